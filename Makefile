@@ -6,9 +6,7 @@ BIN := $(VENV)/bin
 # changed its mind about which of them governs that).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
-# What controllers would compile, half a minute, beside what is measured and tested.
-COMPILE := $(BIN)/python -m koopman_ros.compiled
-# Where the environment forbids to keep what is compiled, each process would compile the package anew.
+# Where the environment forbids to keep byte code, each process would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 # All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
 unexport PYTHONPATH AMENT_PREFIX_PATH
@@ -36,7 +34,6 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,test,bench]'
-	$(COMPILE)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
@@ -65,7 +62,6 @@ $(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,bench,fast]'
-	$(COMPILE)
 	@touch $@
 
 demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, to be run from a browser)
@@ -76,7 +72,7 @@ demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned a
 
 demo-saddle: SEEDS = 5
 demo-saddle: $(VENV)/saddle.stamp  ## an unstable reactor is learned from its temperature alone, recorded under a PI law, and held, SEEDS=5, a quarter of an hour -> out/demo-saddle
-	$(BIN)/python -m validation.saddle_act --seeds $(SEEDS)
+	$(BIN)/python -m studies.saddle_act --seeds $(SEEDS)
 
 # Types are checked beside the tests. Tests across processes wait most of their time, so that there
 # are two workers more than cores; the longest files come first (test/conftest.py). A worker that was
@@ -96,38 +92,38 @@ lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/mypy
 
 models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
-	$(BIN)/python -m validation.shipped_models
+	$(BIN)/python -m studies.shipped_models
 
 studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figures, report -> out/studies
-	$(BIN)/python -m validation.paper --seeds $(SEEDS)
+	$(BIN)/python -m studies.paper --seeds $(SEEDS)
 
 studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, ten seeds -> out/studies-sensors
-	$(BIN)/python -m validation.paper --sensors --seeds 10
+	$(BIN)/python -m studies.paper --sensors --seeds 10
 
 studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
-	$(BIN)/python -m validation.robustness
+	$(BIN)/python -m studies.robustness
 
 studies-general: SEEDS = 10
 studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
-	$(BIN)/python -m validation.general --seeds $(SEEDS)
+	$(BIN)/python -m studies.general --seeds $(SEEDS)
 
 studies-unstable: SEEDS = 10
 studies-unstable: $(VENV)/bench.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
-	$(BIN)/python -m validation.unstable --seeds $(SEEDS)
+	$(BIN)/python -m studies.unstable --seeds $(SEEDS)
 
 studies-saddle: SEEDS = 10
 studies-saddle: $(VENV)/saddle.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
-	$(BIN)/python -m validation.saddle --seeds $(SEEDS)
+	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
 
 studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## three plants beside do-mpc and a plain LQG, two of them measured in part, SEEDS=10, five minutes -> out/studies-partial
-	$(BIN)/python -m validation.partly_measured --seeds $(SEEDS)
+	$(BIN)/python -m studies.partly_measured --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs and on a cluster, an hour (BENCH=--quick: seven minutes) -> out/bench
-	$(BIN)/python -m validation.benchmarks $(BENCH)
+	$(BIN)/python -m benchmarks $(BENCH)
 
 faults: $(VENV)/mpc.stamp  ## put faults into the loops of the reactor, of two tank plants and of a reactor at its saddle, and soak both reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
-	$(BIN)/python -m validation.faults $(FAULTS)
+	$(BIN)/python -m studies.faults $(FAULTS)
 
 docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env \

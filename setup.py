@@ -39,7 +39,7 @@ setup(
     python_requires='>=3.11',
     zip_safe=True,
     install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'pint', 'mcap>=1.5',
-                      'mcap-ros2-support', 'lz4', 'zstandard', 'rosbags', 'safetensors'],
+                      'lz4', 'zstandard', 'rosbags', 'safetensors'],
     extras_require={
         # A sourced ROS 2 installation brings these itself; elsewhere PyPI does.
         'ros': [
@@ -50,16 +50,15 @@ setup(
         'demo': ['matplotlib', 'rich'],
         # the operator's panel, with all that its pages load
         'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
-        # the predictive law's solver of quadratic programs
-        'mpc': ['daqp'],
-        # compiles the numerics of a control step
-        'fast': ['numba'],
+        # the predictive law: solver of quadratic programs, and compiler
+        'mpc': ['daqp', 'numba'],
         'train': ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm'],
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
-        # what validation and benchmarks compare with
+        # what studies and benchmarks compare with
         'bench': ['argon2-cffi', 'casadi==3.8.2', 'control', 'daqp', 'distributed',
-                  'do-mpc==5.1.2', 'itsdangerous', 'limits', 'nicegui>=3', 'playwright', 'psutil', 'pysindy==2.1.0'],
+                  'do-mpc==5.1.2', 'itsdangerous', 'limits', 'nicegui>=3', 'numba', 'playwright',
+                  'psutil', 'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'argon2-cffi',

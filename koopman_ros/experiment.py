@@ -168,19 +168,20 @@ def level(experiment: Experiment, progress: Progress) -> Array:
 
 
 @dataclass(frozen=True)
-class Following:
+class TrackingMonitor:
     """Whether a controller passes on one of the signals, within limits of its own."""
 
     span: float  #: width of the signal's range, in its unit
-    heard: float | None = None  #: what it commanded last, or None at first
-    astray: int = 0  #: how many times in a row that was not, nor came nearer to, what was asked
+    last: float | None = None  #: its last command, or None at first
+    deviations: int = 0  #: commands in a row that neither were the request nor came nearer to it
     since: float = 0.0  #: time of the first of these, in s
 
-    def after(self, heard: float, asked: float, now: float) -> Following:
-        """Return the same after the controller commanded `heard` where `asked` was asked."""
-        gap = abs(heard - asked)
-        nearer = self.heard is None or (
-            gap < abs(self.heard - asked) - _COMES_NEARER * self.span)
+    def after(self, command: float, request: float, now: float) -> TrackingMonitor:
+        """Return the monitor after a command of the controller where another was requested."""
+        gap = abs(command - request)
+        nearer = self.last is None or (
+            gap < abs(self.last - request) - _COMES_NEARER * self.span)
         if gap <= _FOLLOWS_WITHIN * self.span or nearer:
-            return Following(self.span, heard, 0, now)
-        return Following(self.span, heard, self.astray + 1, self.since if self.astray else now)
+            return TrackingMonitor(self.span, command, 0, now)
+        return TrackingMonitor(self.span, command, self.deviations + 1,
+                               self.since if self.deviations else now)

@@ -1,194 +1,113 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-First steps of a program, before anything large is loaded, and its end by force.
-
-What is imported here is imported before signals are handled, so it is little. Only a child that
-is started by :func:`command` and :func:`blocked_signals` handles them from its very start.
-"""
+"""Entry of every program: standard streams, one BLAS thread, signals; before large imports."""
 
 import atexit
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
-import ctypes
 import faulthandler
 from functools import partial
-import gc
 import importlib
 import os
+import select
 import signal
 import sys
 import threading
-import time
-from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# One thread of each library of linear algebra. A control step takes a fraction of a millisecond,
-# and twenty where several threads share it on busy cores; and the last bit of a command depends on
-# the number of threads.
+# A control step takes a fraction of a millisecond, and twenty where several threads share it on
+# busy cores; and the last bit of a command depends on the number of threads.
 ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL')}
-# Their results are compared bit by bit: no variable of the user changes the number of threads.
-_BIT_IDENTICAL = tuple(
+_ONE_THREAD_PROGRAMS = tuple(
     f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player', 'replay'))
-
-_PR_SET_PDEATHSIG = 1  # of prctl(2)
-_END = 8.0  # s from the end of a program to that by force
-_QUIET = 1.0  # s after an interrupt in which another one is the same
-_SIGEV_THREAD = 2  # of sigevent(3type): the function is called in a thread of its own
-_LATER = 3.0  # s from the sentence, which some thread can say, to the stack
-_AFTER = 0.5  # s from the stack that is printed to the end
 
 
 def run_program(module: str, interrupted: int) -> int:
-    """Run a module's `main`, whatever signals come; return its exit code, or `interrupted`."""
+    """Run the `main` of a module; return its exit code, or `interrupted` after a signal."""
     open_standard_streams()
-    ended: list[int] = []
-    # the last of those that are called, as the first one that is registered
-    atexit.register(_end_at_once, ended)
-    # numpy and rclpy take a quarter of a second, in which there is nothing to complete
+    codes: list[int] = []
+    # registered first, so that it is called last
+    atexit.register(_exit, codes)
+    # nothing has to be completed while modules are imported
     handle_signals(lambda *_: os._exit(interrupted))
-    if module in _BIT_IDENTICAL:
+    if module in _ONE_THREAD_PROGRAMS:
         os.environ.update(ONE_THREAD)
-    # what is imported stays: nobody is to look through it for garbage again and again, now or at
-    # the end
-    gc.disable()
     main = importlib.import_module(module).main
-    gc.freeze()
-    gc.enable()
-    _raise_interrupts()
-    code = 1
+    handle_signals(_interrupt)
     try:
-        code = main()
-        ended.append(code)
+        codes.append(main())
     except KeyboardInterrupt:
-        code = interrupted
-        ended.append(code)
+        codes.append(interrupted)
     finally:
         handle_signals(signal.SIG_IGN)
-        # what libraries do at the interpreter's own end may hang, too
-        end_by_force(_END, code)
-    return code
+    return codes[0]
 
 
-def _end_at_once(ended: list[int]) -> None:
-    """End the process with its code, where its program has ended; all else is done by now."""
-    if not ended:
-        return
-    try:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except (OSError, ValueError):
-        # the interpreter's own end says so
-        return
-    # What is left is to take down objects and libraries one by one, for which the operating system
-    # needs a fraction of a millisecond: Fast DDS waits a tenth of a second in there.
-    os._exit(ended[0])
+def _exit(codes: Sequence[int]) -> None:
+    """End the process before the interpreter does, where threads of rclpy crash or hang."""
+    if codes:
+        print(end='', flush=True)
+        print(end='', file=sys.stderr, flush=True)
+        os._exit(codes[0])
 
 
 def open_standard_streams() -> None:
-    """Open what is closed of the three standard streams, to nowhere."""
-    # the next file or socket would take its number, and what a library prints would go there
-    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
+    """Open closed standard streams to the null device: a later file would take their numbers."""
+    for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            # takes the lowest free number, which is this one
             os.open(os.devnull, os.O_RDWR)
-        if getattr(sys, name) is None:
-            stream = os.fdopen(number, 'r' if number == 0 else 'w', closefd=False)
-            setattr(sys, name, stream)
-            setattr(sys, f'__{name}__', stream)
 
 
 def handle_signals(handler: Any) -> None:
-    """Handle signals so; at the end they are ignored, for Python gives up its handlers early."""
+    """Set the handler of every signal that ends a program."""
     for number in SIGNALS:
         signal.signal(number, handler)
 
 
-def _raise_interrupts() -> None:
-    last = -_QUIET
-
-    def interrupt(_: int, __: FrameType | None) -> None:
-        nonlocal last
-        # a second one would end in the middle what the first has made to end
-        if time.monotonic() - last >= _QUIET:
-            last = time.monotonic()
-            raise KeyboardInterrupt
-
-    handle_signals(interrupt)
-
-
-class _Event(ctypes.Structure):
-    """sigevent of timer_create(2), with room to spare."""
-
-    _fields_ = (('value', ctypes.c_void_p), ('signal', ctypes.c_int), ('notify', ctypes.c_int),
-                ('function', ctypes.c_void_p), ('rest', ctypes.c_char * 64))
+def _interrupt(*_: object) -> None:
+    # a second signal would interrupt the clean end
+    handle_signals(signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def end_by_force(seconds: float, code: int = 0, sentence: str = '') -> Callable[[], None]:
     """
-    End the process then, with a sentence; where no Python runs, print where it hangs and end it.
+    End the process after some seconds, with a sentence; return a function that cancels this.
 
-    The latter comes some seconds later, or at once without a sentence, and takes no lock of the
-    interpreter's: Python prints from a thread of its own, and the C library ends the process.
-
-    :return: takes that back.
+    Where a library holds the interpreter's lock, the process ends 1 s later with code 1 and a
+    traceback.
     """
-    def give_up() -> None:
-        print(sentence, file=sys.stderr, flush=True)
+    def end() -> None:
+        if sentence:
+            print(sentence, file=sys.stderr, flush=True)
         os._exit(code)
 
-    said = threading.Timer(seconds, give_up)
-    if sentence:
-        said.daemon = True
-        said.start()
-        seconds += _LATER
-    cancel = _exit_later(seconds + _AFTER, code)
-    # where standard error is no file it says nothing
-    with contextlib.suppress(OSError, ValueError, RuntimeError):
-        faulthandler.dump_traceback_later(seconds, exit=cancel is None)
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+    faulthandler.dump_traceback_later(seconds + 1.0, exit=True, file=2)
 
-    def disarm() -> None:
-        said.cancel()
+    def cancel() -> None:
+        timer.cancel()
         faulthandler.cancel_dump_traceback_later()
-        if cancel is not None:
-            cancel()
 
-    return disarm
-
-
-def _exit_later(seconds: float, code: int) -> Callable[[], object] | None:
-    """Let the C library end the process then; return what takes it back, None where it cannot."""
-    libc = ctypes.CDLL(None)
-    if not hasattr(libc, 'timer_create'):
-        return None
-    # _exit(value)
-    event = _Event(code, 0, _SIGEV_THREAD, ctypes.cast(libc._exit, ctypes.c_void_p))
-    timer = ctypes.c_void_p()
-    if libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)):
-        return None
-    # the interval, and the time until the first; each in seconds and nanoseconds
-    due = (ctypes.c_long * 4)(0, 0, int(seconds), int(seconds % 1.0 * 1e9))
-    if libc.timer_settime(timer, 0, ctypes.byref(due), None):
-        return None
-    return lambda: libc.timer_delete(timer)
+    return cancel
 
 
 def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
-    """Return the command line of a child that gets a signal when this process ends, however."""
-    # the signal comes when the thread ends that started the child
-    parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
-    return (sys.executable, '-m', 'koopman_ros.startup', str(parent), str(int(number)),
+    """Return the command line of a child that gets a signal when this process ends."""
+    return (sys.executable, '-m', 'koopman_ros.startup', str(os.getpid()), str(int(number)),
             str(interrupted), module)
 
 
 @contextlib.contextmanager
 def blocked_signals() -> Iterator[None]:
-    """Block signals in a child started meanwhile, until it handles them."""
+    """Block signals in a child that is started meanwhile, until the child handles them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
@@ -199,21 +118,23 @@ def blocked_signals() -> Iterator[None]:
 def run_child(parent: int, number: int, interrupted: int, module: str,
               arguments: Sequence[str]) -> int:
     """
-    Run a module's `main` in a child whose signals are blocked; return its exit code.
+    Run the `main` of a module in a child process; return its exit code.
 
-    :param parent: at whose end the child gets the signal `number`; 0 for none.
+    :param parent: process at whose end the child gets the signal `number`.
     :param interrupted: exit code after a signal.
     """
-    libc = ctypes.CDLL(None)
-    if parent and hasattr(libc, 'prctl'):
-        libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
-        if os.getppid() != parent:
-            # it has ended before
-            os._exit(0)
     sys.argv = [module, *arguments]
     handle_signals(lambda *_: os._exit(interrupted))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    threading.Thread(target=_signal_at_end, args=(parent, number), daemon=True).start()
     return run_program(module, interrupted)
+
+
+def _signal_at_end(parent: int, number: int) -> None:
+    # the process may have ended before
+    with contextlib.suppress(ProcessLookupError):
+        select.select([os.pidfd_open(parent)], [], [])
+    os.kill(os.getpid(), number)
 
 
 def main() -> int:
@@ -222,8 +143,7 @@ def main() -> int:
     return run_child(int(parent), int(number), int(interrupted), module, arguments)
 
 
-# The programs on the path. A node that is ended by a signal has done its work: 0. A replay has
-# not: 130.
+# The programs on the path. A signal completes the work of a node (0), and interrupts a replay.
 plant = partial(run_program, 'koopman_ros.nodes.plant', 0)
 controller = partial(run_program, 'koopman_ros.nodes.controller', 0)
 trainer = partial(run_program, 'koopman_ros.nodes.trainer', 0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from koopman_ros import experiment
-from koopman_ros.experiment import advance, begin, end, Experiment, Following, level, Phase
+from koopman_ros.experiment import advance, begin, end, Experiment, level, Phase, TrackingMonitor
 from koopman_ros.reasons import Words
 from koopman_ros.units import Displays
 from koopman_ros.units import NANOSECONDS as SECOND
@@ -239,9 +239,9 @@ def test_contradicting_limits_are_refused(change: dict[str, Any], words: str) ->
 
 
 # What a controller commands, or which set-point it tracks, and what was asked for, in ranges of
-# three sizes; and how often it went astray.
+# three sizes; and how often it deviated.
 @pytest.mark.parametrize('span', [18.0, 1.8e-3, 1.8e6])
-@pytest.mark.parametrize(('heard', 'asked', 'astray'), [
+@pytest.mark.parametrize(('heard', 'asked', 'deviations'), [
     ([292.0, 292.0, 292.0], [292.0, 292.0, 292.0], 0),
     ([292.01, 291.99, 292.01], [292.0, 292.0, 292.0], 0),  # within a thousandth of the range
     ([292.1, 291.9, 292.1], [292.0, 292.0, 292.0], 2),
@@ -252,11 +252,11 @@ def test_contradicting_limits_are_refused(change: dict[str, Any], words: str) ->
     ([290.0 + 1e-5 * k for k in range(6)], [292.0] * 6, 5),  # settles by itself
 ])
 def test_controller_that_comes_nearer_follows(
-        heard: list[float], asked: list[float], astray: int, span: float) -> None:
-    following, unit = Following(span), span / 18.0
+        heard: list[float], asked: list[float], deviations: int, span: float) -> None:
+    monitor, unit = TrackingMonitor(span), span / 18.0
     for now, (command, wanted) in enumerate(zip(heard, asked, strict=True)):
-        following = following.after(command * unit, wanted * unit, float(now))
-    assert following.astray == astray
-    if astray:
-        assert following.since == 1.0
-        assert following.after(292.0, 292.0, 9.0) == Following(span, 292.0, 0, 9.0)
+        monitor = monitor.after(command * unit, wanted * unit, float(now))
+    assert monitor.deviations == deviations
+    if deviations:
+        assert monitor.since == 1.0
+        assert monitor.after(292.0, 292.0, 9.0) == TrackingMonitor(span, 292.0, 0, 9.0)

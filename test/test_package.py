@@ -24,7 +24,7 @@ import koopman_ros
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted([ROOT / 'setup.py', *(
-    path for folder in ('docs', 'koopman_ros', 'examples', 'test', 'validation')
+    path for folder in ('docs', 'koopman_ros', 'examples', 'test', 'studies', 'benchmarks')
     for path in ROOT.glob(f'{folder}/**/*.py'))])
 # What each sub-package may import of the others.
 ALLOWED = {
@@ -37,7 +37,7 @@ ALLOWED = {
     'learning': {'control', 'jobs', 'lifting'},
     'identification': {'jobs', 'learning', 'lifting', 'plants'},
     'retraining': {'bags', 'control', 'identification', 'jobs', 'learning', 'lifting', 'plants'},
-    'replay': {'bags', 'control', 'lifting'},
+    'replay': {'bags', 'control', 'lifting', 'parameters'},
     'parameters': {'control', 'estimation', 'jobs', 'lifting', 'plants'},
     'jobs': set(),
     'panel': {'bags', 'jobs', 'lifting', 'parameters', 'replay'},
@@ -89,7 +89,7 @@ def _keys() -> dict[str, dict[str, list[str]]]:
 
 def _third_party(*folders: str) -> set[str]:
     """Return the modules of other distributions that the files in folders import."""
-    own = {'koopman_ros', 'validation', 'support', 'machines'}
+    own = {'koopman_ros', 'studies', 'benchmarks', 'support', 'machines'}
     return {name.split('.')[0] for folder in folders for path in ROOT.glob(f'{folder}/**/*.py')
             for name in _imports(path)} - own - sys.stdlib_module_names
 
@@ -115,7 +115,7 @@ def test_manifest_declares_what_is_imported(control_only: bool) -> None:
     used = _third_party('koopman_ros') - without
     # numba is optional: a key of the tests
     assert {key_of[name] for name in used - learning - {'numba'}} <= nodes
-    assert {key_of[name] for name in _third_party('koopman_ros', 'test', 'validation')
+    assert {key_of[name] for name in _third_party('koopman_ros', 'test', 'studies', 'benchmarks')
             - without - learning} <= everything
     assert not {key_of[name] for name in learning} & everything
 
@@ -128,7 +128,7 @@ def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> N
                     for some in (manifest.exec_depends, manifest.test_depends))
     assert nodes | tests <= {*keys['ros'], *keys['apt'], *keys['pip']}
     assert not set(keys['none']) & {key for kind in ('ros', 'apt', 'pip') for key in keys[kind]}
-    assert nodes & set(keys['pip']) == {'mcap-ros2-support'}
+    assert nodes & set(keys['pip']) == {'mcap-ros2-support', 'python3-rosbags-pip'}
     _, _, install = (ROOT / 'docs' / 'operation.md').read_text().partition('## Install')
     install, _, _ = install.partition('## Start')
     assert not [key for key in keys['pip'] if f'`{key}`' not in install]
@@ -150,11 +150,11 @@ def test_packages_that_messages_and_pages_advise_are_known() -> None:
         ROOT / 'requirements.lock').read_text().splitlines() if not line.startswith('#')}
     texts = {path: path.read_text() for path in (
         *ROOT.glob('*.md'), *ROOT.glob('docs/*.md'), *ROOT.glob('koopman_ros/**/*.py'),
-        *ROOT.glob('validation/**/*.py'), *ROOT.glob('config/*.yaml'))}
+        *ROOT.glob('studies/**/*.py'), *ROOT.glob('benchmarks/*.py'), *ROOT.glob('config/*.yaml'))}
     assert not [path for path, text in texts.items() if 'koopman_ros[' in text]
     advised = {name for text in texts.values() for name in re.findall(
         r"pip install '?([a-z][\w-]*)", text)}
-    assert {'daqp', 'matplotlib', 'nicegui', 'numba', 'torch'} <= advised
+    assert {'matplotlib', 'nicegui', 'numba', 'torch'} <= advised
     assert {canonicalize_name(name) for name in advised} <= locked
 
 
@@ -220,7 +220,7 @@ def test_nothing_installed_imports_what_is_not_and_few_packages_torch() -> None:
     users = set()
     for path in ROOT.glob('koopman_ros/**/*.py'):
         roots = {name.split('.')[0] for name in _imports(path)}
-        assert not roots & {'validation', 'examples', 'support', 'test'}, path
+        assert not roots & {'studies', 'benchmarks', 'examples', 'support', 'test'}, path
         users |= {path.parent.name} if 'torch' in roots else set()
     assert users == {'identification', 'learning'}
     # and every package has its rule

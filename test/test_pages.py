@@ -6,7 +6,6 @@
 import ast
 from collections.abc import Iterator
 from dataclasses import fields
-from fractions import Fraction
 from functools import cache
 from pathlib import Path
 import re
@@ -14,7 +13,6 @@ import re
 from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
-import yaml
 
 from koopman_ros.control.laws import Plan
 from koopman_ros.parameters.trainer import preset_wiring
@@ -24,7 +22,7 @@ from koopman_ros.wire import CARRIERS, place
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
-PARTS = 'koopman_ros|validation|examples|config|docs|test'
+PARTS = 'koopman_ros|studies|benchmarks|examples|config|docs|test'
 each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 
 
@@ -148,25 +146,6 @@ def test_interfaces_list_what_there_is_of_each_signal() -> None:
                    if row.startswith(f'{name}.') and about.unit}
             assert listed == own, (node, kind)
     assert len(rows) == 3
-
-
-def test_changelog_has_the_former_names_of_all_parameters() -> None:
-    rows = re.findall(r'^   (\w+), ``(.+)``, ``(.+)``, (.+), (.+)$',
-                      (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
-    renamed = yaml.safe_load((ROOT / 'config' / 'renamed.yaml').read_text())
-    assert [row[:3] for row in rows] == [
-        (node, name, now) for node, names in renamed.items() for name, (now, _) in names.items()]
-    tables = programs.tables()
-    for node, name, now, unit, by in rows:
-        assert unit == (tables[node].rows[now].unit or '-')
-        factor = renamed[node][name][1]
-        if isinstance(factor, dict):
-            assert by == '; '.join(
-                f'{was} is now {new}' for was, new in factor.items() if was != new)
-        elif factor == 'digits':
-            assert by == 'its negative decimal logarithm'
-        else:
-            assert float(Fraction(by)) == pytest.approx(factor, rel=1e-12)
 
 
 def test_operation_quotes_what_diagnostics_say() -> None:

@@ -43,8 +43,7 @@ def of_one_thread() -> str:
     return found
 
 
-@pytest.mark.parametrize('program', ['controller', 'replay', 'plant', 'player'])
-@pytest.mark.parametrize('threads', ['', '4'])
+@pytest.mark.parametrize(('program', 'threads'), [('controller', ''), ('replay', '4')])
 def test_bits_of_a_program_do_not_depend_on_the_number_of_threads(
         program: str, threads: str, of_one_thread: str) -> None:
     """As it is by default, or set by the user."""

@@ -5,17 +5,20 @@
 
 from koopman_ros.bags.decoding import BagMessage
 from koopman_ros.bags.episodes import loop_episodes, stream_episodes
-from koopman_ros.bags.limits import BagReadError
-from koopman_ros.bags.metadata import INFINITE_NS, QosProfile
+from koopman_ros.bags.import_spec import Account, RecordedInput, RecordedState
+from koopman_ros.bags.mcap_file import BagReadError
+from koopman_ros.bags.message_definitions import (
+    message_definition,
+    MessageDefinition,
+    MessageDefinitionError,
+)
 from koopman_ros.bags.reader import BagSummary, in_log_order, read_messages, summary
-from koopman_ros.bags.recorded import Account, RecordedInput, RecordedState
-from koopman_ros.bags.schemas import message_definition, MessageDefinition, MessageDefinitionError
 from koopman_ros.bags.series import read_series, Series
 from koopman_ros.bags.writer import BagWriter
 
 __all__ = [
-    'INFINITE_NS', 'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter',
-    'MessageDefinition', 'MessageDefinitionError', 'QosProfile', 'RecordedInput',
-    'RecordedState', 'Series', 'in_log_order', 'loop_episodes', 'message_definition',
-    'read_messages', 'read_series', 'stream_episodes', 'summary',
+    'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter', 'MessageDefinition',
+    'MessageDefinitionError', 'RecordedInput', 'RecordedState', 'Series', 'in_log_order',
+    'loop_episodes', 'message_definition', 'read_messages', 'read_series', 'stream_episodes',
+    'summary',
 ]

@@ -1,27 +1,31 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages decoded by the definition that their file brings along."""
+"""Messages decoded by the definition that their file brings along, by the library rosbags."""
 
 from collections.abc import Callable
-import contextlib
-from dataclasses import dataclass, replace
-import io
+from functools import cache
 from pathlib import Path
-from typing import Any
+import re
+from typing import Any, NamedTuple
 
-from mcap.exceptions import EndOfFile
-from mcap.records import Schema
-from mcap.well_known import SchemaEncoding
-from mcap_ros2.decoder import DecoderFactory
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-from koopman_ros.bags import limits
-from koopman_ros.bags.records import StoredMessage
+from koopman_ros.bags.mcap_file import BagReadError, reason, StoredMessage
 from koopman_ros.wire import full_type_name
 
+_Decode = Callable[[bytes], Any]
 
-@dataclass(frozen=True, slots=True)
-class BagMessage:
+# A byte is unsigned in ROS 2, in rosbags it is not.
+_BYTE = re.compile(r'^\s*byte\b', re.MULTILINE)
+# Definitions of some writers leave them out.
+_TIMES = {
+    **get_types_from_msg('int32 sec\nuint32 nanosec', 'builtin_interfaces/msg/Time'),
+    **get_types_from_msg('int32 sec\nuint32 nanosec', 'builtin_interfaces/msg/Duration')}
+
+
+class BagMessage(NamedTuple):
     """
     One message of a bag: times of receipt and of sending [ns], decoded fields, original bytes.
 
@@ -37,95 +41,78 @@ class BagMessage:
     data: bytes
 
 
-class UndecodableError(limits.BagReadError):
-    """A topic whose type or encoding is not decoded here; its messages may be whole."""
-
-
-def type_name(schema: Schema | None) -> str:
-    """Return the full name of a message type, '' without a schema."""
-    return full_type_name(schema.name) if schema else ''
-
-
-class _WholeSlices(bytes):
-    """
-    Bytes whose slices are complete or fail.
-
-    The decoder takes whatever a slice returns for a string or a field of bytes: one cut short
-    would pass for a shorter one, and a damaged length for that many empty ones.
-    """
-
-    def __getitem__(self, key: Any) -> Any:
-        if isinstance(key, slice) and key.stop > len(self):
-            raise EndOfFile
-        return super().__getitem__(key)
+class UndecodableError(BagReadError):
+    """A topic whose type or encoding is not decoded here; its messages may be complete."""
 
 
 class Decoders:
-    """The decoders of one file's message types."""
+    """Decode the messages of one file."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
-        self._factory = DecoderFactory()
-        self._known: dict[tuple[str, int], Callable[[bytes], Any] | UndecodableError] = {}
+        self._by_channel: dict[int, tuple[str, _Decode | UndecodableError]] = {}
 
     def decode(self, stored: StoredMessage) -> BagMessage:
-        """Return a message with its fields; raise BagReadError where that cannot be."""
-        channel, message = stored.channel, stored.message
-        decode = self._prepare(stored)
+        """Return a message with its fields; raise BagReadError where that is impossible."""
+        type_name, decode = self._by_channel.get(stored.channel.id) or self._prepared(stored)
+        if isinstance(decode, UndecodableError):
+            raise decode.with_traceback(None)
         try:
-            fields = decode(_WholeSlices(message.data))
-        except MemoryError:
-            raise
+            fields = decode(stored.data)
         except Exception as error:
-            # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
-            raise limits.BagReadError(
-                f'{str(self._file)!r}: the message on {channel.topic!r} at {message.log_time} ns '
-                f'does not decode ({limits.reason(error)}): read the other topics by name'
-            ) from error
-        return self.undecoded(stored, fields)
+            # the decoder walks over foreign bytes and fails in as many ways as they can be wrong
+            raise BagReadError(
+                f'{str(self._file)!r}: the message on {stored.channel.topic!r} at '
+                f'{stored.log_time_ns} ns does not decode ({reason(error)}): read the other '
+                'topics by name') from error
+        return BagMessage(stored.channel.topic, type_name, stored.log_time_ns,
+                          stored.publish_time_ns, fields, stored.data)
 
-    @staticmethod
-    def undecoded(stored: StoredMessage, fields: Any = None) -> BagMessage:
-        """Return a message with its bytes, and with fields that were decoded before."""
-        message = stored.message
-        return BagMessage(stored.channel.topic, type_name(stored.schema), message.log_time,
-                          message.publish_time, fields, message.data)
+    def undecoded(self, stored: StoredMessage) -> BagMessage:
+        """Return a message with its bytes alone."""
+        return BagMessage(stored.channel.topic, type_name(stored), stored.log_time_ns,
+                          stored.publish_time_ns, None, stored.data)
 
-    def fields(self, stored: StoredMessage, data: bytes) -> Any:
-        """Return the fields of other data on the channel of a message; it fails in any way."""
-        return self._prepare(stored)(_WholeSlices(data))
-
-    def _prepare(self, stored: StoredMessage) -> Callable[[bytes], Any]:
-        key = stored.channel.message_encoding, stored.channel.schema_id
-        if key not in self._known:
-            try:
-                self._known[key] = self._decoder(stored)
-            except UndecodableError as error:
-                self._known[key] = error
-        known = self._known[key]
-        if isinstance(known, UndecodableError):
-            raise known.with_traceback(None)
-        return known
-
-    def _decoder(self, stored: StoredMessage) -> Callable[[bytes], Any]:
-        schema, encoding = stored.schema, stored.channel.message_encoding
-        try:
-            if schema is not None and schema.encoding == SchemaEncoding.ROS2:
-                schema = replace(schema, data=limits.fields_only(schema.data))
-            # the definition parser prints what it also raises
-            with contextlib.redirect_stderr(io.StringIO()):
-                decoder = self._factory.decoder_for(encoding, schema)
-        except MemoryError:
-            raise
-        except Exception as error:
-            # Another recorder's schema text meets the definition parser here.
-            raise UndecodableError(
-                f'{str(self._file)!r}: the definition stored for {stored.channel.topic!r} does '
-                f'not parse ({limits.reason(error)}): read the other topics by name') from error
-        if decoder is None:
-            schema_encoding = schema.encoding if schema else 'no schema'
-            raise UndecodableError(
-                f'{str(self._file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} '
-                f'with {schema_encoding!r}, only cdr with ros2msg is decoded here: read the other '
+    def _prepared(self, stored: StoredMessage) -> tuple[str, _Decode | UndecodableError]:
+        schema, channel = stored.schema, stored.channel
+        encodings = channel.message_encoding, schema.encoding if schema else 'no schema'
+        decode: _Decode | UndecodableError
+        if schema is None or encodings != (MessageEncoding.CDR, SchemaEncoding.ROS2):
+            decode = UndecodableError(
+                f'{str(self._file)!r}: topic {channel.topic!r} is encoded as {encodings[0]!r} '
+                f'with {encodings[1]!r}, only cdr with ros2msg is decoded here: read the other '
                 'topics by name')
-        return decoder
+        else:
+            try:
+                decode = _decoder(type_name(stored), schema.data)
+            except Exception as error:
+                # the definition of another recorder meets the parser here
+                decode = UndecodableError(
+                    f'{str(self._file)!r}: the definition stored for {channel.topic!r} does not '
+                    f'parse ({reason(error)}): read the other topics by name')
+        return self._by_channel.setdefault(channel.id, (type_name(stored), decode))
+
+
+def type_name(stored: StoredMessage) -> str:
+    """Return the full name of a message's type, '' without a schema."""
+    return full_type_name(stored.schema.name) if stored.schema else ''
+
+
+@cache
+def _decoder(name: str, definition: bytes) -> _Decode:
+    """Return the function that decodes messages of a type; raise any exception without one."""
+    store = get_typestore(Stores.EMPTY)
+    store.register({**_TIMES, **get_types_from_msg(
+        _BYTE.sub('uint8', definition.decode('utf-8')), name)})
+    found = store.get_msgdef(name)
+    # The store's own deserialize_cdr refuses more than three bytes behind a message, where ROS
+    # leaves four behind an empty array of doubles.
+    orders = found.deserialize_cdr_be, found.deserialize_cdr_le
+
+    def decode(data: bytes) -> Any:
+        message, end = orders[data[1] & 1](data[4:], 0, found.cls, store)
+        if end > len(data) - 4:
+            raise EOFError(f'{len(data)} bytes, {end + 4} are needed')
+        return message
+
+    return decode

@@ -13,15 +13,14 @@ import warnings
 
 from mcap.records import Channel
 from mcap.summary import Summary
+from rosbags.interfaces import Qos
 
-from koopman_ros.bags import limits
+from koopman_ros.bags.bag_files import locate
 from koopman_ros.bags.decoding import BagMessage, Decoders, type_name, UndecodableError
-from koopman_ros.bags.metadata import parse_offered_qos, QosProfile
-from koopman_ros.bags.records import stored_messages, summary_section
-from koopman_ros.bags.storage import locate
+from koopman_ros.bags.mcap_file import BagReadError, opened, stored_messages, summary_section
+from koopman_ros.bags.metadata import parse_offered_qos
+from koopman_ros.wire import full_type_name
 
-# Of the different offers in a file, which take seconds to read; seven hundred publishers' worth.
-_MAX_OFFERS_BYTES = 2**18
 # A recorder that falls behind writes what waits topic by topic; longer than this it never waits.
 _BEHIND_NS = 5_000_000_000
 
@@ -38,7 +37,7 @@ class BagSummary:
 
     counts: dict[str, int]
     types: dict[str, str]
-    offered_qos: dict[str, tuple[QosProfile, ...]]
+    offered_qos: dict[str, tuple[Qos, ...]]
     start_ns: int | None
     end_ns: int | None
     complete: bool
@@ -103,7 +102,7 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
     parts = [_indexed_summary(file) or _scanned_summary(file) for file in files]
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
-    offered_qos: dict[str, tuple[QosProfile, ...]] = {}
+    offered_qos: dict[str, tuple[Qos, ...]] = {}
     for part in parts:
         counts.update(part.counts)
         types.update(part.types)
@@ -119,27 +118,25 @@ def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bo
              ) -> Iterator[BagMessage]:
     undecoded: set[str] = set()
     for file in files:
-        # One set of decoders for each file: they are kept by schema id, and ids are a file's own.
+        # of each file by itself: identifiers of channels are a file's own
         decoders = Decoders(file)
         for stored in stored_messages(file, recover=recover, topics=topics):
-            with limits.enough_memory(file):
-                try:
-                    message = decoders.decode(stored)
-                except UndecodableError as error:
-                    if topics is not None:
-                        raise
-                    message = decoders.undecoded(stored)
-                    if message.topic not in undecoded:
-                        undecoded.add(message.topic)
-                        warnings.warn(f'messages on {message.topic!r} are given as bytes alone: '
-                                      f'{error}', stacklevel=2)
-            yield message
+            try:
+                yield decoders.decode(stored)
+            except UndecodableError as error:
+                if topics is not None:
+                    raise
+                if stored.channel.topic not in undecoded:
+                    undecoded.add(stored.channel.topic)
+                    warnings.warn(f'messages on {stored.channel.topic!r} are given as bytes '
+                                  f'alone: {error}', stacklevel=2)
+                yield decoders.undecoded(stored)
 
 
 def _indexed_summary(file: Path) -> BagSummary | None:
     """Return the summary at the end of a closed file, None where a part of it is left out."""
-    with limits.enough_memory(file), limits.opened(file) as stream:
-        content = summary_section(stream, limits.Budget(file))
+    with opened(file) as stream:
+        content = summary_section(stream)
     if content is None or content.statistics is None or not _is_whole(content):
         return None
     statistics = content.statistics
@@ -148,7 +145,7 @@ def _indexed_summary(file: Path) -> BagSummary | None:
     for channel in content.channels.values():
         schema = content.schemas.get(channel.schema_id)
         counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
-        types[channel.topic] = type_name(schema)
+        types[channel.topic] = full_type_name(schema.name) if schema else ''
     empty = statistics.message_count == 0
     return BagSummary(
         dict(counts), types, _offered_qos(content.channels.values()),
@@ -172,38 +169,28 @@ def _is_whole(content: Summary) -> bool:
 
 
 def _scanned_summary(file: Path) -> BagSummary:
-    """Return the summary of whatever can be read, counted message by message."""
+    """Return the summary of all complete records, counted message by message."""
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
     channels: dict[str, Channel] = {}
     start_ns = end_ns = None
     complete = True
     try:
-        for stored in stored_messages(file, recover=False, with_data=False):
-            topic, time_ns = stored.channel.topic, stored.message.log_time
+        for stored in stored_messages(file, recover=False):
+            topic, time_ns = stored.channel.topic, stored.log_time_ns
             counts[topic] += 1
-            types[topic] = type_name(stored.schema)
+            types[topic] = type_name(stored)
             channels[topic] = stored.channel
             start_ns = time_ns if start_ns is None else min(start_ns, time_ns)
             end_ns = time_ns if end_ns is None else max(end_ns, time_ns)
-    except limits.BagTooLargeError:
-        raise
-    except limits.BagReadError:
+    except BagReadError:
         complete = False
     return BagSummary(
         dict(counts), types, _offered_qos(channels.values()), start_ns, end_ns, complete)
 
 
-def _offered_qos(channels: Iterable[Channel]) -> dict[str, tuple[QosProfile, ...]]:
-    """Return what was offered on each topic, as far as it was kept and can be read."""
-    offers: dict[str, tuple[QosProfile, ...]] = {}
-    # the same text is on many topics
-    known: dict[str, tuple[QosProfile, ...]] = {'': ()}
-    left = _MAX_OFFERS_BYTES
-    for channel in channels:
-        text = channel.metadata.get('offered_qos_profiles', '')
-        if text not in known:
-            left -= len(text)
-            known[text] = parse_offered_qos(text) if left >= 0 else ()
-        offers[channel.topic] = known[text]
+def _offered_qos(channels: Iterable[Channel]) -> dict[str, tuple[Qos, ...]]:
+    """Return the offers on each topic, as far as they were kept and can be read."""
+    offers = {channel.topic: parse_offered_qos(channel.metadata.get('offered_qos_profiles', ''))
+              for channel in channels}
     return {topic: offered for topic, offered in offers.items() if offered}

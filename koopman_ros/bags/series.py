@@ -10,11 +10,13 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags.limits import BagReadError, reason
-from koopman_ros.bags.reader import BagMessage, BagSummary, read_messages, summary
+from koopman_ros.bags.decoding import BagMessage
+from koopman_ros.bags.mcap_file import BagReadError, reason
+from koopman_ros.bags.reader import BagSummary, read_messages, summary
 from koopman_ros.units import NANOSECONDS
 from koopman_ros.wire import CARRIERS, Place
 
+_MOST_NS = 2**63
 # Fewer samples do not tell what is usual.
 _ENOUGH = 50
 # A change is no motion when it is larger than so many times all but the largest changes, ...
@@ -90,8 +92,10 @@ def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Place
         raise _other_type(path, entry.topic, entry.type_name, place.type)
     try:
         header = getattr(entry.message, 'header', None)
-        stamp_ns = None if header is None else int(np.int64(
-            NANOSECONDS * header.stamp.sec + header.stamp.nanosec))
+        stamp_ns = None if header is None else (
+            NANOSECONDS * header.stamp.sec + header.stamp.nanosec)
+        if stamp_ns is not None and not -_MOST_NS < stamp_ns < _MOST_NS:
+            raise OverflowError(f'a stamp of {stamp_ns} ns')
         try:
             return stamp_ns, place.get(entry.message)
         except LookupError:

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recording: serialized messages into a bag that rosbag2 and every MCAP reader can open."""
+"""Crash-safe recording: serialized messages into a bag that rosbag2 and MCAP readers open."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+import contextlib
 import math
 import operator
 import os
@@ -11,13 +13,24 @@ from pathlib import Path
 import time
 from typing import Self
 
-from koopman_ros.bags.files import COMPRESSIONS, FileSequence
-from koopman_ros.bags.metadata import QosProfile, RecordedTopic
-from koopman_ros.bags.schemas import MessageDefinition
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Qos
+
+from koopman_ros import __version__
+from koopman_ros.bags import metadata
+from koopman_ros.bags.message_definitions import MessageDefinition
 from koopman_ros.units import NANOSECONDS
 
+_COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD,
+                 'lz4': CompressionType.LZ4}
 _MAX_TIME_NS = 2**63 - 1
-_BYTES = (bytes, bytearray, memoryview)
+_SEQUENCE_MODULUS = 2**32
+# A message in a chunk beside its data: opcode, length, channel, sequence, two times.
+_MESSAGE_HEAD_BYTES = 31
+# Chunks end by flush() and then go to the operating system at once: mcap's own limit would leave
+# the end of a chunk in a buffer.
+_NO_LIMIT = 2**62
 
 
 class BagWriter:
@@ -30,20 +43,21 @@ class BagWriter:
     A bag directory is split where asked for: a message that finds `max_file_bytes` written, or
     `max_file_duration_s` [s] passed since the first log time of the file, begins the next file
     (`<name>_1.mcap`, ...; 0: never). The file before it is completed in the background, written
-    through to the disk and only then listed in `metadata.yaml`.
+    through to the disk and only then listed in `metadata.yaml`: files listed there can be read
+    whatever happens later.
 
     `compression` of the chunks is 'none', 'zstd' or 'lz4'. The default is that of rosbag2: every
     reader can open it, and there is no codec between a damaged file and its messages. With 'zstd'
     the bag of a control loop has about a third of the size. A chunk ends when it exceeds
     `max_chunk_bytes`, or with the first `write` after it has been open for `max_chunk_age_s` [s of
     `clock`] (0: after each message, infinity: never). A process that is killed loses no more than
-    the open chunk; a recorder whose topics may fall silent calls `flush` from a timer. What it
-    leaves is read by `read_messages` with `recover`, and by mcap's `NonSeekingReader` with
+    the open chunk; a recorder whose topics may fall silent calls `flush` from a timer. A cut file
+    is read by `read_messages` with `recover`, and by mcap's `NonSeekingReader` with
     `log_time_order=False` until that raises `EndOfFile`.
 
     Not thread-safe: one thread at a time may use a writer. Raises FileExistsError if `path`
     exists, ValueError for an option out of range and for a single file that is to be split.
-    What goes wrong in the background is raised by the next `flush` or `close`.
+    An error in the background is raised by the next `flush` or `close`.
     """
 
     def __init__(
@@ -57,39 +71,49 @@ class BagWriter:
         max_chunk_age_s: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if compression not in COMPRESSIONS:
+        if compression not in _COMPRESSIONS:
             raise ValueError(
-                f'compression {compression!r} is not one of {", ".join(COMPRESSIONS)}')
-        if max_chunk_bytes < 1:
-            raise ValueError(f'max_chunk_bytes {max_chunk_bytes} is below 1: give a size in bytes')
-        if math.isnan(max_chunk_age_s) or max_chunk_age_s < 0:
-            raise ValueError(
-                f'max_chunk_age_s {max_chunk_age_s} is not a time of 0 s or more: '
-                'use 0 to flush each message, math.inf to flush by size alone')
-        if max_file_bytes < 0:
-            raise ValueError(f'max_file_bytes {max_file_bytes} is negative: use 0 for no limit')
-        if not 0 <= max_file_duration_s < math.inf:
-            raise ValueError(
-                f'max_file_duration_s {max_file_duration_s} is not a time of 0 s or more: '
-                'use 0 for no limit')
+                f'compression {compression!r} is not one of {", ".join(_COMPRESSIONS)}')
+        for name, value, least, most in (
+                ('max_file_bytes', max_file_bytes, 0, math.inf),
+                ('max_file_duration_s', max_file_duration_s, 0, _MAX_TIME_NS / NANOSECONDS),
+                ('max_chunk_bytes', max_chunk_bytes, 1, math.inf),
+                ('max_chunk_age_s', max_chunk_age_s, 0, math.inf)):
+            if not least <= value <= most:
+                raise ValueError(f'{name} {value} is outside [{least}, {most:g}]')
         self.path = Path(path)
-        if (max_file_bytes or max_file_duration_s) and self.path.suffix == '.mcap':
+        self._is_directory = self.path.suffix != '.mcap'
+        if (max_file_bytes or max_file_duration_s) and not self._is_directory:
             raise ValueError(
                 f'{str(self.path)!r} is one file, which is not split: give the name of a folder, '
                 'without .mcap')
+        self._compression = compression
+        self._max_file_bytes = max_file_bytes or math.inf
+        self._max_file_ns = round(max_file_duration_s * NANOSECONDS) or math.inf
         self._max_chunk_bytes = max_chunk_bytes
         self._max_chunk_age_s = max_chunk_age_s
         self._clock = clock
-        self._topics: dict[str, RecordedTopic] = {}
         self._chunk_opened_s: float | None = None
+        self._topics: dict[str, metadata.RecordedTopic] = {}
         self._closed = False
-        self._files = FileSequence(
-            self.path, compression, max_file_bytes or math.inf,
-            round(max_file_duration_s * NANOSECONDS) or math.inf)
+        self._completed: list[metadata.RecordedFile] = []
+        # In a thread: to write a large file through to the disk takes longer than messages can
+        # wait.
+        self._background = ThreadPoolExecutor(max_workers=1, thread_name_prefix='bag')
+        self._completion: Future[None] | None = None
+        self._file_count = 0
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            if self._is_directory:
+                self.path.mkdir()
+            self._file = self._next_file()
+        except FileExistsError as error:
+            raise FileExistsError(
+                f'{str(error.filename)!r} exists already and recordings are never overwritten: '
+                'choose another name, or move the old one away') from error
 
-    def add_topic(
-        self, topic: str, definition: MessageDefinition, offered_qos: Sequence[QosProfile] = ()
-    ) -> None:
+    def add_topic(self, topic: str, definition: MessageDefinition,
+                  offered_qos: Sequence[Qos] = ()) -> None:
         """
         Announce a topic by its absolute name; again with the same definition does nothing.
 
@@ -102,11 +126,16 @@ class BagWriter:
             raise ValueError(
                 f'topic {topic!r} is not an absolute name: resolve it first, '
                 f'such as node.resolve_topic_name({topic!r})')
-        self._check_consistent(topic, definition)
-        if topic in self._topics:
-            return
-        self._topics[topic] = RecordedTopic(topic, definition, tuple(offered_qos))
-        self._files.current.add_topic(self._topics[topic])
+        for known in self._topics.values():
+            same_name = known.name == topic or known.definition.type_name == definition.type_name
+            if same_name and known.definition != definition:
+                raise ValueError(
+                    f'topic {topic!r} of type {definition.type_name} ({definition.type_hash}) '
+                    f'contradicts topic {known.name!r} of type {known.definition.type_name} '
+                    f'({known.definition.type_hash}): record it in a bag of its own')
+        if topic not in self._topics:
+            self._topics[topic] = metadata.RecordedTopic(topic, definition, tuple(offered_qos))
+            self._file.add_topic(self._topics[topic])
 
     def write(self, topic: str, data: bytes | bytearray | memoryview, log_time_ns: int,
               publish_time_ns: int | None = None) -> None:
@@ -122,65 +151,189 @@ class BagWriter:
         if recorded is None:
             raise ValueError(
                 f'topic {topic!r} is not in the bag {str(self.path)!r}: call add_topic first')
-        if not isinstance(data, _BYTES):
+        if not isinstance(data, (bytes, bytearray, memoryview)):
             raise TypeError(
                 f'data for {topic!r} must be serialized (bytes), got {type(data).__name__}: '
                 'subscribe with raw=True or call rclpy.serialization.serialize_message')
         log_time_ns = _checked_time('log_time_ns', log_time_ns)
         publish_time_ns = (log_time_ns if publish_time_ns is None
                            else _checked_time('publish_time_ns', publish_time_ns))
-        if self._files.is_full(log_time_ns):
-            self.flush()
-            self._files.split(self._topics.values())
-        self._files.current.write(
+        if self._is_full(log_time_ns):
+            self._split()
+        self._file.write(
             topic, bytes(data), log_time_ns, publish_time_ns, recorded.message_count)
         recorded.message_count += 1
         now_s = self._clock()
         if self._chunk_opened_s is None:
             self._chunk_opened_s = now_s
-        if (self._files.current.open_chunk_bytes > self._max_chunk_bytes
+        if (self._file.open_chunk_bytes > self._max_chunk_bytes
                 or now_s - self._chunk_opened_s >= self._max_chunk_age_s):
             self.flush()
 
     def flush(self) -> None:
         """
-        End the open chunk; what was flushed survives the end of the process, not a loss of power.
+        End the open chunk; flushed messages survive the end of the process, not a loss of power.
 
         Raises ValueError on a closed writer.
         """
         self._check_open('flush')
-        self._files.current.flush()
+        self._file.flush()
         self._chunk_opened_s = None
-        self._files.raise_failures()
+        self._raise_background_error()
 
     def close(self) -> None:
         """Complete the file (and `metadata.yaml`); closing a closed writer does nothing."""
         if self._closed:
             return
         self._closed = True
-        self._files.complete()
+        self._background.shutdown()
+        try:
+            self._raise_background_error()
+        finally:
+            self._complete(self._file)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        # Also after an exception: what was recorded up to it is what one wants to look at.
+        # After an exception, too: the record up to it is what one wants to look at.
         self.close()
 
-    def _check_consistent(self, topic: str, definition: MessageDefinition) -> None:
-        """Refuse a second type of one topic, and a second definition of one type."""
-        for known in self._topics.values():
-            same_name = known.name == topic or known.definition.type_name == definition.type_name
-            if same_name and known.definition != definition:
-                raise ValueError(
-                    f'topic {topic!r} of type {definition.type_name} ({definition.type_hash}) '
-                    f'contradicts topic {known.name!r} of type {known.definition.type_name} '
-                    f'({known.definition.type_hash}): record it in a bag of its own')
+    def _is_full(self, log_time_ns: int) -> bool:
+        range_ns = self._file.content.time_range_ns
+        return range_ns is not None and (
+            self._file.size_bytes >= self._max_file_bytes
+            or log_time_ns - range_ns[0] >= self._max_file_ns)
+
+    def _split(self) -> None:
+        """Go on in the next file, and complete the present one meanwhile."""
+        self.flush()
+        if self._completion is not None:
+            # long done, unless files fill up faster than the disk takes them
+            self._completion.result()
+        full, self._file = self._file, self._next_file()
+        for topic in self._topics.values():
+            self._file.add_topic(topic)
+        self._completion = self._background.submit(self._complete, full)
+
+    def _next_file(self) -> '_McapFile':
+        name = f'{self.path.name}_{self._file_count}.mcap'
+        file = _McapFile(self.path / name if self._is_directory else self.path, self._compression)
+        self._file_count += 1
+        return file
+
+    def _complete(self, file: '_McapFile') -> None:
+        """Complete a file, and list it in the metadata of a bag directory."""
+        file.close()
+        self._completed.append(file.content)
+        if self._is_directory:
+            metadata.write_metadata_file(self.path, metadata.bag_metadata(self._completed))
+        else:
+            metadata.sync_folder(self.path.parent)
+
+    def _raise_background_error(self) -> None:
+        if self._completion is not None and self._completion.done():
+            self._completion.result()
 
     def _check_open(self, action: str) -> None:
         if self._closed:
             raise ValueError(
                 f'cannot {action} the bag {str(self.path)!r}: it is closed; start another one')
+
+
+class _McapFile:
+    """
+    Write the messages of one file, chunk by chunk, without any checks.
+
+    `content` describes the file so far. A chunk ends with :meth:`flush`. Raises FileExistsError
+    for a path that exists.
+    """
+
+    def __init__(self, path: Path, compression: str) -> None:
+        self.path = path
+        self.content = metadata.RecordedFile(path.name)
+        self.open_chunk_bytes = 0
+        self._whole_chunk_bytes = 0
+        # After a failed write, mcap's writer and the file no longer agree.
+        self._is_broken = False
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._stream = path.open('xb')
+        # Chunk checksums alone leave the bytes between chunks unchecked: a damaged record type
+        # there would make a reader skip a whole chunk without a word.
+        self._mcap = Writer(self._stream, chunk_size=_NO_LIMIT, enable_data_crcs=True,
+                            compression=_COMPRESSIONS[compression])
+        try:
+            self._mcap.start(profile=Profile.ROS2, library=f'koopman_ros {__version__}')
+            # rosbag2 too writes the record at both ends. The last one counts; the first one lets
+            # a file whose recorder was killed keep its format version.
+            self._add_metadata_record()
+            self.flush()
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            path.unlink()
+            raise
+
+    @property
+    def size_bytes(self) -> int:
+        """The size so far, with the open chunk as if it was not compressed."""
+        return self._whole_chunk_bytes + self.open_chunk_bytes
+
+    def add_topic(self, topic: metadata.RecordedTopic) -> None:
+        """Announce a topic, once; its own count of messages begins at 0."""
+        definition = topic.definition
+        if definition.type_name not in self._schemas:
+            self._schemas[definition.type_name] = self._mcap.register_schema(
+                name=definition.type_name, encoding=SchemaEncoding.ROS2,
+                data=definition.text.encode('utf-8'))
+        self._channels[topic.name] = self._mcap.register_channel(
+            topic=topic.name, message_encoding=MessageEncoding.CDR,
+            schema_id=self._schemas[definition.type_name],
+            metadata={'offered_qos_profiles': metadata.dump_offered_qos(topic.offered_qos),
+                      'topic_type_hash': definition.type_hash})
+        self.content.topics[topic.name] = metadata.RecordedTopic(
+            topic.name, definition, topic.offered_qos)
+
+    def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int
+              ) -> None:
+        """Append one message to the open chunk."""
+        self._mcap.add_message(
+            channel_id=self._channels[topic], log_time=log_time_ns, data=data,
+            publish_time=publish_time_ns, sequence=sequence % _SEQUENCE_MODULUS)
+        self.open_chunk_bytes += len(data) + _MESSAGE_HEAD_BYTES
+        self.content.count(topic, log_time_ns)
+
+    def flush(self) -> None:
+        """End the open chunk and hand everything to the operating system."""
+        if self._is_broken:
+            raise OSError(f'{str(self.path)!r} ends where it could not be written before')
+        try:
+            self._mcap.flush()
+        except OSError:
+            self._is_broken = True
+            raise
+        self._whole_chunk_bytes = self._stream.tell()
+        self.open_chunk_bytes = 0
+
+    def close(self) -> None:
+        """Complete the file on the disk; after an OSError it ends with its last whole chunk."""
+        try:
+            self.flush()
+            self._add_metadata_record()
+            self._mcap.finish()
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            os.truncate(self.path, self._whole_chunk_bytes)
+            raise
+        self._stream.close()
+
+    def _add_metadata_record(self) -> None:
+        text = metadata.dump_metadata(metadata.bag_metadata([self.content]))
+        self._mcap.add_metadata('rosbag2', {'serialized_metadata': text})
 
 
 def _checked_time(name: str, time_ns: int) -> int:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The demo; see :mod:`koopman_ros.demo.first_act`."""
+"""The demo; see :mod:`koopman_ros.demo.setpoint_demo`."""
 
 import sys
 
 from koopman_ros.startup import run_program
 
 if __name__ == '__main__':
-    sys.exit(run_program('koopman_ros.demo.first_act', 130))
+    sys.exit(run_program('koopman_ros.demo.setpoint_demo', 130))

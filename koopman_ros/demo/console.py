@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What both acts do on the terminal: options, a live table, and what came of them."""
+"""The terminal of the demos: options, a live table, and the figures at the end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rich.table import Table
 
 from koopman_ros.demo.loop import Row
 from koopman_ros.parameters.wire import Signals
-from koopman_ros.testing import reserved_output
+from koopman_ros.testing import HarnessError, reserved_output
 from koopman_ros.units import SECONDS_PER_MINUTE, shown, unit_label
 
 _ROWS = 20  # in the table of a run
@@ -54,20 +54,20 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
     return options
 
 
-def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argparse.Namespace,
-            errors: tuple[type[Exception], ...], files: str) -> int:
-    """Run a demo, say what came of it or which of `errors`, and return the exit code."""
+def run_demo(demo: Callable[[Path, float], Mapping[str, object]], options: argparse.Namespace,
+             files: str) -> int:
+    """Run a demo, print its figures or why it failed, and return the exit code."""
     try:
         with reserved_output(options.output) as output:
             if output != options.output:
                 print(f'another run writes to {options.output}: this one writes to {output}',
                       flush=True)
-            result = act(output, options.speed)
-    except errors as error:
+            result = demo(output, options.speed)
+    except (HarnessError, OSError, ValueError) as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
+        print('demo: interrupted; the recording is kept', file=sys.stderr)
         return 130
     for key, value in result.items():
         print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One closed loop of plant, controller and trainer in lock-step, with an operator beside it."""
+"""The closed loop of a demo: plant, controller and trainer in lock-step, and its operator."""
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.parameters.wire import Wiring
@@ -68,13 +69,19 @@ class Row:
 
 
 class Operator:
-    """Set the set-points through their topics and watch the loop, which `harness` runs."""
+    """
+    Operate the loop that `harness` runs: set-points, services and parameters, phase by phase.
 
-    def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None]
-                 ) -> None:
+    Raises HarnessError where the loop refuses a step, or stands still.
+    """
+
+    def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None],
+                 announce: Callable[[str], None]) -> None:
         self.scenario = scenario
         self.harness = harness
+        self.phases: list[tuple[str, float]] = []  # name and start in s
         self._on_row = on_row
+        self._announce = announce
         # several topics: any message of those with one stamp may come first
         self._measured: dict[int, dict[str, float]] = {}
         self._commanded: dict[int, dict[str, float]] = {}
@@ -135,6 +142,47 @@ class Operator:
             self.harness.node.destroy_publisher(publisher)
         self._setpoints = None
 
+    def begin(self, name: str, text: str) -> None:
+        """Begin a phase, and announce it."""
+        self.phases.append((name, self.seconds))
+        self._announce(text)
+
+    def switch(self, service: str, on: bool) -> None:
+        """Call a service that switches something on or off."""
+        _check(service, self.harness.set_bool(service, on))
+
+    def set(self, node: str, **values: object) -> None:
+        """Set parameters of a node."""
+        for result in self.harness.set_parameters(node, **values):
+            if not result.successful:
+                raise HarnessError(f'{node}: {result.reason}')
+
+    def record_anew(self, bag: Path) -> None:
+        """End the recording, and begin another one."""
+        self.switch('trainer/record', False)
+        self.set('trainer', output=str(bag))
+        self.switch('trainer/record', True)
+
+    def wait_for(self, task: str, words: str, timeout: float) -> DiagnosticStatus:
+        """Wait until the status of a task of the trainer begins with some words."""
+        def found() -> DiagnosticStatus | None:
+            status = self.harness.last_status(f'trainer: {task}')
+            if status is not None and status.level == DiagnosticStatus.ERROR:
+                raise HarnessError(f'{task}: {status.message}')
+            return status if status is not None and status.message.startswith(words) else None
+
+        status = self.harness.wait_until(found, f'the {task} did not end', timeout)
+        assert status is not None
+        return status
+
+    def train(self, model: Path, timeout: float) -> None:
+        """Let the trainer learn a model from its recording, and wait for it."""
+        _check('trainer/train', self.harness.trigger('trainer/train'))
+        status = self.wait_for('training', 'the new model', timeout)
+        self._announce(status.message)
+        if not model.exists():
+            raise HarnessError(status.message)
+
     def _on_part(self, parts: dict[int, dict[str, float]], heard: Heard) -> None:
         """Take a message, and show the row that it makes whole."""
         stamp = heard.stamp_ns
@@ -144,6 +192,11 @@ class Operator:
             self.last_stamp_ns = stamp
             self._on_row(Row((stamp - FIRST_STAMP_NS) / NANOSECONDS, self._measured.pop(stamp),
                              dict(self._active), self._commanded.pop(stamp)))
+
+
+def _check(service: str, response: SetBool.Response | Trigger.Response) -> None:
+    if not response.success:
+        raise HarnessError(f'{service}: {response.message}')
 
 
 def foreign(harness: Harness, wiring: Wiring) -> str:
@@ -176,6 +229,7 @@ def foreign(harness: Harness, wiring: Wiring) -> str:
 @contextlib.contextmanager
 def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                  on_row: Callable[[Row], None] = lambda _: None,
+                 announce: Callable[[str], None] = print,
                  panel: Mapping[str, object] | None = None) -> Iterator[Operator]:
     """
     Run plant, controller and trainer in lock-step, the set-points requested, until it is left.
@@ -185,9 +239,10 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
 
     :param logs: folder for what the processes print.
     :param trainer: parameters of the trainer, which records from its start.
-    :param on_row: called with what the operator sees, at every command.
-    :param panel: parameters of a panel beside the loop, None for no panel.
-    :raises HarnessError: when others in the domain publish or take what the loop does, before
+    :param on_row: called at every command.
+    :param announce: called with a text at the begin of each phase.
+    :param panel: parameters of a panel, None for no panel.
+    :raises HarnessError: when other nodes of the domain use the loop's topics or names, before
         anything is commanded; when a process ends early or the loop stands still.
     """
     with (deferred_interrupt() as check_interrupt,
@@ -201,7 +256,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                 f'ROS domain {domain} has other nodes with the names or topics of the demo: '
                 f'{found}; end them, or start in another domain: '
                 f'ROS_DOMAIN_ID={(int(domain) + 1) % 102} make demo')
-        operator = Operator(scenario, harness, on_row)
+        operator = Operator(scenario, harness, on_row, announce)
         harness.start('controller', {'system': scenario.system, **scenario.controller})
         harness.start('trainer', {'system': scenario.system, **trainer})
         harness.wait_until(lambda: operator.found_loop,

@@ -1,21 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The reactor on the wire, as the demos know it: topics, messages and parameters."""
+"""The loop of the reactor: its topics and the parameters that it starts with."""
 
 from typing import Any
 
-from builtin_interfaces.msg import Time
-from sensor_msgs.msg import Temperature
-
 from koopman_ros.demo.loop import Scenario
 from koopman_ros.lifting import load
-from koopman_ros.parameters.controller import ControllerParameters, InputParameters, table_of
-from koopman_ros.parameters.table import ParameterTable
+from koopman_ros.parameters.controller import InputParameters, table_of
+from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.resources import model_path
-from koopman_ros.units import to_celsius
 
-SYSTEM, MODEL, LINEAR_MODEL = 'reactor', 'reactor_nz4', 'reactor_linear'
+SYSTEM, MODEL = 'reactor', 'reactor_nz4'
 TEMPERATURE = 'temperature'
 CONCENTRATION = 'concentration'
 SETPOINT = 'setpoint'
@@ -26,42 +22,17 @@ MANUAL_COOLANT_SETPOINT = 'manual_coolant_setpoint'
 PREDICTED_TEMPERATURE = 'predicted_temperature'
 
 
-def controller_table() -> ParameterTable[ControllerParameters]:
-    """Return the parameters of a controller."""
-    return table_of(load(model_path(MODEL)))
-
-
-def controller_parameters() -> ControllerParameters:
-    """Return those of a controller that was given none."""
-    return controller_table().snapshot({})
-
-
 def coolant_parameters() -> InputParameters:
-    """Return what it is tuned by for the coolant."""
-    return controller_parameters().inputs[COOLANT_TEMPERATURE]
+    """Return the default parameters of the coolant."""
+    return table_of(load(model_path(MODEL))).snapshot({}).inputs[COOLANT_TEMPERATURE]
 
 
 def constant(name: str) -> float:
-    """Return a constant of a plant that was given none, in SI."""
-    # here, as it takes scipy's integrators, a third of a second that others do without
-    from koopman_ros.parameters.plant import PlantTable
-
+    """Return the default of a constant of the plant, in SI."""
     return float(PlantTable().rows[f'constants.{name}'].default)
 
 
 def scenario(model: str, setpoint: float, **others: Any) -> Scenario:
-    """
-    Return a loop that a model controls alone, with a set-point in K.
-
-    The observer would make up for what a model does not know, which is what is to be seen.
-    """
+    """Return a loop without disturbance observer, with a set-point in K."""
     return Scenario({TEMPERATURE: setpoint}, controller={
         'model': model, 'disturbance_bandwidth': 0.0}, **others)
-
-
-def temperature_message(kelvin: float, stamp: Time, frame_id: str) -> Temperature:
-    """Build a message from a temperature in K."""
-    message = Temperature(temperature=to_celsius(kelvin))
-    message.header.stamp = stamp
-    message.header.frame_id = frame_id
-    return message

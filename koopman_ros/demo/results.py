@@ -1,29 +1,29 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results of both acts, from their bags: series, figures and the pictures."""
+"""A recorded run, read from its bags, and the figures of it."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-import itertools
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-# where it is missing, the demo ends before it has run and not after
+# a missing matplotlib ends the demo before its run, not after
 import matplotlib.figure  # noqa: F401
 import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.bags import read_series
-from koopman_ros.demo.reactor import COOLANT_TEMPERATURE, TEMPERATURE
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.controller import InputParameters
 from koopman_ros.parameters.wire import Wiring
-from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, LIMIT
-from koopman_ros.units import conversion, NANOSECONDS, to_celsius, ZERO_CELSIUS
+from koopman_ros.units import conversion, NANOSECONDS
 from koopman_ros.wire import Place
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _AVERAGED = 600.0  # s over which an offset is averaged
-_COLORS = ('0.96', '#fde8e4', '#e6eefa', '#fdf5dc', '#e4f3e4')  # of phases
 
 
 @dataclass(frozen=True)
@@ -80,84 +80,13 @@ def read_run(wiring: Wiring, *bags: Path) -> Run:
     return Run(seconds, measured, (stamps - origin) / NANOSECONDS, commanded)
 
 
-def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: float,
-         model: LiftedModel, limits: InputParameters) -> None:
-    """
-    Draw both runs: temperature with set-point and training range, coolant with limits.
-
-    :param setpoint: in K, from `step_time` on, in s after the first measurement.
-    """
-    start, end = float(learned.measured[TEMPERATURE][0]), float(learned.seconds[-1])
-    low, high = (to_celsius(float(b[0])) for b in (model.states.lower, model.states.upper))
-    with drawing(path, 2, 1, size=(9.0, 7.0), sharex=True) as (_, (upper, lower)):
-        upper.axhspan(low, high, label='training range', **DRAWN_RANGE)
-        upper.step(np.array([0.0, step_time, end]) / 60.0,
-                   np.array([start, setpoint, setpoint]) - ZERO_CELSIUS, 'k--', where='post',
-                   linewidth=1.2, label='set-point')
-        draw_limits(lower, (limits.min, limits.max), 'coolant limits')
-        for name, run, digits, style in (
-                ('linearised', linear, '+.2f', {'color': 'tab:red'}),
-                ('learned', learned, '+.0e', {'color': 'tab:green', 'linewidth': 2.0})):
-            upper.plot(run.seconds / 60.0, run.measured[TEMPERATURE] - ZERO_CELSIUS, **style,
-                       label=f'{name} controller '
-                       f'(ends {run.final_error(TEMPERATURE, setpoint):{digits}} K off)')
-            lower.step(run.command_seconds / 60.0,
-                       run.commanded[COOLANT_TEMPERATURE] - ZERO_CELSIUS, where='post',
-                       label=f'{name} controller', **style)
-        upper.set(ylabel='reactor temperature [°C]', ylim=(low - 1.0, high + 1.0), title=(
-            f'Set-point step of {setpoint - start:+.0f} K at {step_time / 60.0:.0f} min, '
-            'disturbance observer off: what each model knows'))
-        upper.legend(loc='upper right')
-        lower.set(ylabel='coolant set-point [°C]', xlabel='plant time [min]',
-                  xlim=(0.0, end / 60.0))
-        lower.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1))
-
-
-def plot_retraining(path: Path, history: Run, phases: Sequence[tuple[str, float]],
-                    setpoint: float, present: LiftedModel, learned: LiftedModel,
-                    limits: InputParameters) -> None:
-    """
-    Draw the story: temperature, coolant and error over plant time, phase by phase.
-
-    :param phases: name and start of each, in s.
-    :param setpoint: in K, from the step on.
-    :param present: the lift at the start; training ranges of both are drawn.
-    """
-    minutes = history.seconds / 60.0
-    end = float(minutes[-1])
-    starts = [start / 60.0 for _, start in phases] + [end]
-    temperature = history.measured[TEMPERATURE]
-    smooth = np.convolve(temperature - setpoint, np.ones(60) / 60.0, mode='valid')
-    with drawing(path, 3, 1, size=(11.0, 9.0), sharex=True,
-                 height_ratios=(3, 2, 2)) as (_, panels):
+def draw_phases(panels: Sequence[Axes], phases: Sequence[tuple[str, float]]) -> None:
+    """Mark the start of each phase, in s, in all panels over minutes; name it in the first."""
+    low, high = panels[0].get_ylim()
+    panels[0].set_ylim(low, high + 0.18 * (high - low))
+    for number, (name, start) in enumerate(phases):
         for axes in panels:
-            for color, (left, right) in zip(itertools.cycle(_COLORS), itertools.pairwise(starts)):
-                axes.axvspan(left, right, color=color, linewidth=0.0)
-        upper, middle, lower = panels
-        upper.plot(minutes, temperature - ZERO_CELSIUS, color='tab:green', linewidth=1.0,
-                   label='measured')
-        upper.axhline(to_celsius(setpoint), color='k', linestyle='--', linewidth=1.0,
-                      label='set-point')
-        for model, name, style in ((present, 'shipped lift', ':'), (learned, 'new lift', '-.')):
-            for i, bound in enumerate((model.states.lower[0], model.states.upper[0])):
-                upper.axhline(to_celsius(float(bound)), **{**LIMIT, 'linestyle': style},
-                              label=f'training range of the {name}' if i == 0 else None)
-        low, high = upper.get_ylim()
-        # in two rows in turn: the first phases are short
-        for number, ((name, _), start) in enumerate(zip(phases, starts, strict=False)):
-            upper.text(start, high + (0.17, 0.08)[number % 2] * (high - low), ' ' + name,
+            axes.axvline(start / 60.0, color='0.7', linewidth=0.8)
+        # in two rows in turn: phases may be short
+        panels[0].text(start / 60.0, high + (0.17, 0.08)[number % 2] * (high - low), f' {name}',
                        va='top', fontsize=9)
-        upper.set(ylabel='reactor temperature [°C]', ylim=(low, high + 0.18 * (high - low)),
-                  title='The plant drifts, is recorded, and its controller learns it anew '
-                  '(disturbance observer off)')
-        upper.legend(loc='lower right', ncols=2, fontsize=8)
-        draw_limits(middle, (limits.min, limits.max), 'coolant limits')
-        middle.step(history.command_seconds / 60.0,
-                    history.commanded[COOLANT_TEMPERATURE] - ZERO_CELSIUS, where='post',
-                    color='tab:blue', linewidth=1.0, label='commanded')
-        middle.set_ylabel('coolant [°C]')
-        middle.legend(loc='upper right', fontsize=8)
-        lower.semilogy(minutes[30:30 + len(smooth)], np.maximum(np.abs(smooth), 1e-4),
-                       color='tab:red', linewidth=1.0, label='mean over a minute')
-        lower.set(ylabel='size of the error [K]', xlabel='plant time [min]', xlim=(0.0, end))
-        lower.legend(loc='lower left', fontsize=8)

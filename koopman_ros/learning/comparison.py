@@ -22,7 +22,7 @@ from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.starts import Progress, Recipe, Watch
 from koopman_ros.learning.training import NoUsefulLift, reference_drift, train, training_states
 from koopman_ros.learning.validation import evaluate, Figures, fit, ROUNDING
-from koopman_ros.lifting import bounds, Box, LiftedModel
+from koopman_ros.lifting import Box, LiftedModel, model_file
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.reports import table
@@ -269,7 +269,7 @@ class _Learner:
         for degree in degrees:
             try:
                 model = Edmd(degree).learn(self._plant, self._training, self._box)
-                bounds.check(model)
+                model_file.check(model)
                 tried.append(Contender(POLYNOMIAL, model, self.rx(model), None, None, 0.0))
             except (ValueError, np.linalg.LinAlgError) as error:
                 refusal = str(error)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 import torch
 from torch import Tensor
 
@@ -66,19 +65,15 @@ def with_units_of(drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
     """
     Add the hidden units of a network to those of a lift, whose z they leave as it is.
 
-    :raises ValueError: for networks that differ in their activation or number of layers.
+    :raises ValueError: for other lifts than of networks.
     """
     ours, theirs = lift.observables, drift.observables
-    if not (isinstance(ours, NetworkObservables) and isinstance(theirs, NetworkObservables)
-            and ours.activation == theirs.activation and len(ours.hidden) == len(theirs.hidden)):
-        raise ValueError('units of networks of different kinds cannot stand in one layer')
-    hidden = []
-    for i, ((W, b), (more_W, more_b)) in enumerate(zip(ours.hidden, theirs.hidden, strict=True)):
-        weight = block_diag(W, more_W) if i else np.vstack([W, more_W])
-        hidden.append((weight, np.concatenate([b, more_b])))
-    idle = np.zeros((len(ours.output), theirs.output.shape[1]))
+    if not (isinstance(ours, NetworkObservables) and isinstance(theirs, NetworkObservables)):
+        raise ValueError('only units of networks can stand in one layer')
+    idle = np.zeros((len(ours.V), len(theirs.W)))
     return replace(lift, readout=None, observables=replace(
-        ours, hidden=tuple(hidden), output=np.hstack([ours.output, idle])))
+        ours, W=np.vstack([ours.W, theirs.W]), b=np.concatenate([ours.b, theirs.b]),
+        V=np.hstack([ours.V, idle])))
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,8 @@ class Scaling:
                                  f'plant has {_listed(ours)}: begin from that of a plant of the '
                                  'same kind')
         wanted = recipe.identity, recipe.layers, recipe.activation
-        if not isinstance(network, NetworkObservables) or not len(network.output) or (
-                network.identity, len(network.hidden), network.activation) != wanted:
+        if not isinstance(network, NetworkObservables) or not len(network.V) or (
+                network.identity, 1, 'tanh') != wanted:
             raise ValueError(
                 'the lift that is begun from is of another class: begin from one with '
                 f'{"" if recipe.identity else "no "}identity coordinates and others by a network '
@@ -82,21 +82,14 @@ class Scaling:
         # deviations there are `stretch` times those here and `shift`
         stretch = own.scale / begin.states.scale
         shift = (own.center - begin.states.center) / begin.states.scale
-        (W, b), *further = network.hidden
-        W, b = W * stretch, b + W @ shift
+        W, b = network.W * stretch, network.b + network.W @ shift
         if self.frame:
             W = W @ np.linalg.inv(self.frame.T)
-        layers = [(W, b), *further]
-        if len(layers) == 1:
-            # units of the read-out alone have no part in z
-            used = np.any(network.output != 0.0, axis=0)
-            layers, output = [(W[used], b[used])], network.output[:, used]
-        else:
-            output = network.output
+        # units of the read-out alone have no part in z
+        used = np.any(network.V != 0.0, axis=0)
         like = data.x
-        return recipe.planted(data, [
-            (like.new_tensor(np.ascontiguousarray(W)), like.new_tensor(b)) for W, b in layers],
-            like.new_tensor(np.ascontiguousarray(output)))
+        return recipe.planted(data, [(like.new_tensor(W[used]), like.new_tensor(b[used]))],
+                              like.new_tensor(network.V[:, used]))
 
     def model(self, grown: Grown, **about: Any) -> LiftedModel:
         """Return what was learned in units; `about` are further fields of the model."""
@@ -104,10 +97,12 @@ class Scaling:
         A, B = self.pace * parts.A.numpy(), None if parts.B is None else (
             self.pace * parts.B.numpy())
         alone = grown.drift_alone
+        if len(parts.hidden) != 1 or grown.layout.activation != 'tanh':
+            raise ValueError('only networks of one hidden layer of tanh can be run')
+        (W, b), = parts.hidden
         observables = NetworkObservables(
-            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
-            parts.V.numpy()[:0 if alone else None], alone or grown.layout.identity,
-            grown.layout.activation)
+            W.numpy(), b.numpy(), parts.V.numpy()[:0 if alone else None],
+            alone or grown.layout.identity)
         if self.frame:
             observables, A, B = self.frame.leave(observables, A, B)
         constant, terms = self.inputs.matrix(B)

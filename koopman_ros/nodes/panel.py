@@ -44,13 +44,15 @@ from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.parameters.wire import Wiring, words_of
 from koopman_ros.reasons import Code, reason
 from koopman_ros.replay import records
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
-from koopman_ros.ros.node import Level, LoopNode, Status, wall_timer, words_of
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.hosted import wall_timer
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
 from koopman_ros.ros.remote import RemoteNode
 from koopman_ros.ros.repeated import RepeatedValues

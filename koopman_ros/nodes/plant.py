@@ -3,8 +3,8 @@
 
 """The plant node: a simulated plant that publishes measurements and takes commands."""
 
-from dataclasses import replace
 from enum import Enum
+from functools import partial
 import math
 import sys
 import time
@@ -15,15 +15,17 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from koopman_ros import plants
-from koopman_ros.arrays import Array
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
 from koopman_ros.parameters.wire import PLANT_KINDS, SIGNALS, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.host import run_loops
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Level, Status, wall_timer
-from koopman_ros.ros.process import run
+from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
+from koopman_ros.ros.simulated_plant import SimulatedPlant
 from koopman_ros.units import display_unit, LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, shown
 from koopman_ros.wire import stem
 
@@ -56,13 +58,13 @@ class PlantNode(ManagedNode):
         """Build the plant at its initial state, and what publishes it."""
         table = self._table
         self._settings = parameters = self.current(table)
-        system = self._build(parameters)
         self._signals = signals = table.described
-        self._sensors = self._known_sensors()
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep
         self._period_ns = round(parameters.sample_period * NANOSECONDS)
         self._start_ns = round(parameters.start_time * NANOSECONDS)
-        self._plant = self._initial(system, self._start_ns)
+        self._plant = SimulatedPlant(table, parameters, self._start_ns)
+        if self._plant.note:
+            self.get_logger().warning(self._plant.note)
         self._phase, self._trip = Phase.WAITING if parameters.lockstep else Phase.RUNNING, ''
         self._sample = 0  # number of the next measurement
         self._answered = True  # whether the last measurement has its command
@@ -91,7 +93,7 @@ class PlantNode(ManagedNode):
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
         self._counted = [publisher for publisher in self._states.publishers
                          if publisher.topic_name in map(self.resolve_topic_name, counted)]
-        self.diagnostics.hardware_id = system.name
+        self.diagnostics.hardware_id = self._plant.name
         self._diagnostics = self.diagnostics.add('simulation', self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
         wall_period = parameters.sample_period / (parameters.speed or math.inf)
@@ -107,7 +109,7 @@ class PlantNode(ManagedNode):
         start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s on'
         lockstep = (f', in lock-step: it begins with {parameters.lockstep_subscribers} '
                     'subscribers and a controller') if parameters.lockstep else ''
-        self.get_logger().info(f'{system.name} started: a measurement every '
+        self.get_logger().info(f'{self._plant.name} started: a measurement every '
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def activate(self) -> None:
@@ -130,32 +132,6 @@ class PlantNode(ManagedNode):
     def _latched(self, topic: str, kind: Any) -> Any:
         return self._matching.publish(topic, kind, topics.LATCHED_QOS)
 
-    def _build(self, parameters: PlantParameters) -> plants.ControlAffineSystem:
-        """Build the plant, which starts from its steady state if it has one."""
-        try:
-            return self._table.system(parameters)
-        except plants.EquilibriumError as error:
-            nominal = self._table.system(self._table.snapshot({})).nominal_state
-            system = self._table.system(parameters, nominal)
-            self.get_logger().warning(
-                f'{error}; the plant starts at {system.describe_state(nominal)} instead')
-            return system
-
-    def _column(self, attribute: str) -> Array:
-        """Return a parameter of all states (n_x,)."""
-        return np.array([getattr(self._settings.states[name], attribute)
-                         for name in self._signals.states])
-
-    def _known_sensors(self) -> tuple[Array, Array, Array, Array]:
-        """Return deviation of the noise, resolution, bias and variance of all states (n_x,)."""
-        noise, resolution = self._column('noise'), self._column('resolution')
-        # the steps of the scale have the variance of a uniform error
-        return noise, resolution, self._column('bias'), noise ** 2 + resolution ** 2 / 12.0
-
-    def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
-        x, u = system.nominal_state + self._column('initial_offset'), system.nominal_input
-        return plants.Process(system, time_ns, x, u, self._table.actuator(self._settings), u)
-
     def _now_ns(self) -> int:
         """Return the plant time that the wall clock stands for."""
         elapsed = time.monotonic() - self._wall_start
@@ -171,7 +147,7 @@ class PlantNode(ManagedNode):
             self._wall_start = time.monotonic()
             if self._real_time:
                 self._start_ns = time.time_ns()
-                self._plant = replace(self._plant, time_ns=self._start_ns)
+                self._plant.skip_to(self._start_ns)
         if self._phase is not Phase.RUNNING:
             return
         if self._settings.speed:
@@ -231,20 +207,17 @@ class PlantNode(ManagedNode):
 
     def _publish(self, sample: int) -> None:
         """Publish the plant as it stands, the states, which are answered, last."""
-        plant, settings = self._plant, self._settings
-        stamp, frame_id = stamp_message(plant.time_ns), settings.frame_id
+        stamp, frame_id = stamp_message(self._plant.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.heard(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
-        self._applied.send(plant.u, stamp, frame_id)
-        deviation, resolution, bias, variance = self._sensors
-        noise = np.array([plants.sensor_noise(one, settings.seed, sample, i)
-                          for i, one in enumerate(deviation.tolist())])
-        self._states.send(plant.x + noise + bias, stamp, frame_id, variance, resolution)
+        self._applied.send(self._plant.inputs, stamp, frame_id)
+        measured, variance, resolution = self._plant.measure(sample)
+        self._states.send(measured, stamp, frame_id, variance, resolution)
 
     def _advance(self, time_ns: int) -> bool:
         """Bring the process to an instant; a plant that ran away stops."""
         try:
-            self._plant = self._plant.until(time_ns)
+            self._plant.advance(time_ns)
         except plants.IntegrationError as error:
             self._phase, self._trip = Phase.TRIPPED, str(error)
             self.get_logger().error(f'{error}; call ~/reset to start again')
@@ -270,10 +243,9 @@ class PlantNode(ManagedNode):
             self._rejection = ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
-                followed = dict(zip(self._signals.inputs, self._plant.followed.tolist(),
+                followed = dict(zip(self._signals.inputs, self._plant.commanded.tolist(),
                                     strict=True))
-                self._plant = self._plant.commanded(
-                    np.array(list((followed | self._heard).values())), self._plant.time_ns)
+                self._plant.command(np.array(list((followed | self._heard).values())))
         else:
             self._rejected += 1
             unit = self._signals.inputs[wrong[0]]
@@ -303,13 +275,13 @@ class PlantNode(ManagedNode):
                                 if self._phase is Phase.FINISHED else self._phase.value)
             return response
         response.success = True
-        self._plant = fresh = self._initial(self._plant.system, self._plant.time_ns)
+        self._plant.reset()
         if self._phase is Phase.TRIPPED:
             self._phase, self._trip = Phase.RUNNING, ''
             self._resynchronise()
         response.message = 'reset to ' + ', '.join(
             f'{name} {value:.6g} {unit[1:-1]}' for (name, unit), value in (
-                (label.rsplit(' ', 1), value) for label, value in self._shown(fresh).items()))
+                (label.rsplit(' ', 1), value) for label, value in self._plant.figures().items()))
         self.get_logger().info(response.message)
         self._diagnostics.publish_if_changed()
         return response
@@ -322,21 +294,13 @@ class PlantNode(ManagedNode):
             return
         passed = self._now_ns() if self._settings.speed else self._plant.time_ns
         self._sample = max(self._sample, -(-(passed - self._start_ns) // self._period_ns))
-        self._plant = replace(self._plant, time_ns=max(passed, self._plant.time_ns))
+        self._plant.skip_to(passed)
 
     def _on_parameters(self, parameters: PlantParameters) -> None:
         if not self._settings.lockstep:
             self._advance_to_now()
-        self._settings, before = parameters, self._plant.system
-        self._sensors = self._known_sensors()
-        try:
-            system = self._table.system(parameters)
-        except plants.EquilibriumError:
-            system = self._table.system(parameters, before.nominal_state)
-        # the nominal point stays what it was, for ~/reset
-        self._plant = replace(
-            self._plant, actuator=self._table.actuator(parameters), system=replace(
-                system, nominal_state=before.nominal_state, nominal_input=before.nominal_input))
+        self._settings = parameters
+        self._plant.tune(parameters)
 
     def _status(self) -> Status:
         level, message = Level.OK, self._phase.value
@@ -358,24 +322,16 @@ class PlantNode(ManagedNode):
                 'is active, and its topics and domain')
         return Status(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
-            **self._shown(self._plant),
+            **self._plant.figures(),
             **{f'{stem(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
                for (name, unit), value in zip(self._signals.inputs.items(),
-                                              self._plant.followed.tolist(), strict=True)},
+                                              self._plant.commanded.tolist(), strict=True)},
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,
             'missed commands': self._missed,
             'foreign commands': self._foreign,
         })
-
-    def _shown(self, plant: plants.Process) -> dict[str, float]:
-        """Return states and inputs with their names and units."""
-        inputs = {stem(name, unit): unit for name, unit in self._signals.inputs.items()}
-        signals = [*self._signals.states.items(), *inputs.items()]
-        return {f'{name} [{display_unit(unit)}]': shown(value, unit)
-                for (name, unit), value in zip(
-                    signals, [*plant.x.tolist(), *plant.u.tolist()], strict=True)}
 
     def _unanswered(self) -> bool:
         """Tell whether no command arrives of an input, be it from the start or for some time."""
@@ -388,7 +344,7 @@ class PlantNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the plant node."""
-    return run('plant', PlantNode, args, hosts=True)
+    return run('plant', PlantNode, args, partial(run_loops, 'plant', PlantNode), events_executor)
 
 
 if __name__ == '__main__':

@@ -11,6 +11,7 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros import bags
@@ -18,7 +19,8 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import player_table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
-from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.hosted import wall_timer
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
 from koopman_ros.units import NANOSECONDS
 
@@ -117,9 +119,10 @@ class PlayerNode(LoopNode):
             missing.append(self._answers.topic_name)
         if not missing:
             self._began = True
+            # before the time counts: the first message of a type takes a tenth of a second
+            self._next = next(self._messages, None)
             self._due = self._wall_start = self._said = time.monotonic()
             self.get_logger().info(f'playing {self._settings.bag}')
-            self._next = next(self._messages, None)
         elif time.monotonic() - self._wall_start > self._settings.wait_timeout:
             self._give_up(
                 f'{", ".join(missing)} found no counterpart within '
@@ -220,10 +223,10 @@ def _stamp_ns(message: bags.BagMessage) -> int | None:
         return None
 
 
-def recorded_offer(offered: tuple[bags.QosProfile, ...]) -> QoSProfile:
+def recorded_offer(offered: tuple[Qos, ...]) -> QoSProfile:
     """Offer what all publishers of the recording offered."""
-    best_effort = bool(offered) and all(o.reliability == 'best_effort' for o in offered)
-    latched = bool(offered) and all(o.durability == 'transient_local' for o in offered)
+    best_effort = {o.reliability for o in offered} == {QosReliability.BEST_EFFORT}
+    latched = {o.durability for o in offered} == {QosDurability.TRANSIENT_LOCAL}
     return topics.profile(
         max(1, *(o.depth for o in offered)) if latched else topics.LOOP_QOS.depth,
         reliable=not best_effort, latched=latched)

@@ -101,7 +101,7 @@ class TrainerNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the trainer node, or with ``--loops`` the retraining of many plants."""
-    return run('trainer', TrainerNode, args, hosts=run_fleet)
+    return run('trainer', TrainerNode, args, run_fleet)
 
 
 if __name__ == '__main__':

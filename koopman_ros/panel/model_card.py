@@ -34,7 +34,7 @@ def model_card(model: LiftedModel) -> dict[str, str]:
     origin = model.provenance
     found = {
         'Model class': model.kind,
-        'Rejected by its training': '; '.join(origin.refused),
+        'Acceptance': origin.acceptance,
         'Learned from': origin.plant, 'Derivatives': origin.method,
         'Written by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'Random seed': '' if origin.seed is None else str(origin.seed)}

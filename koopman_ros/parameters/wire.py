@@ -9,20 +9,16 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 import functools
 from functools import cached_property
-import math
 from pathlib import Path
 import re
+from types import MappingProxyType
 from typing import Any
 
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.table import (
-    as_yaml,
-    ConfigurationError,
-    parameter,
-    ParameterTable,
-)
+from koopman_ros.parameters.table import ConfigurationError, parameter
+from koopman_ros.reasons import Words
 from koopman_ros.resources import config_directory
-from koopman_ros.units import check_unit, conversion
+from koopman_ros.units import check_unit, conversion, Display, Displays
 from koopman_ros.wire import Place, place, SIGNAL_NAME, stem
 
 CONTROLLER_STATE = 'controller_state'
@@ -170,6 +166,11 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
                    {} if len(states) == len(every) else every)
+
+
+def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
+    """Return the words for some signals; `shown` are those not written as they usually are."""
+    return Words(Displays(signals.units, {'K': Display('K', 'degC', '.2f'), **shown}))
 
 
 @dataclass(frozen=True)
@@ -323,27 +324,6 @@ def _content(path: Path) -> dict[str, Any]:
     # by libyaml, which is in its wheels and in packages of distributions, ten times as fast
     loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
     return dict(yaml.load(path.read_text(), loader))
-
-
-def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> str:
-    """Say what former parameters among those given are called now, or return an empty string."""
-    path = config_directory() / 'renamed.yaml'
-    if not (unknown := set(given) - set(table.rows)) or not path.is_file():
-        return ''
-    said = []
-    for name, (now, factor) in _content(path).get(node, {}).items():
-        if name in unknown and now in table.rows:
-            value, row = given[name], table.rows[now]
-            if isinstance(factor, Mapping):
-                value = factor.get(value, value)
-            elif factor == 'digits':
-                value = round(-math.log10(value), 6) if 0.0 < value < 1.0 else row.default
-            elif isinstance(value, (int, float)):
-                value = float(f'{value * factor:.12g}')
-            written = as_yaml((value,) if isinstance(row.default, tuple) else value)
-            said.append(f'{name} is now {now}' + (f' [{row.unit}]' if row.unit else '')
-                        + f': write {now}: {written}')
-    return '; '.join(said)
 
 
 def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None:

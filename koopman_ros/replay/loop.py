@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The replay: a loop over a controller's records, which gives its commands again."""
+"""The replay: a loop over the records of controllers, which gives their commands again."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -10,13 +10,12 @@ from typing import Any, TypeAlias
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Setpoint, State
 from koopman_ros.control.events import apply, Measurement, SetpointRequest
-from koopman_ros.kernels import IN_NUMPY, Kernels, named, NUMPY
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.replay import records
 
-# The model of a name and a digest, read anew each time; raises RecordError where there is none.
+# The model of a name and a digest; raises RecordError where there is none.
 FindModel: TypeAlias = Callable[[str, str], LiftedModel]
-# The tuning of a model that parameters by name stand for; raises ValueError where they do not fit.
+# The controller of parameters by name and a model; raises ValueError where they do not fit.
 Build: TypeAlias = Callable[[Mapping[str, Any], LiftedModel], Controller]
 
 
@@ -37,11 +36,9 @@ class Sample:
     stamp_ns: int  #: of the measurement that it answers, or of the silence
     measured: Array | None  #: (n_y,) or None in silence
     setpoint: Array | None  #: (n_c,) that was tracked according to the replay, or None
-    recorded: Array  #: (n_u,) what was commanded
-    #: (n_u,) the same by the replay; None where it knows no state, before the first snapshot and
-    #: behind a lost record
-    replayed: Array | None
-    alternative: Array | None  #: (n_u,) what the alternative commands, or None
+    recorded: Array  #: (n_u,)
+    replayed: Array | None  #: (n_u,) or None where the state is not known
+    alternative: Array | None  #: (n_u,) or None
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,7 @@ class Lost:
 
 @dataclass
 class Replay:
-    """What came of a replay."""
+    """The result of a replay."""
 
     #: one for each command, in the order of the records
     samples: list[Sample] = field(default_factory=list)
@@ -74,7 +71,7 @@ class Replay:
 def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Build,
            alternative: Alternative | None = None) -> Replay:
     """
-    Apply what is recorded again.
+    Apply recorded events again.
 
     Records come in the order of receipt; those of several runs may alternate. The alternative
     answers the same measurements under the set-points that were tracked. Raises RecordError for
@@ -89,93 +86,88 @@ def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Bui
             found.begins_late += record.event != records.START
         try:
             runs[record.run].take(record)
+        except records.RecordError:
+            raise
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError
                 ) as error:
-            if isinstance(error, records.RecordError):
-                raise
             raise records.RecordError(
                 f'record {record.number} of run {record.run} cannot be replayed '
                 f'({type(error).__name__}: {error})') from error
     return found
 
 
-def _kernels(record: records.Record) -> Kernels:
-    """Return the functions that answered, or those in numpy where there are none here."""
-    return named(record.fields.get(records.NUMERICS, IN_NUMPY)) or NUMPY
-
-
 class _Run:
-    """A run of a controller on its way through the replay."""
+    """A run of a controller, and the alternative beside it."""
 
     def __init__(self, found: Replay, find_model: FindModel, build: Build,
                  alternative: Alternative | None) -> None:
-        self._found = found
-        self._find_model = find_model
-        self._build = build
+        self._found, self._find_model, self._build = found, find_model, build
         self._other = alternative
         self._next: int | None = None  # number of the next record
         self._state: State | None = None  # None while it is not known
         self._other_state = State()
         self._parameters: dict[str, Any] = {}
-        self._kernels = NUMPY
         self._controller: Controller
         self._other_controller: Controller
 
     def take(self, record: records.Record) -> None:
         """Replay the next record."""
-        if self._next is not None:
-            if record.number < self._next:
-                raise records.RecordError(
-                    f'record {record.number} of run {record.run} comes again, or after record '
-                    f'{self._next - 1}: the bag is not in order')
-            if record.number > self._next:
-                self._found.lost.append(Lost(record.run, self._next, record.number - 1))
-                self._state = None
-        self._next = record.number + 1
-        if record.event in (records.START, records.SNAPSHOT):
-            if self._state is None or record.event == records.START:
-                self._begin(record)
-        elif self._state is None:
+        self._count(record)
+        state = self._state
+        if record.event == records.START or (record.event == records.SNAPSHOT and state is None):
+            self._begin(record)
+        elif record.event == records.SNAPSHOT:
+            return
+        elif state is None:
             self._keep(record, None, None, None)
-        elif record.event == records.NUMERICS:
-            self._switch(record)
         elif record.event in (records.PARAMETERS, records.MODEL):
-            self._exchange(record, self._state)
+            self._exchange(record, state)
         else:
-            self._apply(record, self._state)
+            self._apply(record, state)
+
+    def _count(self, record: records.Record) -> None:
+        """Forget the state behind a lost record."""
+        if self._next is not None and record.number < self._next:
+            raise records.RecordError(
+                f'record {record.number} of run {record.run} comes again, or after record '
+                f'{self._next - 1}: the bag is not in order')
+        if self._next is not None and record.number > self._next:
+            self._found.lost.append(Lost(record.run, self._next, record.number - 1))
+            self._state = None
+        self._next = record.number + 1
 
     def _begin(self, record: records.Record) -> None:
-        self._parameters = dict(record.fields['parameters'])
-        self._kernels = _kernels(record)
-        model = self._model(record)
-        self._controller = self._build(self._parameters, model)
-        self._found.controller, self._found.parameters = self._controller, self._parameters
+        self._parameters = {}
+        controller = self._put_in_force(record, None)
         self._state = records.state_of(record)
         if self._other is not None:
             same = self._other.digest == record.fields['model']['digest']
-            self._other_controller = self._tuned(
-                self._controller.model if same else self._other.model)
-            self._other_state = self._other_controller.hand_over(self._controller, self._state)
-
-    def _switch(self, record: records.Record) -> None:
-        """Put other functions for the same numbers in force."""
-        self._kernels = _kernels(record)
-        self._controller = self._build(self._parameters, replace(
-            self._controller.model, kernels=self._kernels))
-        self._found.controller = self._controller
+            self._other_controller = self._tuned(controller.model if same else self._other.model)
+            self._other_state = self._other_controller.hand_over(controller, self._state)
 
     def _exchange(self, record: records.Record, state: State) -> None:
         """Put other parameters or another model in force."""
-        self._parameters.update(record.fields.get('parameters', {}))
-        predecessor = self._controller
-        model = self._model(record) if 'model' in record.fields else predecessor.model
+        before = self._controller
+        self._state = self._put_in_force(record, before.model).hand_over(before, state)
+        if self._other is not None and 'parameters' in record.fields:
+            before = self._other_controller
+            self._other_controller = self._tuned(before.model)
+            self._other_state = self._other_controller.hand_over(before, self._other_state)
+
+    def _put_in_force(self, record: records.Record, model: LiftedModel | None) -> Controller:
+        self._parameters |= record.fields.get('parameters', {})
+        if model is None or 'model' in record.fields:
+            name, digest = record.fields['model']['name'], record.fields['model']['digest']
+            if name not in self._found.models:
+                self._found.models.append(name)
+            model = self._find_model(name, digest)
         self._controller = self._build(self._parameters, model)
         self._found.controller, self._found.parameters = self._controller, self._parameters
-        self._state = self._controller.hand_over(predecessor, state)
-        if self._other is not None and 'parameters' in record.fields:
-            predecessor = self._other_controller
-            self._other_controller = self._tuned(predecessor.model)
-            self._other_state = self._other_controller.hand_over(predecessor, self._other_state)
+        return self._controller
+
+    def _tuned(self, model: LiftedModel) -> Controller:
+        assert self._other is not None
+        return self._build({**self._parameters, **self._other.parameters}, model)
 
     def _apply(self, record: records.Record, state: State) -> None:
         event = records.event_of(record)
@@ -185,7 +177,7 @@ class _Run:
         target = None if outcome.report is None else outcome.report.target
         active = None if target is None else target.setpoint
         other = None
-        # it may refuse a request: it goes by what was tracked
+        # it may refuse a request: it goes by the set-point that was tracked
         if self._other is not None and not isinstance(event, SetpointRequest):
             if active is not None and isinstance(event, Measurement):
                 self._other_state = replace(
@@ -197,19 +189,8 @@ class _Run:
     def _keep(self, record: records.Record, setpoint: Array | None, replayed: Array | None,
               other: Array | None) -> None:
         """Keep the command of a record, where it has one."""
-        fields = record.fields
-        if fields.get('command') is not None:
-            measured = fields.get('measured')
+        if (command := record.fields.get('command')) is not None:
+            measured = record.fields.get('measured')
             self._found.samples.append(Sample(
                 record.stamp_ns, None if measured is None else records.float_array(measured),
-                setpoint, records.float_array(fields['command']), replayed, other))
-
-    def _model(self, record: records.Record) -> LiftedModel:
-        name, digest = record.fields['model']['name'], record.fields['model']['digest']
-        if name not in self._found.models:
-            self._found.models.append(name)
-        return replace(self._find_model(name, digest), kernels=self._kernels)
-
-    def _tuned(self, model: LiftedModel) -> Controller:
-        assert self._other is not None
-        return self._build({**self._parameters, **self._other.parameters}, model)
+                setpoint, records.float_array(command), replayed, other))

@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 import json
 import math
-import sys
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from koopman_ros import __version__
 from koopman_ros.control import events, Mode, State
-from koopman_ros.kernels import IN_NUMPY
+from koopman_ros.plugs import loaded_class
 from koopman_ros.reasons import Code, Reason
 
 VERSION = 1
@@ -34,14 +33,11 @@ EVENTS: dict[str, type[events.Event]] = {
     'mode': events.ModeChange, 'initialisation': events.Initialisation}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
 _FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
-_DEFAULTED = ('seconds', 'cause')
 _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
 # Names of records that carry the controller's whole state.
 START, SNAPSHOT = 'start', 'snapshot'
 # Names of those by which it is exchanged for one with other parameters or another model.
 PARAMETERS, MODEL = 'parameters', 'model'
-# Name of those by which compiled functions take the place of those in numpy, and their field.
-NUMERICS = 'numerics'
 _TAG = '@'
 
 
@@ -90,23 +86,18 @@ def parse(text: str) -> Record:
 
 def fields_of(event: events.Event, outcome: events.Outcome) -> tuple[str, dict[str, Any]]:
     """Return the name of an event, and what is written of it and of what it led to."""
-    written = {name: _written(getattr(event, name)) for name in _FIELDS[type(event)]}
-    if isinstance(event, events.SetpointRequest):
-        names = written.pop('signals')
-        if names is not None:
-            written['signals'] = list(names)
-    report = outcome.report
-    if report is None:
-        if not isinstance(event, (events.ModeChange, events.Initialisation)):
-            written['accepted'] = outcome.refused is None
-            written['reason'] = _codes(outcome.refused)
-        return _NAMES[type(event)], written
-    if isinstance(event, events.Measurement):
-        written['result'] = report.measurement.arrival.value
-    return _NAMES[type(event)], {
-        **written, 'command': _written(outcome.command),
-        'setpoint': None if report.target is None else numbers(report.target.setpoint),
-        'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
+    name, report = _NAMES[type(event)], outcome.report
+    written = {of: _written(getattr(event, of)) for of in _FIELDS[type(event)]}
+    if report is not None:
+        if isinstance(event, events.Measurement):
+            written['result'] = report.measurement.arrival.value
+        written |= {
+            'command': _written(outcome.command),
+            'setpoint': None if report.target is None else numbers(report.target.setpoint),
+            'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
+    elif isinstance(event, (events.SetpointRequest, events.ManualCommand)):
+        written |= {'accepted': outcome.refused is None, 'reason': _codes(outcome.refused)}
+    return name, written
 
 
 def event_of(record: Record) -> events.Event:
@@ -114,19 +105,14 @@ def event_of(record: Record) -> events.Event:
     if record.event not in EVENTS:
         raise ValueError(f'the event {record.event!r} is not known')
     kind = EVENTS[record.event]
-    # a field with a default is not in records from before it was introduced
-    read = {name: _read(record.fields[name]) for name in _FIELDS[kind]
-            if name != 'signals' and (name in record.fields or name not in _DEFAULTED)}
-    if 'signals' in record.fields:
-        read['signals'] = tuple(map(str, record.fields['signals']))
-    return kind(**read)
+    return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]})
 
 
-def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str],
-             numerics: str = IN_NUMPY) -> dict[str, Any]:
+def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
+             ) -> dict[str, Any]:
     """Return the fields of a snapshot; a model is its `name` and the SHA-256 of its file."""
     return {'package': __version__, 'model': dict(model), 'parameters': dict(parameters),
-            NUMERICS: numerics, 'state': encoded(state)}
+            'state': encoded(state)}
 
 
 def state_of(record: Record) -> State:
@@ -146,10 +132,14 @@ def _written(value: Any) -> Any:
     return numbers(value) if isinstance(value, np.ndarray) else value
 
 
-def _read(value: Any) -> Any:
-    """Return what was written."""
-    if isinstance(value, str):
-        return Mode[value.upper()] if value.upper() in Mode.__members__ else Code(value)
+def _read(name: str, value: Any) -> Any:
+    """Return what was written of a field of an event."""
+    if name == 'mode':
+        return Mode[value.upper()]
+    if name == 'cause':
+        return None if value is None else Code(value)
+    if name == 'signals':
+        return None if value is None else tuple(map(str, value))
     return value if value is None or isinstance(value, (int, float)) else float_array(value)
 
 
@@ -185,9 +175,10 @@ def decoded(value: Any) -> Any:
     """
     Return the value that :func:`encoded` was given.
 
-    A class is looked up among those that this program has loaded, and has to be a dataclass or an
-    enum: no text of a bag imports anything. Raises ValueError for a class that is not known here,
-    TypeError for one that has other fields here.
+    A class has to be loaded, and a dataclass or an enum: no text of a bag imports anything.
+
+    :raises ValueError: for a class that is not known here.
+    :raises TypeError: for one that has other fields here.
     """
     if isinstance(value, list):
         return tuple(decoded(item) for item in value)
@@ -206,7 +197,9 @@ def decoded(value: Any) -> Any:
             array.setflags(write=False)
             return array
         case name:
-            kind = _class(str(name))
+            kind = loaded_class(str(name))
+            if not (is_dataclass(kind) or issubclass(kind, Enum)):
+                raise ValueError(f'the class {name!r} holds no data')
             if issubclass(kind, Enum):
                 return kind[rest['name']]
             return kind(**{key: decoded(item) for key, item in rest.items()})
@@ -229,13 +222,3 @@ def float_array(values: Any) -> NDArray[np.float64]:
 
 def _name(kind: type) -> str:
     return f'{kind.__module__}:{kind.__qualname__}'
-
-
-def _class(name: str) -> type:
-    module, _, path = name.partition(':')
-    found: Any = sys.modules.get(module)
-    for part in path.split('.'):
-        found = getattr(found, part, None)
-    if not isinstance(found, type) or not (is_dataclass(found) or issubclass(found, Enum)):
-        raise ValueError(f'the class {name!r} is not known here')
-    return found

@@ -3,8 +3,6 @@
 
 """Recorded and replayed commands side by side, in numbers and as a report."""
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,10 +13,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.lifting import Coordinates
 from koopman_ros.replay.loop import Replay
-from koopman_ros.replay.sources import Command, command_key
 from koopman_ros.reports import write_figures, write_page
-from koopman_ros.units import conversion
-from koopman_ros.wire import Place
 
 
 @dataclass(frozen=True)
@@ -56,10 +51,6 @@ class ReplayedBag:
     path: str  #: of the bag
     complete: bool  #: whether its recorder closed it
     found: Replay  #: what came of the replay
-    #: commands on their topic by stamp and value, as :func:`command_counts` has them; empty where
-    #: the bag has none
-    published: Counter[Command]
-    places: Sequence[Place]  #: (n_u,) where the inputs were commanded
     tolerance: float  #: difference in input units from which on a command is counted
     new_range: Coordinates | None = None  #: of the new model's training, or None without one
 
@@ -107,19 +98,6 @@ class ReplayedBag:
         kept = [names.index(name) for name in controller.controlled.names]
         return int(np.count_nonzero(((self.setpoint < self.new_range.lower[kept])
                                      | (self.setpoint > self.new_range.upper[kept])).any(axis=1)))
-
-    @property
-    def unexplained(self) -> int:
-        """The number of commands on the topic of which there is no record with their bits."""
-        if self.found.controller is None:
-            return self.published.total()
-        units = self.found.controller.model.inputs.units
-        there = [conversion(unit, place.unit)
-                 for unit, place in zip(units, self.places, strict=True)]
-        recorded = Counter(command_key(i, sample.stamp_ns, there[i](value))
-                           for sample in self.found.samples
-                           for i, value in enumerate(sample.recorded.tolist()))
-        return (self.published - recorded).total()
 
     def _compared(self, commands: Array) -> Comparison:
         """Compare commands (n, n_u) with those recorded."""
@@ -208,8 +186,7 @@ def _section(bag: ReplayedBag) -> list[str]:
             (found.runs - 1, 'times the controller was started again, or another one recorded'),
             (found.refused, 'requests are refused'),
             (len(found.samples) - bag.measurements, 'commands were given because no measurement '
-                                                    'came'),
-            (bag.unexplained, 'commands on the topic are in no record')):
+                                                    'came')):
         if count > 0:
             lines.append(f'- {count} {words}.')
     lines += [f'- Records {lost.first} to {lost.last} of run {lost.run} are missing.'
@@ -225,7 +202,6 @@ def _figures(bag: ReplayedBag) -> dict[str, Any]:
         'bag': bag.path, 'measurements': bag.measurements, 'reproduced': reproduced(bag),
         'recorded_model': _comparison(bag, bag.check),
         'not_compared': len(found.samples) - bag.check.compared,
-        'commands_without_record': bag.unexplained,
         'commands_in_silence': len(found.samples) - bag.measurements,
         'refused_requests': found.refused,
         'began_before_bag': found.begins_late > 0,

@@ -3,19 +3,16 @@
 
 """What a replay reads: a controller's records and commands in a bag, and the models they name."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 import contextlib
 import os
 from pathlib import Path
-import struct
-from typing import TypeAlias
 
 from koopman_ros.bags import BagMessage, BagReadError, read_messages, summary
 from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.replay.records import parse, Record, RecordError, SNAPSHOT, START
 from koopman_ros.units import NANOSECONDS
-from koopman_ros.wire import Place
 
 RECORD_TYPE = 'std_msgs/msg/String'
 
@@ -35,8 +32,7 @@ def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = Fa
         known = ', '.join(name for name, count in sorted(content.counts.items()) if count)
         raise BagReadError(
             f'bag {os.fspath(path)!r} has no records of a controller on {topic!r}, it has '
-            f'{known or "none"}: record that topic, too (version 0.1 had none: its bags can be '
-            f'played and trained from), or name it, e.g. -r {topic[1:]}:=NAME')
+            f'{known or "none"}: record that topic, too, or name it, e.g. -r {topic[1:]}:=NAME')
     if content.types[topic] != RECORD_TYPE:
         raise BagReadError(
             f'topic {topic!r} of bag {os.fspath(path)!r} is {content.types[topic]} and not '
@@ -65,36 +61,6 @@ def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Ite
         except (RecordError, AttributeError) as error:
             raise BagReadError(f'bag {os.fspath(path)!r}, topic {entry.topic!r}: {error}'
                                ) from error
-
-
-# Number of an input, stamp [ns], and bytes of its float64.
-Command: TypeAlias = tuple[int, int, bytes]
-
-
-def command_counts(path: str | os.PathLike[str], places: Sequence[Place], *,
-                   recover: bool = False, since_ns: int = 0) -> Counter[Command]:
-    """
-    Count the commands of the inputs in a bag by :func:`command_key`; none where it has none.
-
-    :param since_ns: stamp of the first that counts.
-    """
-    found: Counter[Command] = Counter()
-    known = summary(path).types
-    for i, place in enumerate(places):
-        if known.get(place.topic) != place.type:
-            continue
-        for entry in read_messages(path, (place.topic,), recover=recover):
-            with contextlib.suppress(LookupError, AttributeError):
-                stamp = entry.message.header.stamp
-                stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
-                if stamp_ns >= since_ns:
-                    found[command_key(i, stamp_ns, place.get(entry.message))] += 1
-    return found
-
-
-def command_key(number: int, stamp_ns: int, value: float) -> Command:
-    """Return what is equal for commands of an input that are bit-identical."""
-    return number, stamp_ns, struct.pack('<d', value)
 
 
 class Models:

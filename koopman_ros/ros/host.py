@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many loops in one process: a node each, one executor, one failing without the others."""
+"""Many loops in one process: a node each, one executor; a failed node ends no other."""
 
 from collections.abc import Callable, MutableMapping, Sequence
 from functools import partial
@@ -16,35 +16,37 @@ from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
 from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.plugs import contained
 from koopman_ros.resources import config_directory, LEAN_PROFILE
-from koopman_ros.ros.hosted import HostableNode, Hosting, Schedule
+from koopman_ros.ros.diagnostics import Diagnostics, Level, Status
+from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
-from koopman_ros.ros.node import Diagnostics, Level, LoopNode, Status, wall_timer
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import (
+    events_executor,
     init,
     LONGEST_WAIT,
     open_to_the_network,
     PROFILES,
     take_down,
     TAKE_DOWN_PATIENCE,
-    told_executor,
 )
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import handle_signals
 
-_PERIOD = 0.1  # s between two looks at what has ended
+_PERIOD = 0.1  # s between two looks at nodes that have ended
 _GOODBYE = 0.1  # s that taking down a node may take
-_LATE = 0.5  # s; a timer that comes so late tells of more work than the process can do
+_LATE = 0.5  # s; a timer so late shows that the process is overloaded
 _SHOWN = 10  # loops that failed, in diagnostics; the log has them all
 
-# Collecting nodes takes down what they have one by one, each time with word to all others; with
-# the process goes all at once.
+# Collected nodes are destroyed one by one, each with a message to all others; at the end of the
+# process all are gone at once.
 _LEFT: list[object] = []
 
 
 def read_loops(path: Path) -> tuple[str, ...]:
     """
-    Read the namespaces of loops, one a line; blank lines and what follows a # do not count.
+    Read the namespaces of loops, one a line; blank lines and comments after # do not count.
 
     :raises ConfigurationError: naming the line and what is wrong with it.
     :raises OSError: when the file cannot be read.
@@ -70,7 +72,7 @@ def read_loops(path: Path) -> tuple[str, ...]:
 
 class Host:
     """
-    The nodes of many loops, and one that says how they are.
+    The nodes of many loops, and one that reports their state.
 
     :param create: makes the node of one loop, given its namespace and the hosting.
     """
@@ -82,20 +84,15 @@ class Host:
         self._failed: dict[str, str] = {}  # why, by namespace
         self._set_aside: list[LoopNode] = []  # whose watchdogs stand in for them
         self._leaving: list[str] = []
-        self._schedule = Schedule()
-        self._node = HostableNode(f'{name}_host', Hosting(
-            self._schedule, len(loops), self._on_own_failure))
+        self._node = HostedNode(f'{name}_host', None)
         if self._node.get_namespace() != '/':
             raise ConfigurationError(
                 f'-r __ns:={self._node.get_namespace()} would put all loops there: write '
                 'the namespaces into the file of loops')
-        self._executor = told_executor()
-        self._executor.add_node(self._node)
-        diagnostics = Diagnostics(self._node)
-        self._diagnostics = diagnostics.add('loops', self._status)
-        self._delay = self._share = 0.0
-        self._looked = self._measured = time.monotonic()
-        self._processor = time.process_time()
+        self.executor = events_executor()
+        self.executor.add_node(self._node)
+        self._diagnostics = Diagnostics(self._node).add('loops', self._status)
+        self._delay, self._looked = 0.0, time.monotonic()
         wall_timer(self._node, _PERIOD, self._look)
         if note := open_to_the_network(os.environ):
             self._node.get_logger().warning(note)
@@ -123,37 +120,35 @@ class Host:
             node.complete()
 
     def _turn(self) -> None:
-        """Call one timer that is due and one message that has come, or wait for the next."""
-        self._executor.spin_once(timeout_sec=min(LONGEST_WAIT, self._schedule.turn()))
+        """Call one callback that is due, or wait for the next."""
+        self.executor.spin_once(timeout_sec=LONGEST_WAIT)
         while self._leaving:
             self._part(self._leaving.pop())
 
     def _catch_up(self, arrived: Sequence[int]) -> None:
-        """Do all that waits now, before another loop is started, but for a signal."""
+        """Call every callback that is due before another loop is started."""
         done: list[bool] = []
-        self._executor.create_task(lambda: done.append(True))
+        self.executor.create_task(lambda: done.append(True))
         while not done and not arrived:
             self._turn()
 
     def _begin(self, namespace: str) -> None:
-        hosting = Hosting(self._schedule, len(self._loops), partial(self._fail, namespace))
+        hosting = HostContext(len(self._loops), partial(self._fail, namespace))
         try:
             node = self._create(namespace=namespace, hosting=hosting)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
-        except KeyboardInterrupt:
-            raise
         except BaseException as error:
-            # a module of the loop may also raise SystemExit
+            contained(error)
             self._note(namespace, error, 'cannot start: ')
             for made in hosting.made:
                 _destroy(made)
             return
         self._nodes[namespace] = node
-        self._executor.add_node(node)
+        self.executor.add_node(node)
 
     def _fail(self, namespace: str, error: BaseException) -> None:
-        """Note what a callback of a node has raised; it gets no further ones."""
+        """Note the exception of a callback; its node gets no further ones."""
         if namespace not in self._failed:
             self._note(namespace, error, 'stopped: ')
             self._leaving.append(namespace)
@@ -165,17 +160,12 @@ class Host:
             one_line(error) if expected else ''.join(traceback.format_exception(error))))
         self._diagnostics.publish_if_changed()
 
-    def _on_own_failure(self, error: BaseException) -> None:
-        raise error
-
     def _part(self, namespace: str) -> None:
-        """Go on without a node, which has failed or was shut down."""
+        """Go on without a node that has failed or was shut down."""
         # it may have failed while it was shut down
         if (node := self._nodes.pop(namespace, None)) is None:
             return
-        self._executor.remove_node(node)
-        for timer in node.hosted_timers:
-            timer.cancel()
+        self.executor.remove_node(node)
         if namespace in self._failed:
             # its watchdog takes it for busy: it holds the command, then goes to the safe one
             self._set_aside.append(node)
@@ -185,10 +175,6 @@ class Host:
     def _look(self) -> None:
         now = time.monotonic()
         self._delay, self._looked = max(self._delay, now - self._looked - _PERIOD), now
-        if now - self._measured > 1.0:
-            processor = time.process_time()
-            self._share = (processor - self._processor) / (now - self._measured)
-            self._measured, self._processor = now, processor
         self._leaving += [namespace for namespace, node in self._nodes.items()
                           if node.exit_code is not None and namespace not in self._leaving]
 
@@ -207,16 +193,14 @@ class Host:
         return Status(level, message, {
             'loops': len(self._loops), 'running': running, 'failed': len(failed),
             'to be started': len(self._waiting),
-            'processor share [%]': 100.0 * self._share,
             'longest delay of a timer [ms]': 1e3 * delay})
 
 
-def _destroy(node: HostableNode) -> None:
+def _destroy(node: HostedNode) -> None:
     if isinstance(node, LoopNode):
         node.complete()
-    for timer in node.hosted_timers:
-        timer.cancel()
     node.destroy_node()
+
 
 
 def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None, file: str,
@@ -247,7 +231,8 @@ def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None
                 host.complete()
         finally:
             # the middleware says good-bye for each node
-            take_down(name, None, TAKE_DOWN_PATIENCE + _GOODBYE * len(loops))
+            take_down(name, None, None if host is None else host.executor,
+                      TAKE_DOWN_PATIENCE + _GOODBYE * len(loops))
             handle_signals(signal.SIG_IGN)
 
 

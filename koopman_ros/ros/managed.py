@@ -17,7 +17,8 @@ from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
 from koopman_ros.plugs import contained
-from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.hosted import wall_timer
+from koopman_ros.ros.node import LoopNode
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
@@ -134,11 +135,10 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             work()
-        except KeyboardInterrupt:
-            raise
         except BaseException as caught:
             # code of one's own may raise SystemExit, which would end all nodes of the process
-            error = caught if isinstance(caught, Exception) else RuntimeError(contained(caught))
+            text = contained(caught)
+            error = caught if isinstance(caught, Exception) else RuntimeError(text)
             # rclpy would not tell of it
             self._failure = error
             expected = isinstance(error, START_ERRORS)
@@ -182,7 +182,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set
         heard = [one for one in self.subscriptions if one.msg_type is not Clock]
-        return ([*self.timers, *self.hosted_timers], list(self.services), heard,
+        return (list(self.timers), list(self.services), heard,
                 list(self.publishers))
 
 

@@ -1,70 +1,47 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes with the parameters of a table, what their parts create and take down, diagnostics."""
+"""Nodes with the parameters of a table; what their parts create and take down."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection
 import copy
-from dataclasses import dataclass, field
 import difflib
-from enum import Enum
 from functools import cached_property
 import math
-import time
-from types import MappingProxyType
 from typing import Any, TypeVar
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces import msg
-from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
-from koopman_ros.parameters.wire import DIAGNOSTICS, renamed, Signals
-from koopman_ros.plugs import contained, own_code
-from koopman_ros.reasons import Words
-from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.hosted import HostableNode, HostedTimer, Hosting
-from koopman_ros.units import Display, Displays, NANOSECONDS
+from koopman_ros.plugs import own_code
+from koopman_ros.ros.diagnostics import Diagnostics
+from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
+from koopman_ros.units import NANOSECONDS
 
 T = TypeVar('T')
-Entity = TypeVar('Entity', Publisher, Service, Subscription, 'Timer | HostedTimer')
+Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)
 
 # Parameters that rclpy itself declares or reads.
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 
 _DESTROY: dict[type, Callable[[Node, Any], object]] = {
     Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
-    Service: Node.destroy_service, Timer: Node.destroy_timer,
-    HostedTimer: lambda node, timer: node.destroy_timer(timer)}
-
-_SHOWN = {'K': Display('K', 'degC', '.2f')}
-
-
-def wall_timer(node: Node, seconds: float, callback: Callable[[], Any], **options: Any
-               ) -> Timer | HostedTimer:
-    """Create a timer by the steady clock, which runs while simulated time stands still."""
-    if isinstance(node, HostableNode) and node.hosting is not None:
-        return node.hosted_timer(seconds, callback)
-    return node.create_timer(
-        seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME), **options)
-
+    Service: Node.destroy_service, Timer: Node.destroy_timer}
 
 class Owned:
     """Publishers, subscriptions, services and timers of one part of a node."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: HostedNode) -> None:
         self._node = node
         self._entities: list[Any] = []
 
@@ -73,8 +50,7 @@ class Owned:
         self._entities.append(entity)
         return entity
 
-    def timer(self, seconds: float, callback: Callable[[], Any], **options: Any
-              ) -> Timer | HostedTimer:
+    def timer(self, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
         """Create a :func:`wall_timer`."""
         return self.keep(wall_timer(self._node, seconds, callback, **options))
 
@@ -85,115 +61,7 @@ class Owned:
             _DESTROY[type(entity)](self._node, entity)
 
 
-class Level(Enum):
-    """Severity of a status, as one byte."""
-
-    OK = DiagnosticStatus.OK
-    WARN = DiagnosticStatus.WARN
-    ERROR = DiagnosticStatus.ERROR
-
-
-@dataclass(frozen=True)
-class Status:
-    """What a node says of itself: a sentence, and figures with their units in the key."""
-
-    level: Level
-    message: str
-    #: or a function, which is called only when they are published
-    values: Mapping[str, object] | Callable[[], Mapping[str, object]] = field(
-        default_factory=dict)
-
-
-class Diagnostics:
-    """
-    Publish what the tasks of a node say of themselves, as diagnostic_updater would.
-
-    :ivar hardware_id: names the plant.
-    """
-
-    hardware_id = ''
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self.tasks: list[DiagnosticTask] = []  #: that are reported
-        # as everywhere, by parameter
-        self._publisher = node.create_publisher(
-            DiagnosticArray, DIAGNOSTICS, QoSProfile(depth=10),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        wall_timer(node, 1.0, lambda: self.publish(self.tasks))
-
-    def add(self, task: str, collect: Callable[[], Status]) -> DiagnosticTask:
-        """Report a further task under the name ``<node>: <task>``."""
-        name = f'{self._node.get_fully_qualified_name().lstrip("/")}: {task}'
-        self.tasks.append(DiagnosticTask(self, name, collect))
-        return self.tasks[-1]
-
-    def remove(self, task: DiagnosticTask) -> None:
-        """Report a task no more."""
-        self.tasks.remove(task)
-
-    def clear(self) -> None:
-        """Report none any more."""
-        self.tasks.clear()
-
-    def publish(self, tasks: Sequence[DiagnosticTask]) -> None:
-        """Publish the present status of some tasks in one message."""
-        if not tasks:
-            return
-        message = DiagnosticArray(status=[task.status() for task in tasks])
-        message.header.stamp = stamp_message(time.time_ns())
-        self._publisher.publish(message)
-
-
-class DiagnosticTask:
-    """What one task of a node says of itself."""
-
-    def __init__(self, diagnostics: Diagnostics, name: str, collect: Callable[[], Status]
-                 ) -> None:
-        self._diagnostics, self._name, self._collect = diagnostics, name, collect
-        self._last: tuple[Level, str] | None = None
-
-    def status(self) -> DiagnosticStatus:
-        """Return its present status as a message."""
-        status = self._collected()
-        try:
-            values = status.values() if callable(status.values) else status.values
-        except Exception as error:
-            status, values = _failed(error), {}
-        self._last = (status.level, status.message)
-        return DiagnosticStatus(
-            level=status.level.value, name=self._name, message=status.message,
-            hardware_id=self._diagnostics.hardware_id,
-            values=[KeyValue(key=key, value=(
-                f'{value:.9g}' if isinstance(value, float) else str(value)))
-                for key, value in values.items()])
-
-    def publish_if_changed(self) -> None:
-        """Publish at once when the level or the sentence differ from the last ones."""
-        # what is late in a part that was taken down has nobody to report to
-        if self not in self._diagnostics.tasks:
-            return
-        status = self._collected()
-        if (status.level, status.message) != self._last:
-            self._diagnostics.publish([self])
-
-    def _collected(self) -> Status:
-        # a failure of a report does not end the loop that it reports on
-        try:
-            return self._collect()
-        except Exception as error:
-            return _failed(error)
-
-    def destroy(self) -> None:
-        """Report no more."""
-        self._diagnostics.remove(self)
-
-
-def _failed(error: Exception) -> Status:
-    return Status(Level.ERROR, f'the status cannot be collected ({contained(error)})')
-
-
-class LoopNode(HostableNode):
+class LoopNode(HostedNode):
     """
     A node whose parameters are those of a table, and which may complete work before its end.
 
@@ -208,8 +76,7 @@ class LoopNode(HostableNode):
     exit_code: int | None = None
     _clocks_refused = 0
 
-    def __init__(self, name: str, hosting: Hosting | None = None, **options: Any) -> None:
-        self._table_of = name
+    def __init__(self, name: str, hosting: HostContext | None = None, **options: Any) -> None:
         self._followers: list[Any] = []  # callbacks by which tables are followed
         self._code: dict[str, list[str]] = {}  # module:name at the start, by parameter
         self._ranges: dict[str, msg.FloatingPointRange | msg.IntegerRange] = {}
@@ -275,15 +142,11 @@ class LoopNode(HostableNode):
         Names that no table knows are ignored with a warning: a file may serve several nodes.
 
         :param beside: further names that count as known.
-        :raises ConfigurationError: naming the parameter, its value and the allowed range, or what
-            a former one is called now.
+        :raises ConfigurationError: naming the parameter, its value and the allowed range.
         """
         given: dict[str, Any] = dict(self.get_parameters_by_prefix(''))
         unknown = [name for name in given if name not in table.rows and name not in beside
                    and name not in _RCLPY_PARAMETERS and not name.startswith('qos_overrides')]
-        if former := renamed(self._table_of, {name: value for name, value in self.given().items()
-                                              if name in unknown}, table):
-            raise ConfigurationError(former)
         # as if they had not been given, like in any node
         for name in [*unknown, *set(given).intersection(table.rows)]:
             self.undeclare_parameter(name)
@@ -399,8 +262,3 @@ def _as_python(value: Any) -> Any:
     if isinstance(value, (str, bytes, bool, int, float)) or value is None:
         return value
     return tuple(value)
-
-
-def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
-    """Return the words for some signals; `shown` are those not written as they usually are."""
-    return Words(Displays(signals.units, {**_SHOWN, **shown}))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Life of a node's process: start, one-line reason on a bad start, clean end on a signal."""
+"""Process of a node: start, reason in one line for a bad start, clean end after a signal."""
 
 from collections.abc import Callable, Mapping
 import os
@@ -17,7 +17,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from koopman_ros.resources import LOOPBACK_PROFILE
-from koopman_ros.ros.hosted import Hosting, Schedule
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
@@ -31,34 +30,31 @@ LONGEST_WAIT = 0.1  # s from a signal to the end
 TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
-def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = None,
-        hosts: bool | Loops = False) -> int:
+def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None,
+        loops: Loops | None = None, executor: Callable[[], Executor] = SingleThreadedExecutor
+        ) -> int:
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks, or by force.
 
-    :param hosts: whether ``--loops`` makes it a process of many such nodes; see
-        :func:`koopman_ros.ros.host.run_loops`; or what is done with that file instead.
+    :param loops: runs the file of ``--loops``; None for a node without that argument.
     :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
         an unknown argument, or the node's own.
     """
     # a list, because a second signal may come while the first is handled, where a lock would hang
     arrived: list[int] = []
     handle_signals(lambda number, _: arrived.append(number))
-    if (said := answer(name, args, bool(hosts))) is not None:
-        return said
-    if hosts and (file := _loops_file(args)) is not None:
-        if callable(hosts):
-            return hosts(args, file, arrived)
-        # most processes have one node
-        from koopman_ros.ros.host import run_loops
-
-        return run_loops(name, create, args, file, arrived)
+    if (code := answer(name, args, loops is not None)) is not None:
+        return code
+    if loops is not None and (file := _loops_file(args)) is not None:
+        return loops(args, file, arrived)
     leave = end_in_time(name)
-    node = None
+    node = spinning = None
     try:
         try:
             init(args)
-            spin, node = _hosted(create) if hosts is True else _alone(create)
+            node = create()
+            spinning = executor()
+            spinning.add_node(node)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
         except START_ERRORS as error:
@@ -68,54 +64,30 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
             node.get_logger().warning(note)
         while not arrived and node.exit_code is None:
             # Python handles a signal when the wait returns, so the wait is bounded
-            spin()
+            spinning.spin_once(timeout_sec=LONGEST_WAIT)
     finally:
         leave()
         try:
             if node is not None:
                 node.complete()
         finally:
-            take_down(name, node)
+            take_down(name, node, spinning)
             handle_signals(signal.SIG_IGN)
     return node.exit_code or 0
 
 
-def told_executor(context: Context | None = None) -> Executor:
+def events_executor(context: Context | None = None) -> Executor:
     """
-    Return an executor that is told what comes, for nodes whose timers a schedule turns.
+    Return an executor that is told of each message, for nodes without clients.
 
-    rclpy's others set up what they wait for anew with each message, which takes longer than a
-    control step; the first releases for Jazzy have no other.
+    rclpy's others set up their wait anew for each message, which takes longer than a control
+    step. The first releases for Jazzy have no other.
     """
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
         return SingleThreadedExecutor(context=context)
     return EventsExecutor(context=context)
-
-
-def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
-    """Return the node of a loop, and what does one thing that is due, or waits for the next."""
-    schedule, failures = Schedule(), list[BaseException]()
-    node = create(hosting=Hosting(schedule, 1, failures.append))
-    executor = told_executor()
-    executor.add_node(node)
-
-    def spin() -> None:
-        executor.spin_once(timeout_sec=min(LONGEST_WAIT, schedule.turn()))
-        if failures:
-            raise failures[0] if isinstance(failures[0], Exception) else RuntimeError(
-                f'a callback raised {failures[0]!r}') from failures[0]
-
-    return spin, node
-
-
-def _alone(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
-    """Return the same of a node with clients, which rclpy's EventsExecutor does not await."""
-    node = create()
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    return lambda: executor.spin_once(timeout_sec=LONGEST_WAIT), node
 
 
 def run_task(name: str, prepare: Callable[[], Callable[[], int]],
@@ -126,8 +98,8 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
     :param prepare: reads them, and returns a task without ROS that returns the exit code, which
         is 1 when it could not start or complete, 2 for an unknown argument.
     """
-    if (said := answer(name, args)) is not None:
-        return said
+    if (code := answer(name, args)) is not None:
+        return code
     try:
         try:
             init(args)
@@ -142,11 +114,15 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
         return 128 + signal.SIGINT
 
 
-def take_down(name: str, node: LoopNode | None, patience: float = TAKE_DOWN_PATIENCE) -> None:
+def take_down(name: str, node: LoopNode | None, executor: Executor | None,
+              patience: float = TAKE_DOWN_PATIENCE) -> None:
     """Take a node down, and the middleware, by force where that takes longer than so many s."""
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see docs/middleware.md
     disarm = end_by_force(patience, 0, (
         f'{name}: the middleware does not shut down: left to the operating system'))
+    if executor is not None:
+        # its threads would call into the interpreter while that ends
+        executor.shutdown()
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()
@@ -183,7 +159,7 @@ def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None
     if not rest or (hosts and _loops_file(args) is not None):
         return None
     if '--help' in rest or '-h' in rest:
-        # it imports the tables of all nodes
+        # the tables of all nodes
         from koopman_ros.ros.programs import help_text
 
         try:

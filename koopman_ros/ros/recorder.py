@@ -14,13 +14,23 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosgraph_msgs.msg import Clock
 
-from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
+from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.units import NANOSECONDS
 
+# An unlimited duration [ns]: RMW_DURATION_INFINITE.
+_INFINITE_NS = 2**63 - 1
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
 _QUEUE_DEPTH = 5000
 _LINGER = 0.1  # s
@@ -248,14 +258,16 @@ def _matching_qos(usual: QoSProfile, publishers: list[TopicEndpointInfo]) -> QoS
     return topics.profile(_QUEUE_DEPTH, reliable=reliable, latched=latched)
 
 
-def _offered(profile: QoSProfile) -> QosProfile:
-    return QosProfile(
-        history=profile.history.short_key, depth=profile.depth,
-        reliability=profile.reliability.short_key, durability=profile.durability.short_key,
-        liveliness=profile.liveliness.short_key, deadline_ns=_nanoseconds(profile.deadline),
-        lifespan_ns=_nanoseconds(profile.lifespan),
-        liveliness_lease_duration_ns=_nanoseconds(profile.liveliness_lease_duration))
+def _offered(profile: QoSProfile) -> Qos:
+    # both number the policies as rmw does
+    return Qos(
+        QosHistory(int(profile.history)), profile.depth,
+        QosReliability(int(profile.reliability)), QosDurability(int(profile.durability)),
+        _time(profile.deadline), _time(profile.lifespan),
+        QosLiveliness(int(profile.liveliness)), _time(profile.liveliness_lease_duration),
+        avoid_ros_namespace_conventions=False)
 
 
-def _nanoseconds(duration: Any) -> int:
-    return ns if 0 <= (ns := duration.nanoseconds) <= INFINITE_NS else INFINITE_NS
+def _time(duration: Any) -> QosTime:
+    ns = duration.nanoseconds
+    return QosTime(*divmod(ns if 0 <= ns <= _INFINITE_NS else _INFINITE_NS, NANOSECONDS))

@@ -17,8 +17,9 @@ from koopman_ros.bags import BagWriter
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.ros import topics
+from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Level, Owned, Status
+from koopman_ros.ros.node import Owned
 from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages

@@ -9,10 +9,9 @@ import time
 
 from builtin_interfaces.msg import Time
 import numpy as np
-from rclpy.node import Node
 
 from koopman_ros.ros import topics
-from koopman_ros.ros.node import wall_timer
+from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.signals import Outlet
 from koopman_ros.wire import Place
 
@@ -33,7 +32,7 @@ class _Value:
 class RepeatedValues:
     """Publishes values, each by a publisher that exists until the answer."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: HostedNode) -> None:
         self._node = node
         self._values: list[_Value] = []
         self._timer = wall_timer(node, _PERIOD, self._on_timer)

@@ -3,13 +3,15 @@
 
 """Messages to the numbers of signals and back, once, at the boundary."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 import inspect
 import math
 from typing import Any
 
 from builtin_interfaces.msg import Time
+import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -19,11 +21,10 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.units import Conversion, conversion, in_steps
-from koopman_ros.values import record
 from koopman_ros.wire import Place
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Heard:
     """What a message says of some signals."""
 
@@ -129,6 +130,37 @@ class Inlet:
     def published(self) -> bool:
         """Tell whether anybody publishes one of the topics."""
         return any(self._node.count_publishers(own.topic_name) for own in self.subscriptions)
+
+
+class MeasuredInputs:
+    """The inputs that were measured last, with their stamps."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        self._names = tuple(names)
+        self._last: dict[str, tuple[int, float]] = {}  # stamp in ns and value
+
+    def take(self, heard: Heard) -> None:
+        """Take what a message says."""
+        self._last |= {name: (heard.stamp_ns, value) for name, value in heard.values.items()}
+
+    def get(self, name: str) -> tuple[float, float]:
+        """Return stamp in ns and value of an input; -infinity and NaN for none."""
+        return self._last.get(name, (-math.inf, math.nan))
+
+    @property
+    def complete(self) -> bool:
+        """Whether all inputs were measured."""
+        return len(self._last) == len(self._names)
+
+    @property
+    def latest(self) -> Array | None:
+        """(n_u,) the last values; None where one was never measured."""
+        return np.array([self._last[name][1] for name in self._names]) if self.complete else None
+
+    def at(self, stamp_ns: int, tolerance_ns: int) -> Array | None:
+        """Return the last values (n_u,) if all are of about a time, else None."""
+        near = all(abs(self.get(name)[0] - stamp_ns) <= tolerance_ns for name in self._names)
+        return self.latest if near else None
 
 
 class Outlet:

@@ -5,10 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 import copy
-import importlib
-import math
 import reprlib
 import time
 from typing import Any
@@ -40,7 +38,9 @@ from koopman_ros.parameters.wire import (
     OPERATOR_ACTIONS,
     Wiring,
 )
-from koopman_ros.ros.hosted import HostableNode
+from koopman_ros.plugs import plug
+from koopman_ros.ros.hosted import HostedNode
+from koopman_ros.ros.managed import one_line
 from koopman_ros.ros.node import Owned
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
@@ -58,10 +58,7 @@ CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 _LOOK_PERIOD = 0.5  # s
 _POLICIES = ('reliability', 'durability', 'deadline', 'liveliness', 'liveliness_lease_duration')
-# Of a processor, that the looks of all loops of a process take: each asks the whole graph, which
-# grows with the loops.
-_LOOK_SHARE = 0.05
-_LOOK_AT_ONCE = 0.002  # s, after which a look goes on in a later turn, as other loops wait
+_LOOK_SHARE = 0.05  # of a processor, for the looks of all loops of a process
 # What does not pass: policy, offered, asked for.
 _CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
               ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
@@ -86,12 +83,12 @@ def unusable(node: Node, names: Collection[str]) -> str:
         try:
             validate_topic_name(name)
         except InvalidTopicNameException as error:
-            return f'topics: {" ".join(str(error).split())}'
+            return f'topics: {one_line(error)}'
         try:
             node.resolve_topic_name(name)
         except (RuntimeError, ValueError) as error:
-            reason = ' '.join(str(error).split(', at /')[0].split())
-            return f'topics: {reprlib.repr(name)} cannot be used ({reason}): choose another name'
+            return (f'topics: {reprlib.repr(name)} cannot be used ({one_line(error)}): choose '
+                    'another name')
     return ''
 
 
@@ -107,8 +104,8 @@ def message_class(type_name: str) -> Any:
     """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
         package, kind, name = type_name.split('/')
-        return getattr(importlib.import_module(f'{package}.{kind}'), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        return plug(f'{package}.{kind}:{name}', 'message type', {})
+    except ValueError as error:
         raise LookupError(
             f'message type {type_name!r} is not installed here: source its workspace') from error
 
@@ -117,24 +114,23 @@ class Matching:
     """
     Make a node's publishers and subscriptions, and say which others conflict or do not match.
 
-    That is looked for twice a second. The middleware has events for it, and the executor asks for
-    each of them, two a topic, before and after each message, which takes longer than its answer.
+    That is looked for twice a second, or less often where many loops share the process: each look
+    asks the whole graph. The events of the middleware for it cost more than the answer to a
+    message.
 
     :param on_change: called when the complaint is another.
     :param single: what is done on topics on which only one node may publish, in words.
     """
 
-    def __init__(self, node: Node, on_change: Callable[[], None],
+    def __init__(self, node: HostedNode, on_change: Callable[[], None],
                  single: Mapping[str, str] | None = None) -> None:
         self._node, self._on_change, self._single = node, on_change, single or {}
         self._owned = Owned(node)
         self._own: list[Publisher | Subscription] = []
         self._said: tuple[str, ...] = ('', '')
         self._shared: dict[str, bool] = {}
-        self._rests_until = -math.inf  # by the steady clock
-        hosting = node.hosting if isinstance(node, HostableNode) else None
-        self._loops = 1 if hosting is None else hosting.loops
-        self._looking = self._look()
+        self._next_look = 0.0  # by the steady clock
+        self._loops = 1 if node.hosting is None else node.hosting.loops
         self._owned.timer(_LOOK_PERIOD, self._look_in_turn)
         self.destroy = self._owned.destroy  #: with what was made here
 
@@ -170,27 +166,18 @@ class Matching:
         return made
 
     def _look_in_turn(self) -> None:
-        if (now := time.monotonic()) < self._rests_until:
+        if (now := time.monotonic()) < self._next_look:
             return
         begun = time.thread_time()
-        for _ in self._looking:
-            if self._loops > 1 and time.thread_time() - begun > _LOOK_AT_ONCE:
-                break
-        else:
-            self._looking = self._look()
-        self._rests_until = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
+        self._look()
+        self._next_look = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
 
-    def _look(self) -> Iterator[None]:
-        """Look at one topic after the other, and say at the end what was found."""
-        conflicts, complaints = [], []
-        for topic in self._single:
-            conflicts.append(self._conflict(topic))
-            self._shared[topic] = bool(conflicts[-1])
-            yield
-        for own in self._own:
-            complaints += self._complaints(own)
-            yield
-        said = ('; '.join(filter(None, conflicts)), '; '.join(dict.fromkeys(complaints)))
+    def _look(self) -> None:
+        conflicts = {topic: self._conflict(topic) for topic in self._single}
+        self._shared = {topic: bool(conflict) for topic, conflict in conflicts.items()}
+        complaints = dict.fromkeys(
+            complaint for own in self._own for complaint in self._complaints(own))
+        said = '; '.join(filter(None, conflicts.values())), '; '.join(complaints)
         before, self._said = self._said, said
         for complaint in said:
             if complaint and complaint not in before:

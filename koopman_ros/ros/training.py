@@ -18,8 +18,9 @@ from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
 from koopman_ros.parameters.wire import preset, system_of, Wiring
 from koopman_ros.resources import model_path
+from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Level, LoopNode, Owned, Status
+from koopman_ros.ros.node import LoopNode, Owned
 from koopman_ros.wire import Place
 
 POLL_PERIOD = 0.1  # s between two looks at a training

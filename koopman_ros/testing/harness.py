@@ -58,8 +58,6 @@ class Harness:
     :param name: of the node in here.
     :param timeout: in s, after which what is waited for has failed.
     :param lasting: whether no process may end by itself, not even with code 0.
-    :param imported: whether nodes of this package share their imports, which makes many starts
-        cheap; see :class:`~koopman_ros.testing.forked.Forked`.
     :param domain: ROS domain to work in, with this process's settings of discovery; by default one
         that no other run uses.
     :param each_turn: called again and again while something is waited for; may raise.
@@ -72,14 +70,12 @@ class Harness:
 
     def __init__(self, folder: Path, environment: Mapping[str, str] | None = None, *,
                  name: str = 'bench', timeout: float = 120.0, lasting: bool = False,
-                 imported: bool = False, domain: str = '',
-                 each_turn: Callable[[], object] = lambda: None) -> None:
+                 domain: str = '', each_turn: Callable[[], object] = lambda: None) -> None:
         self.folder = folder
         self.processes: list[NodeProcess] = []
         self.statuses: list[DiagnosticStatus] = []
         self._timeout = timeout
         self._lasting = lasting
-        self._imported = imported
         self._each_turn = each_turn
         with contextlib.ExitStack() as stack:
             chosen = given_domain(domain) if domain else isolated_domain()
@@ -112,7 +108,8 @@ class Harness:
             left = [process for process in self.processes if not process.told_to_end]
             for process in left:
                 process.send(signal.SIGINT)
-            return {process.log.stem: process.wait() for process in left}
+            codes = {process: process.wait() for process in self.processes}
+            return {process.log.stem: codes[process] for process in left}
         finally:
             self._made.close()
 
@@ -126,8 +123,7 @@ class Harness:
               called: str = '') -> NodeProcess:
         """Start a process as :class:`NodeProcess`, its log `called` as the node by default."""
         log = self.folder / f'{called or name}_{len(self.processes)}.log'
-        process = NodeProcess(name, parameters or {}, log, self.environment, arguments, command,
-                              self._imported)
+        process = NodeProcess(name, parameters or {}, log, self.environment, arguments, command)
         self.processes.append(process)
         return process
 

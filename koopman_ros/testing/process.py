@@ -17,53 +17,49 @@ from types import TracebackType
 
 from koopman_ros import startup
 from koopman_ros.resources import config_directory, LOOPBACK_PROFILE
-from koopman_ros.testing.forked import Forked
-from koopman_ros.testing.guard import guard
 
 STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
 _ABORT_TIMEOUT = 1.0  # s from SIGABRT, at which Python prints where it is, to SIGKILL
 _DOMAINS = range(1, 102)
+# Reads until the end of this process, whatever ends it, and then ends the session of the child.
+_GUARD = 'read _; kill -INT -$0; kill -CONT -$0; sleep $1; kill -KILL -$0'
 
 
 class NodeProcess:
     """
     A process with a log; leaving the context ends it, as does the end of this process.
 
-    :param name: a node of this package, e.g. ``plant``; with `command`, what to call it.
+    :param name: a node of this package, e.g. ``plant``; with `command`, the name of the process.
     :param parameters: values other than the node's defaults.
     :param log: file for everything that the process prints.
     :param environment: variables on top of the present ones.
     :param arguments: further ROS arguments, e.g. ``('-r', '__ns:=/unit_1')``.
-    :param command: what to run instead of a node of this package.
-    :param imported: whether to begin after the imports, which others have shared; see
-        :class:`~koopman_ros.testing.forked.Forked`.
+    :param command: command to run instead of a node of this package.
     :ivar told_to_end: whether its end is expected, e.g. after :meth:`stop`.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, object], log: Path,
                  environment: Mapping[str, str], arguments: tuple[str, ...] = (),
-                 command: tuple[str, ...] | None = None, imported: bool = False) -> None:
+                 command: tuple[str, ...] | None = None) -> None:
         self.name = name
         self.log = log
         self.told_to_end = False
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_as_argument(value)}')]
-        module = f'koopman_ros.nodes.{name}'
-        ros_arguments = ('--ros-args', *given, *arguments) if given or arguments else ()
-        variables = {**os.environ, 'PYTHONFAULTHANDLER': '1', **environment}
-        self.process: subprocess.Popen[bytes] | Forked
-        if imported and not command:
-            self.process = Forked(module, ros_arguments, log, variables)
-            guard(self.process.pid)
-            return
-        program = command or startup.command(module, signal.SIGINT, interrupted=0)
+        program = command or startup.command(
+            f'koopman_ros.nodes.{name}', signal.SIGINT, interrupted=0)
         waiting = contextlib.nullcontext() if command else startup.blocked_signals()
         with open(log, 'wb') as output, waiting:
             # a session of its own: an interrupt of the terminal is passed on by us, in order
             self.process = subprocess.Popen(
-                [*program, *ros_arguments], stdout=output, stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL, start_new_session=True, env=variables)
-            guard(self.process.pid)
+                [*program, *(('--ros-args', *given, *arguments) if given or arguments else ())],
+                stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env={**os.environ, 'PYTHONFAULTHANDLER': '1', **environment})
+        self._guard = subprocess.Popen(
+            ['sh', '-c', _GUARD, str(self.process.pid), str(STOP_TIMEOUT)],
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            start_new_session=True)
 
     @property
     def running(self) -> bool:
@@ -91,11 +87,14 @@ class NodeProcess:
         self.told_to_end = True
         patience = STOP_TIMEOUT if timeout is None else timeout
         for seconds, next_signal in ((patience, signal.SIGABRT), (_ABORT_TIMEOUT, signal.SIGKILL)):
-            try:
-                return self.process.wait(seconds)
-            except subprocess.TimeoutExpired:
-                self.process.send_signal(next_signal)
-        return self.process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(seconds)
+                break
+            self.process.send_signal(next_signal)
+        code = self.process.wait()
+        self._guard.kill()
+        self._guard.communicate()
+        return code
 
     def stop(self, number: int = signal.SIGINT) -> int:
         """End the process by a signal; see :meth:`wait`."""

@@ -276,7 +276,7 @@ def test_bag_that_was_not_closed(write: Callable[..., Path], cut: int, left: int
     (episode,), account = read(bag)
     assert len(episode) == left
     assert account.notes == [
-        f'{bag} was not closed or is damaged: read up to its last whole record']
+        f'{bag} was not closed or is damaged: read up to its last complete record']
 
 
 def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:

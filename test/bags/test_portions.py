@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from koopman_ros import bags
-from koopman_ros.bags import runs
+from koopman_ros.bags import segments
 from koopman_ros.plant_data import Episode
 from koopman_ros.wire import Place
-from validation.benchmarks.long_records import FIELD, TYPE, write
+from support.long_records import FIELD, TYPE, write
 
 PLACES = {name: Place(f'/{name}', TYPE, FIELD, '1') for name in ('warm', 'cold', 'valve', 'flow')}
 STATES = [bags.RecordedState(name, '1', PLACES[name]) for name in ('warm', 'cold')]
@@ -26,7 +26,7 @@ PERIOD = 0.05
 
 @pytest.fixture(autouse=True)
 def small_portions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs, 'MOST', 2000)
+    monkeypatch.setattr(segments, 'MOST', 2000)
 
 
 def record(path: Path, count: int) -> Path:
@@ -44,7 +44,7 @@ def record(path: Path, count: int) -> Path:
 
 def whole(path: Path, signal: bags.RecordedInput, monkeypatch: pytest.MonkeyPatch) -> Episode:
     with monkeypatch.context() as patch:
-        patch.setattr(runs, 'MOST', 10 ** 9)
+        patch.setattr(segments, 'MOST', 10 ** 9)
         (episode,), _ = bags.loop_episodes([path], STATES, [signal])
     return episode
 

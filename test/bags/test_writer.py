@@ -13,13 +13,21 @@ from typing import Any
 
 from mcap.reader import make_reader
 from mcap.summary import Summary
-from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 import pytest
 import yaml
 
 from koopman_ros import __version__, bags
-from support.bag_samples import NUMBER, number, OFFERED_QOS, record, Sample, TOPICS, write_numbers
+from support.bag_samples import (
+    DEFAULT_QOS,
+    NUMBER,
+    number,
+    OFFERED_QOS,
+    record,
+    Sample,
+    TOPICS,
+    write_numbers,
+)
 
 
 def content(path: Path) -> Summary:
@@ -39,10 +47,10 @@ def serialized_metadata(path: Path) -> list[dict[str, Any]]:
 
 def test_header_schemas_and_channels_are_those_of_rosbag2(tmp_path: Path) -> None:
     with bags.BagWriter(tmp_path / 'run.mcap') as writer:
-        writer.add_topic('/x', NUMBER, [bags.QosProfile(depth=3)])
+        writer.add_topic('/x', NUMBER, [DEFAULT_QOS._replace(depth=3)])
         writer.add_topic('/y', NUMBER)
         # again, which does nothing
-        writer.add_topic('/x', NUMBER, [bags.QosProfile()])
+        writer.add_topic('/x', NUMBER, [DEFAULT_QOS])
     with writer.path.open('rb') as stream:
         header = make_reader(stream).get_header()
     assert (header.profile, header.library) == ('ros2', f'koopman_ros {__version__}')
@@ -91,9 +99,9 @@ def test_statistics_indexes_and_compression(tmp_path: Path, compression: str) ->
         '' if compression == 'none' else compression}
     assert len(found.metadata_indexes) == 2
     with path.open('rb') as stream:
-        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        decoded = [entry.decoded_message.data for entry in reader.iter_decoded_messages()]
-    assert decoded == [m.message.data for m in bags.read_messages(path)] == list(range(100, 120))
+        sent = [m.data for _, _, m in make_reader(stream, validate_crcs=True).iter_messages()]
+    assert sent == [m.data for m in bags.read_messages(path)] == [
+        number(k) for k in range(100, 120)]
 
 
 @pytest.mark.parametrize(('environment', 'expected'), [(None, 'jazzy'), ('kilted', 'kilted')])
@@ -206,21 +214,17 @@ def test_exception_inside_with_keeps_the_recording(tmp_path: Path) -> None:
     assert [m.log_time_ns for m in bags.read_messages(tmp_path / 'run')] == [1]
 
 
-@pytest.mark.parametrize(('name', 'options', 'sentence'), [
-    ('run.mcap', {'compression': 'zip'}, "compression 'zip' is not one of none, zstd, lz4"),
-    ('run.mcap', {'max_chunk_bytes': 0}, 'max_chunk_bytes 0 is below 1'),
-    ('run.mcap', {'max_chunk_age_s': -1.0}, r'max_chunk_age_s -1\.0 is not a time of 0 s or more'),
-    ('run.mcap', {'max_chunk_age_s': math.nan}, 'max_chunk_age_s nan is not a time'),
-    ('run.mcap', {'max_file_bytes': 1}, r"run\.mcap' is one file, which is not split: give the"),
-    ('run.mcap', {'max_file_duration_s': 1.0}, 'is one file'),
-    ('run', {'max_file_bytes': -1}, 'max_file_bytes -1 is negative: use 0 for no limit'),
-    ('run', {'max_file_duration_s': -1.0}, r'max_file_duration_s -1\.0 is not a time'),
-    ('run', {'max_file_duration_s': math.nan}, 'max_file_duration_s nan is not a time'),
+@pytest.mark.parametrize(('name', 'options'), [
+    ('run.mcap', {'compression': 'zip'}), ('run.mcap', {'max_chunk_bytes': 0}),
+    ('run.mcap', {'max_chunk_age_s': -1.0}), ('run.mcap', {'max_chunk_age_s': math.nan}),
+    # one file is not split
+    ('run.mcap', {'max_file_bytes': 1}), ('run.mcap', {'max_file_duration_s': 1.0}),
+    ('run', {'max_file_bytes': -1}), ('run', {'max_file_duration_s': -1.0}),
+    ('run', {'max_file_duration_s': math.nan}), ('run', {'max_file_duration_s': math.inf}),
 ])
-def test_bad_options_make_no_file(
-    tmp_path: Path, name: str, options: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises(ValueError, match=sentence):
+def test_bad_options_make_no_file(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=name if 'mcap' in name and (
+            'max_file' in str(options)) else next(iter(options))):
         bags.BagWriter(tmp_path / name, **options)
     assert list(tmp_path.iterdir()) == []
 
@@ -254,12 +258,7 @@ def test_rosbags_reads_messages_offers_and_metadata(
             hash_ = bags.message_definition(connection.msgtype).type_hash
             assert connection.digest == (hash_ if path.is_dir() else '')
             profiles = connection.ext.offered_qos_profiles
-            for profile, offered in zip(profiles, OFFERED_QOS[connection.topic], strict=True):
-                for policy in ('history', 'reliability', 'durability', 'liveliness'):
-                    assert getattr(profile, policy).name.lower() == getattr(offered, policy)
-                assert profile.depth == offered.depth
-                deadline = profile.deadline
-                assert deadline.sec * 10**9 + deadline.nsec == offered.deadline_ns
+            assert tuple(profiles) == OFFERED_QOS[connection.topic]
         if path.is_dir():
             assert reader.ros_distro
             files = [file['path'] for file in reader.storage.files]

@@ -16,7 +16,7 @@ import torch
 
 import koopman_ros
 from koopman_ros.learning.levenberg_marquardt import minimise, MinimumStatus, normal_equations
-from koopman_ros.learning.network import ACTIVATIONS, Layout, Pass
+from koopman_ros.learning.network import Layout, Pass
 from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.lifting import NetworkObservables
 
@@ -44,17 +44,15 @@ def test_sizes_that_do_not_fit(sizes):
         Layout(*sizes)
 
 
-@every_depth
-@pytest.mark.parametrize('name', ACTIVATIONS)
 @identity_or_free
-def test_a_pass_is_what_the_model_evaluates_at_run_time(name, hidden, identity):
-    layout = Layout(2, 4, hidden, identity, name)
+def test_a_pass_is_what_the_model_evaluates_at_run_time(identity):
+    layout = Layout(2, 4, (5,), identity)
     normal = normals(0)
     parts, x, f = layout.split(normal(layout.size)), normal(20, 2), normal(20, 2)
     lifted = Pass(layout, parts, x, f)
-    z, J = NetworkObservables(
-        tuple((W.numpy(), b.numpy()) for W, b in parts.hidden), parts.V.numpy(), identity,
-        name).lift_and_jacobian(x.numpy())
+    (W, b), = parts.hidden
+    z, J = NetworkObservables(W.numpy(), b.numpy(), parts.V.numpy(),
+                              identity).lift_and_jacobian(x.numpy())
     np.testing.assert_allclose(lifted.z, z, rtol=0, atol=1e-14)
     np.testing.assert_allclose(lifted.jacobian(), J, rtol=0, atol=1e-14)
     np.testing.assert_allclose(lifted.z_rate, (J @ f.numpy()[..., None])[..., 0],

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import os
 from pathlib import Path
 import sys
-import threading
 import time as clock
 from typing import BinaryIO
 
@@ -20,11 +19,10 @@ from std_msgs.msg import String
 
 from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
-from koopman_ros.ros import watchdog as watchdog_module
 from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
 from support.controller_bench import reproduced, STATUS, STEADY
-from support.nodes import opened, seconds, temperature, TIMEOUT
+from support.nodes import opened, seconds, temperature
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2,
@@ -38,7 +36,8 @@ from koopman_ros.ros import watchdog
 watchdog.PERIOD, watchdog._PATIENCE = 0.02, 0.2
 from koopman_ros.nodes import controller
 from koopman_ros.control import events
-controller._WATCH_STEP //= 5
+from koopman_ros.ros import control_loop
+control_loop._WATCH_STEP //= 5
 pipe, apply = sys.argv.pop(1), events.apply
 def slowly(*args):
     result = apply(*args)
@@ -154,11 +153,9 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
 
 def test_watchdog_acts_only_without_a_beat_and_tells_its_errors() -> None:
     acted: list[float] = []
-    done = threading.Semaphore(0)
 
     def act(busy: float) -> None:
         acted.append(busy)
-        done.release()
         if len(acted) == 2:
             raise RuntimeError('the second time')
 
@@ -171,29 +168,6 @@ def test_watchdog_acts_only_without_a_beat_and_tells_its_errors() -> None:
     assert not acted
     for _ in range(3):
         watchdog.look()
-        assert done.acquire(timeout=TIMEOUT)
-        assert watchdog._acting is not None
-        watchdog._acting.join(TIMEOUT)
     assert acted == pytest.approx([1.0, 1.1, 1.2])
     with pytest.raises(RuntimeError, match='the second time'):
         watchdog.beat()
-
-
-def test_watchdog_that_is_kept_keeps_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watchdog_module, 'PERIOD', 0.001)
-    going_on, acted = threading.Event(), threading.Semaphore(0)
-
-    def stay(_: float) -> None:
-        going_on.wait(TIMEOUT)
-
-    stays, acts = Watchdog(stay), Watchdog(lambda _: acted.release())
-    stays.start()
-    acts.start()
-    (thread,) = [one for one in threading.enumerate() if one.name == 'watchdogs']
-    try:
-        assert all(acted.acquire(timeout=TIMEOUT) for _ in range(3))
-    finally:
-        going_on.set()
-        stays.end()
-        acts.end()
-    assert not thread.is_alive()

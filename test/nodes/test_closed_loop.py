@@ -13,6 +13,7 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
+from koopman_ros.ros.controller_status import TASKS
 from koopman_ros.testing import Harness
 from support.nodes import seconds, temperature, value
 
@@ -129,7 +130,7 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
 
 def test_each_node_tells_of_all_its_tasks_in_one_message_and_names_the_plant(ros: Harness) -> None:
     heard: list[DiagnosticArray] = ros.listen(DiagnosticArray, topics.DIAGNOSTICS)
-    tasks = {'plant': ('simulation',), 'controller': ('control',),
+    tasks = {'plant': ('simulation',), 'controller': TASKS,
              'trainer': ('recording', 'experiment', 'training')}
     for node in tasks:
         ros.start(node, {'record_at_start': False} if node == 'trainer' else None)

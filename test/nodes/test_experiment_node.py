@@ -264,29 +264,3 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     assert recorded[-1] == pytest.approx(SAFE)
     assert max(abs(b - a) for a, b in pairwise([to_celsius(PRESENT), *recorded])) <= 1.0 + 1e-9
     assert 'Traceback' not in ros.printed()
-
-
-def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
-    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
-    ros.start('controller')
-    ros.meet('controller')
-    ros.set_bool('controller/set_automatic', False)
-    ros.start('trainer', {**IDLE, 'experiment_on': 'manual',
-                          'experiment_length': 60000.0, 'experiment_shortest_hold': 6.0,
-                          'experiment_longest_hold': 12.0})
-    ros.meet('trainer')
-    ros.start('plant', {'lockstep': True, 'speed': 60.0})
-    ros.wait_until(lambda: commands)
-    assert ros.set_bool(SERVICE, True).message == 'running on /manual_coolant_setpoint'
-    first = len(commands)
-    ros.wait_until(lambda: len(commands) > first + 60)
-    levels = [message.temperature for message in commands[first:]]
-    assert max(levels) - min(levels) > 5.0
-    assert max(abs(b - a) for a, b in pairwise(levels)) <= 1.0 + 1e-9
-    ros.wait_for_status(STATUS, lambda s: s.message == 'running')
-
-    ros.set_bool('controller/set_automatic', True)
-    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
-    assert status.message.startswith('aborted: the controller commands ')
-    assert 'switch it to manual mode' in status.message
-    ros.wait_until(lambda: ros.node.count_publishers(reactor.MANUAL_COOLANT_SETPOINT) == 0)

@@ -90,13 +90,12 @@ def test_example_of_the_page_passes(tmp_path: Path) -> None:
 
 
 PARENT = """
-import signal, threading, time
+import threading, time
 from pathlib import Path
-from koopman_ros.testing import guard, NodeProcess
-guard.PATIENCE = {patience}
+from koopman_ros.testing import NodeProcess, process
+process.STOP_TIMEOUT = {patience}
 def start():
-    child = NodeProcess({name!r}, {parameters!r}, Path({log!r}), {{}}, command={command!r},
-                        imported={imported})
+    child = NodeProcess({name!r}, {parameters!r}, Path({log!r}), {{}}, command={command!r})
     print(child.process.pid, flush=True)
 # a signal at the death of the parent would come with the end of this thread
 thread = threading.Thread(target=start)
@@ -114,18 +113,14 @@ HALTED = 'import signal\nprint("ready", flush=True)\nsignal.raise_signal(signal.
 def orphan(ros: Harness, log: Path, patience: float = TIMEOUT, **child: object) -> int:
     """Start a process that starts another one; return the number of that one."""
     parent = ros.start('parent', command=(sys.executable, '-c', PARENT.format(
-        log=str(log), patience=patience,
-        **{'parameters': {}, 'command': None, 'imported': False, **child})))
+        log=str(log), patience=patience, **{'parameters': {}, 'command': None, **child})))
     ros.wait_until(lambda: parent.output().endswith('\n'))
     return int(parent.output())
 
 
-@pytest.mark.parametrize('imported', [False, True])
-def test_node_of_a_process_that_is_killed_completes_its_work(
-        ros: Harness, tmp_path: Path, imported: bool) -> None:
+def test_node_of_a_process_that_is_killed_completes_its_work(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'bag.mcap'
-    child = orphan(ros, tmp_path / 'child.log', name='trainer', parameters={'output': str(bag)},
-                   imported=imported)
+    child = orphan(ros, tmp_path / 'child.log', name='trainer', parameters={'output': str(bag)})
     ros.meet('trainer')
     ros.processes[0].stop(signal.SIGKILL)
     wait_until_ended(child)

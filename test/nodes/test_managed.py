@@ -228,14 +228,12 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert 'Traceback' not in process.output()
 
 
-@pytest.mark.parametrize('measured', [False, True], ids=['', 'measured'])
-def test_controller_goes_on_from_the_last_command(ros: Harness, measured: bool) -> None:
+def test_controller_goes_on_from_the_last_command(ros: Harness) -> None:
     """After an activation, by the records, too; an input that was measured long ago is none."""
     loop = Loop(ros)
     applied = ros.node.create_publisher(
         Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
-    if measured:
-        applied.publish(temperature(15.0, 1.0))
+    applied.publish(temperature(15.0, 1.0))
     process = started(ros, 'controller', measurement_timeout=0.0)
     assert change(ros, 'controller', 'configure')
     assert change(ros, 'controller', 'activate')

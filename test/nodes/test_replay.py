@@ -23,10 +23,10 @@ from std_msgs.msg import String
 from koopman_ros.bags import BagReadError
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
-from koopman_ros.nodes.replay import Names
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.replay.records import parse, Record, SNAPSHOT
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict
+from koopman_ros.replay.run import replayed_bag
 from koopman_ros.replay.sources import read_records
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
@@ -100,13 +100,13 @@ class Operator:
 
 def run_a_day(operator: Operator) -> None:
     """Go through whatever an operator and a sensor may do."""
-    operator.measure_on(20, STEADY, -0.05)
+    operator.measure_on(8, STEADY, -0.05)
     operator.setpoint.publish(temperature(45.0))
-    operator.measure_on(15, STEADY, -0.3)
+    operator.measure_on(12, STEADY, -0.3)
     # refused, and one for later
     operator.setpoint.publish(temperature(200.0))
     operator.setpoint.publish(temperature(48.0, operator.time + 6.5))
-    operator.measure_on(12, 47.3, -0.1)
+    operator.measure_on(10, 47.3, -0.1)
     operator.join()
     # a gap, a sensor that fails, stamps that repeat and come late, and a clock that is set back
     operator.measure(46.4, operator.time + 30.0)
@@ -118,10 +118,10 @@ def run_a_day(operator: Operator) -> None:
     for mode, celsius in ((False, 26.0), (True, 15.0), (False, 24.0)):
         operator.ros.set_bool('controller/set_automatic', mode)
         operator.manual.publish(temperature(celsius))
-        operator.measure_on(12, 46.0, 0.04)
+        operator.measure_on(4, 46.0, 0.04)
     operator.ros.set_bool('controller/set_automatic', True)
     # requests and measurements side by side, whose order only the controller knows
-    for k in range(30):
+    for k in range(12):
         operator.setpoint.publish(temperature(44.0 + (k % 5)))
         operator.measure(46.0 - 0.03 * k)
     operator.join()
@@ -139,12 +139,12 @@ def tune_and_swap(operator: Operator) -> None:
             ({'model': str(operator.model), 'coolant_temperature.weight': 0.5}, True),
             ({'model': 'none'}, False)):
         assert operator.set(**change) is taken
-        operator.measure_on(5, 46.0, -0.05)
+        operator.measure_on(3, 46.0, -0.05)
     for content in (model_path('reactor_nz3').read_bytes(), b'',
                     model_path('reactor_nz4').read_bytes()):
         operator.model.write_bytes(content)
         assert operator.ros.trigger('controller/reload_model').success is bool(content)
-        operator.measure_on(5, 45.8, 0.05)
+        operator.measure_on(3, 45.8, 0.05)
 
 
 def fall_silent(operator: Operator) -> None:
@@ -155,14 +155,14 @@ def fall_silent(operator: Operator) -> None:
         operator.ros.wait_until(lambda count=count: operator.answered.total() >= count + 3)
         assert operator.set(measurement_timeout=0.0)
         operator.time += 10.0
-        operator.measure_on(15, 46.0, -0.02)
+        operator.measure_on(5, 46.0, -0.02)
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a day of a controller, which is started again in the evening."""
     folder = tmp_path_factory.mktemp('day')
-    with Harness(folder, imported=True) as ros:
+    with Harness(folder) as ros:
         operator = Operator(ros, folder)
         run_a_day(operator)
         tune_and_swap(operator)
@@ -182,9 +182,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         # each who joins is sent a record, which the trainer has once it has found the controller
         ros.wait_until(lambda: operator.join() and int(value(
             ros.last_status('trainer: recording'), f'messages on {RECORDS}')) > count + 1)
-        operator.measure_on(20, 46.0, -0.05)
+        operator.measure_on(5, 46.0, -0.05)
         ros.wait_until(lambda: sum(
-            parse(message.data).event == 'measurement' for message in runs) == 20)
+            parse(message.data).event == 'measurement' for message in runs) == 5)
         operator.wait_for_records(count)
         assert ros.set_bool('trainer/record', False).success
     operator.model.unlink()
@@ -192,15 +192,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def replayed(bag: Path, **parameters: object) -> ReplayedBag:
-    return replay.replayed_bag(str(bag), Names(), ReplayParameters(**parameters), parameters)
+    return replayed_bag(str(bag), ReplayParameters(**parameters), given=parameters)
 
 
 def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Path) -> None:
     found, written = replayed(bag), list(read_records(bag, RECORDS))
-    assert found.check.identical == found.check.compared == len(found.recorded) > 200
-    # and all that were sent have their record
-    assert found.unexplained == 0
-    assert found.published.total() == len(found.recorded)
+    assert found.check.identical == found.check.compared == len(found.recorded) > 80
     assert (found.found.runs, found.found.lost) == (2, [])
     assert found.complete
     assert verdict(found) == (
@@ -209,7 +206,7 @@ def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Pa
     events = Counter(record.event for record in written)
     # the manual command in automatic mode is refused
     assert {name: events[name] for name in ('setpoint', 'mode', 'manual_command', 'model')} == {
-        'setpoint': 33, 'mode': 4, 'manual_command': 3, 'model': 2}
+        'setpoint': 15, 'mode': 4, 'manual_command': 3, 'model': 2}
     assert found.found.refused == 2
     # on a busy machine there may be more
     assert events['silence'] >= 6
@@ -224,7 +221,7 @@ def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Pa
     assert found.found.models == ['reactor_nz4', str(bag.parent / 'own.safetensors'),
                                   'reactor_nz3']
     steps = np.abs(np.diff(found.recorded[:, 0]))
-    assert sum(steps > 0.49) > 20  # K; the rate limit at one sample a second
+    assert sum(steps > 0.49) > 10  # K; the rate limit at one sample a second
 
 
 def test_a_replay_on_several_threads_is_bit_identical(bag: Path, tmp_path: Path) -> None:
@@ -243,7 +240,7 @@ def test_bag_that_was_cut_off_is_reproduced_as_far_as_it_is_whole(
         bag: Path, tmp_path: Path) -> None:
     (file,) = bag.glob('*.mcap')
     part = tmp_path / 'part.mcap'
-    part.write_bytes(file.read_bytes()[:int(0.6 * file.stat().st_size)])
+    part.write_bytes(file.read_bytes()[:int(0.7 * file.stat().st_size)])
     with pytest.raises(BagReadError, match='did not close it'):
         replayed(part)
     found = replayed(part, recover=True)
@@ -273,7 +270,7 @@ def altered(whole: list[Record]) -> list[Record]:
     (lambda whole: whole[-5:], 3, 'replay: nothing to compare in a bag'),
     (lambda whole: whole[:1], 3, 'replay: nothing to compare in a bag'),
     (lambda whole: [*whole[:9], *whole[:9]], 1, 'comes again, or after record'),
-    (lambda whole: [], 1, 'version 0.1 had none: its bags can be played and trained from'),
+    (lambda whole: [], 1, 'has no records of a controller'),
 ])
 def test_records_that_are_not_reproduced_end_with_their_code_and_one_line(
         tmp_path: Path, capfd: pytest.CaptureFixture[str],
@@ -293,8 +290,6 @@ def test_run_without_its_start_and_with_a_lost_record_is_reproduced_from_the_sna
     assert lost.first == lost.last == 8
     assert found.check.identical == found.check.compared == 10
     assert len(found.recorded) == 15
-    # commands whose record is not there
-    assert found.unexplained == 20 - len(found.recorded)
     assert found.found.begins_late == found.found.runs == 1
     assert reproduced(found)
     assert run_here(replay, bags=f'[{path}]', output=tmp_path) == 0
@@ -305,8 +300,7 @@ def test_report_tells_where_the_new_model_and_the_new_tuning_differ(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_run(tmp_path / 'run.mcap')
     for new, tuning in (
-            ('reactor_linear', ()), ('reactor_nz4', ('-p', 'coolant_temperature.weight:=5.0')),
-            ('reactor_nz4', ())):
+            ('reactor_nz4', ('-p', 'coolant_temperature.weight:=5.0')), ('reactor_nz4', ())):
         assert run_here(
             replay, '--params-file', str(config_directory() / 'controller.yaml'), *tuning,
             bags=f'[{path}]', new_model=new, output=tmp_path / 'out') == 0
@@ -344,9 +338,7 @@ def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
     *((('-p', 'new_model:=reactor_nz4', '-p', given), words) for given, words in (
         ('coolant_temperature.min:=40.0', 'coolant_temperature.min = 40.0 degC must be below'),
         ('coolant_temperature.min:=40',
-         'coolant_temperature.min = 40 must be a double, e.g. 1.0'),
-        ('coolant_min:=10.0', 'coolant_min is now coolant_temperature.min [degC]: write '
-                              'coolant_temperature.min: 10.0'))),
+         'coolant_temperature.min = 40 must be a double, e.g. 1.0'))),
     (('-p', 'output:=/dev/null/out'), 'Not a directory'),
 ])
 def test_what_cannot_be_replayed_is_refused_in_one_line(

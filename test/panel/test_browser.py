@@ -86,7 +86,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         # the parser of the type support imports a module that Python deprecated
         warnings.simplefilter('ignore', DeprecationWarning)
         serialize_message(Temperature())
-    with opened_browser() as browser, Harness(folder, imported=True) as ros:
+    with opened_browser() as browser, Harness(folder) as ros:
         panel = ros.start('panel', {'port': 0, 'users': users})
         # a model is accepted although the present one predicts a plant that has changed
         controller = ros.start('controller', {'model_check_factor': 0.0})

@@ -20,10 +20,10 @@ import pytest
 
 from koopman_ros.control import events, Mode, State
 from koopman_ros.lifting import load_with_digest, save
-from koopman_ros.nodes.replay import replay_records
-from koopman_ros.reasons import Code, UNMEASURED
+from koopman_ros.reasons import UNMEASURED
 from koopman_ros.replay import records
 from koopman_ros.replay.loop import Alternative, Lost, Replay
+from koopman_ros.replay.run import replay_records
 from koopman_ros.replay.sources import Models
 from koopman_ros.resources import config_directory
 from support.recorded_runs import COOLANT, MODELS, Recorded, SECOND, STEADY
@@ -63,13 +63,6 @@ HAPPENS = st.one_of(
     st.tuples(st.just('snapshot')))
 
 
-def test_events_of_records_without_the_later_fields_are_as_they_were() -> None:
-    old = {'stamp_ns': SECOND, 'measured': [300.0], 'applied': None}
-    assert records.event_of(records.Record('run', 0, 'measurement', old)).seconds is None
-    assert records.event_of(records.Record('run', 1, 'silence', {'stamp_ns': SECOND})) == (
-        events.Silence(SECOND, Code.NO_MEASUREMENT))
-
-
 def happen(controller: Recorded, event: tuple) -> None:
     match event:
         case ('measure', *measurement):
@@ -91,7 +84,7 @@ def happen(controller: Recorded, event: tuple) -> None:
             controller.snapshot()
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.lists(HAPPENS, max_size=60), st.sampled_from(sorted(MODELS)), st.integers(0, 59))
 def test_any_run_is_reproduced_from_its_start_and_from_any_place(
         happened: list[tuple], model: str, place: int) -> None:
@@ -209,7 +202,7 @@ def test_text_that_is_no_record(text: str, words: str) -> None:
 
 
 def event(measured: object) -> dict[str, object]:
-    return {'stamp_ns': 1, 'measured': measured, 'applied': None}
+    return {'stamp_ns': 1, 'measured': measured, 'applied': None, 'seconds': None}
 
 
 @pytest.mark.parametrize(('place', 'change', 'words'), [
@@ -280,6 +273,7 @@ def exact(value: object) -> str:
         return re.sub(r'np\.float64\(([^)]*)\)', r'\1', repr(value))
 
 
+@settings(max_examples=25, deadline=None)
 @given(VALUES)
 def test_values_survive_bit_identical(value: object) -> None:
     text = json.dumps(records.encoded(value), allow_nan=False)

@@ -23,13 +23,13 @@ from koopman_ros.identification import (
 )
 from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import linearised_model, load, ModelFileError, Provenance, save
+from koopman_ros.parameters.model_checks import load_suitable
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
 from koopman_ros.retraining.gate import shortfalls
 from koopman_ros.retraining.lift import _spread, drift_samples, steady_point
-from koopman_ros.ros.model_reload import load_suitable
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, NOISE, reactor

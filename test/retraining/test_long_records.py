@@ -13,12 +13,12 @@ import pytest
 from koopman_ros.identification import Stopped
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining.record import read_record
-from support.long_records import bags_of, CASE, source, task
+from support.long_records import bags_of, drift_error, source, task
+from support.long_records import SAMPLES as LENGTH
 from support.quick_retraining import quick_retraining
-from validation.benchmarks.retraining import drift_error
 
 BAGS = 10
-SAMPLES = BAGS * CASE.bag
+SAMPLES = BAGS * LENGTH
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -46,7 +46,7 @@ def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Pa
     assert found.reduction.samples == found.account.measurements == SAMPLES
     assert found.reduction.used <= 3000
     # of rates up to 15 K/min
-    assert drift_error(CASE, found.found.drift)[0] < 0.02
+    assert drift_error(found.found.drift) < 0.02
     # a dozen segments of four minutes reach most of the range
     assert min(found.coverage.values()) > 0.6
     shares = [share for share, _ in told]
@@ -61,13 +61,13 @@ def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Pa
 
 
 def test_a_short_record_is_taken_whole(bags: list[Path]) -> None:
-    found = read_record(source([*bags[:2], bags[0]]), 2 * CASE.bag, 0)
+    found = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH, 0)
     assert found.reduction is None
-    assert [len(one) for one in found.episodes] == [CASE.bag, CASE.bag]
+    assert [len(one) for one in found.episodes] == [LENGTH, LENGTH]
     # a bag that is named twice is read once, here and there
-    twice = read_record(source([*bags[:2], bags[0]]), 2 * CASE.bag - 1000, 0)
+    twice = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH - 1000, 0)
     assert twice.account.notes[0] == f'{bags[0]} is named twice: read once'
-    assert twice.account.used == 2 * CASE.bag
+    assert twice.account.used == 2 * LENGTH
 
 
 def test_reading_can_be_stopped(bags: list[Path], tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ from koopman_ros.parameters.trainer import (
 )
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
+from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS, programs
 from koopman_ros.testing import Harness, isolated_domain
@@ -230,10 +231,10 @@ class Pair:
         self.speaker = self.matching.publish('command', Temperature)
         self.matching.subscribe('temperature', lambda _: None, Temperature)
 
-    def _node(self, name: str) -> Node:
+    def _node(self, name: str) -> HostedNode:
         context = Context()
         rclpy.init(context=context)
-        return Node(name, context=context)
+        return HostedNode(name, None, context=context)
 
     def wait(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + TIMEOUT

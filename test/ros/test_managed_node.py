@@ -15,10 +15,10 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from koopman_ros.ros.hosted import Hosting, Schedule
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.hosted import HostContext, wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Level, Status, wall_timer
-from koopman_ros.ros.process import told_executor
+from koopman_ros.ros.process import events_executor
 from koopman_ros.testing import Harness
 from support.nodes import TIMEOUT
 
@@ -138,8 +138,7 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
             return response
 
     failures: list[BaseException] = []
-    schedule = Schedule()
-    node = Own('own', context=ros.node.context, hosting=Hosting(schedule, 1, failures.append))
+    node = Own('own', context=ros.node.context, hosting=HostContext(1, failures.append))
     node.start()
     speakers = [ros.node.create_publisher(String, f'words_{kind}', 100) for kind in range(2)]
     client = ros.node.create_client(Trigger, 'own/serve')
@@ -150,7 +149,7 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
             speaker.publish(String())
     assert all(speaker.wait_for_all_acked() for speaker in speakers)
     asked = [client.call_async(Trigger.Request()) for _ in range(3)]
-    executor = told_executor(ros.node.context)
+    executor = events_executor(ros.node.context)
     executor.add_node(node)
     deadline = time.monotonic() + TIMEOUT
     # what has come is queued, and one of it handled
@@ -159,7 +158,6 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
     node.trigger_deactivate()
     node.trigger_cleanup()
     for _ in range(50):
-        schedule.turn()
         executor.spin_once(timeout_sec=0.0)
     while not all(future.done() for future in asked) and time.monotonic() < deadline:
         ros.spin_once()

@@ -37,7 +37,6 @@ from koopman_ros.testing import Harness
 
 TABLES = tables()
 PLANTS = sorted(path.stem for path in config_directory().glob('plants/*.yaml'))
-FORMER = yaml.safe_load((config_directory() / 'renamed.yaml').read_text())
 
 
 def row(default: Any, **details: Any) -> Specification:
@@ -345,27 +344,6 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
     file = config_directory() / 'plants' / f'{system}.yaml'
     assert declared(ros, '--params-file', str(file), name='plant',
                     table=PlantTable({'system': system}))[0].system == system
-
-
-@pytest.mark.parametrize(('node', 'name'), [
-    (node, name) for node, rows in FORMER.items() for name in rows])
-def test_former_name_is_refused_with_the_line_to_write(ros: Harness, node: str, name: str) -> None:
-    now, factor = FORMER[node][name]
-    row = TABLES[node].rows[now]
-    old, new = next(iter(factor.items())) if isinstance(factor, dict) else (
-        ('1.0e-06', 6.0) if factor == 'digits' else (3, 3.0 * factor))
-    with pytest.raises(ConfigurationError) as refusal:
-        declared(ros, '-p', f'{name}:={old}', name=node, table=TABLES[node])
-    unit = f' [{row.unit}]' if row.unit else ''
-    said = re.fullmatch(rf'(\w+) is now ([\w.]+){re.escape(unit)}: write ([\w.]+): (.+)',
-                        str(refusal.value))
-    assert said is not None
-    assert said.groups()[:3] == (name, now, now)
-    # of the type that the row takes
-    written = yaml.safe_load(said[4])
-    assert isinstance(written, list if isinstance(row.default, tuple) else type(row.default))
-    found = written[0] if isinstance(written, list) else written
-    assert found == (new if isinstance(factor, dict) else pytest.approx(new, rel=1e-11))
 
 
 def test_a_topic_is_not_commanded_and_measured_at_once() -> None:

@@ -23,15 +23,18 @@ from koopman_ros.control import Mode, State
 from koopman_ros.control.laws import Plan
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
+from koopman_ros.parameters import model_checks
 from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.parameters.model_checks import load_suitable
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.parameters.wire import Signals, signals_of, Wiring
 from koopman_ros.resources import model_path
-from koopman_ros.ros import model_reload, recorder, topics
-from koopman_ros.ros.controller_messages import active_limits, condition, planned
+from koopman_ros.ros import recorder, topics
+from koopman_ros.ros.controller_messages import active_limits, planned
+from koopman_ros.ros.controller_status import statuses
+from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.experiment import PlantExperiment
-from koopman_ros.ros.model_reload import load_suitable
-from koopman_ros.ros.node import Level, LoopNode, Status
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
@@ -181,7 +184,7 @@ def test_model_of_other_signals_than_the_controller_was_started_for_is_refused(
 def test_model_whose_step_takes_too_long_is_refused_with_its_time(
         monkeypatch: pytest.MonkeyPatch) -> None:
     """No model within the bounds takes that long, so the limit is moved."""
-    monkeypatch.setattr(model_reload, '_LONGEST_STEP', 1e-7)
+    monkeypatch.setattr(model_checks, '_LONGEST_STEP', 1e-7)
     with pytest.raises(ModelFileError, match=(
             r'a control step with the model takes [0-9.e-]+ s of a processor, at most 1e-07 s are '
             r'allowed: train one with fewer coordinates \(n_z = 4\)$')):
@@ -237,12 +240,12 @@ def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
         state = own.step(state, model.states.center, k * 10 ** 9)[0]
     state = own.request_manual_input(state, model.inputs.center + 1.0)[0]
     state, _, report = own.hold(state, int((3.0 + silence) * 1e9), None)
-    ok = Status(Level.OK, '')
     now = SimpleNamespace(
         report=report, state=state, controller=own, signals=SIGNALS, measured=model.states.center,
-        parameters=SimpleNamespace(max_measurement_age=5.0), complaint='', open_loop=ok,
-        request='', model_refused='', counts=SimpleNamespace(measurements=3),
+        parameters=SimpleNamespace(max_measurement_age=5.0, measurement_timeout=0.0),
+        complaint='', unheard=(), unheard_for=0.0, request='', model_refused='', input='coolant',
+        counts=SimpleNamespace(measurements=3),
         timing=SimpleNamespace(silence=silence, paused=False, without_clock=False, age=math.nan,
                                no_news=lambda _: None))
-    found = condition(now, 'measurements')
+    found = statuses(now)['measurements']
     assert (found.level is Level.WARN) is warned

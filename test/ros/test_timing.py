@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from koopman_ros.ros import watchdog
-from koopman_ros.ros.watchdog import Timing
+from koopman_ros.ros import timing
+from koopman_ros.ros.timing import Timing
 from koopman_ros.time_base import Advance
 from koopman_ros.units import NANOSECONDS as SECOND
 
@@ -22,7 +22,7 @@ class Clocks:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, simulated: bool) -> None:
         self.steady, self.simulated = 100.0, 0.0
-        monkeypatch.setattr(watchdog, 'time', SimpleNamespace(
+        monkeypatch.setattr(timing, 'time', SimpleNamespace(
             monotonic=lambda: self.steady,
             time_ns=lambda: round((EPOCH + self.steady) * SECOND)))
         self.node = SimpleNamespace(

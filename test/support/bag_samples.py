@@ -9,10 +9,18 @@ from pathlib import Path
 import struct
 from typing import Any
 
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 import yaml
 import zstandard
 
-from koopman_ros.bags import BagWriter, MessageDefinition, QosProfile
+from koopman_ros.bags import BagWriter, MessageDefinition
 
 TOPICS = {
     '/temperature': 'sensor_msgs/msg/Temperature',
@@ -20,14 +28,19 @@ TOPICS = {
     '/joint_states': 'sensor_msgs/msg/JointState',
     '/clock': 'rosgraph_msgs/msg/Clock',
 }
+# RMW_DURATION_INFINITE
+NEVER = QosTime(9223372036, 854775807)
+DEFAULT_QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, NEVER,
+                  NEVER, QosLiveliness.AUTOMATIC, NEVER, avoid_ros_namespace_conventions=False)
 OFFERED_QOS = {
-    '/temperature': (QosProfile(),),
-    '/diagnostics': (QosProfile(history='unknown', depth=0),),
+    '/temperature': (DEFAULT_QOS,),
+    '/diagnostics': (DEFAULT_QOS._replace(history=QosHistory.UNKNOWN, depth=0),),
     '/joint_states': (
-        QosProfile(reliability='best_effort', depth=5, deadline_ns=1_500_000_000),
-        QosProfile(durability='transient_local', depth=1),
+        DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT, depth=5,
+                             deadline=QosTime(1, 500_000_000)),
+        DEFAULT_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1),
     ),
-    '/clock': (QosProfile(reliability='best_effort', depth=1),),
+    '/clock': (DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT, depth=1),),
 }
 _HASH = 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a'
 NUMBER = MessageDefinition('std_msgs/msg/Float64', 'float64 data\n', _HASH)

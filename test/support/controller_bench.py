@@ -16,9 +16,9 @@ from std_msgs.msg import String
 
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import load
-from koopman_ros.nodes.replay import replay_records
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.replay.records import parse, Record
+from koopman_ros.replay.run import replay_records
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness

@@ -50,7 +50,7 @@ def type_support() -> None:
 @pytest.fixture
 def ros(tmp_path: Path) -> Iterator[Harness]:
     """Yield a node in a domain of its own, which starts processes and talks to them."""
-    with Harness(tmp_path, imported=True) as bench:
+    with Harness(tmp_path) as bench:
         yield bench
 
 
@@ -58,7 +58,7 @@ def ros(tmp_path: Path) -> Iterator[Harness]:
 def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
     """Yield the same for tests that use one process after each other."""
     folder = tmp_path_factory.mktemp('shared')
-    with Harness(folder, imported=True) as bench:
+    with Harness(folder) as bench:
         yield bench
 
 

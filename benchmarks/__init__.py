@@ -1,0 +1,11 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Speed of the package beside other programs: ``python -m benchmarks`` measures it."""
+
+import os
+
+# Before numpy is imported, here and by the processes that are started: with so few numbers other
+# threads only wait and spin.
+for library in ('OMP', 'OPENBLAS', 'MKL'):
+    os.environ[f'{library}_NUM_THREADS'] = '1'

@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a plan of the law `mpc` takes, beside do-mpc with IPOPT and casadi's generated SQP."""
+
+from collections.abc import Callable
+from pathlib import Path
+import shutil
+import tempfile
+from time import perf_counter_ns, thread_time_ns
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from benchmarks.process import Tell
+from benchmarks.sqp import Problem, solver_of, Sqp
+from koopman_ros.arrays import Array
+from koopman_ros.control import (
+    at,
+    Controller,
+    SetpointRequest,
+    simulate,
+    State,
+)
+from koopman_ros.control.laws.base import Target
+from koopman_ros.control.laws.receding_horizon import RecedingHorizon
+from koopman_ros.control.simulate import after_a_second
+from koopman_ros.estimation import Estimate
+from koopman_ros.plants import Process
+from koopman_ros.units import NANOSECONDS
+from studies.equations import EQUATIONS
+from studies.partly_measured.cases import Case, CASES
+
+# A state (n_x,) and its target, and what answers them.
+Call: TypeAlias = tuple[Array, Target]
+Answer: TypeAlias = Callable[[Array, Target], Array]
+
+# Lifts of two states and of four, whose horizon is thirty samples, each with its set-points, of
+# which each holds for so many samples, and the noise of all states, in their units.
+SETPOINTS = {'pendulum': ((0.0,), (0.5,), (-0.3,), (0.8,)),
+             'quadruple_tank': ((0.15, 0.12), (0.12, 0.14), (0.14, 0.10), (0.11, 0.13))}
+_NOISE = {'pendulum': (2e-3, 1e-2), 'quadruple_tank': (1e-3, 1e-3, 5e-4, 5e-4)}
+_HELD, _BLOCK = 40, 20
+# Until then a controller does not know the time between samples, and plans nothing.
+_UNTIMED = 2
+_MARGIN = 0.3  # half widths of the training box by which the law may leave that
+_UNIFORM = 0.02  # of a sample, by which intervals of the horizon may differ from one
+#: of the range of an input, between the commands of each and those of the law. The lift's drift is
+#: not quite the plant's, which the others have; do-mpc counts the cost at the samples alone.
+TOLERANCE = {'step': 1e-3, 'sqp': 2e-3, 'do_mpc': 0.03}
+INTERVALS = 30
+
+
+def compare_all(tell: Tell, plants: tuple[str, ...], samples: int, compiled: bool) -> None:
+    """Compare on several plants, in a process with nothing else."""
+    compiler = next(filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
+    for plant in plants:
+        tell({plant: compare(plant, samples, compiler if compiled else None)})
+
+
+def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
+    """
+    Time all sides on one course, block by block in turns, once they are seen to agree.
+
+    :param compiler: command of a C compiler for the others, or None.
+    :return: by side its figures in microseconds; `agreement`, the largest distance of its commands
+        from the law's as a share of the input's range.
+    :raises ValueError: where the sides do not solve one problem.
+    """
+    case = CASES[plant]
+    controller = _controller(case)
+    calls, commanded, requested = _course(case, controller, samples)
+    # each twice: what one run remembers would help the next
+    problem = _problem(case, controller)
+    with tempfile.TemporaryDirectory() as name:
+        solver = solver_of(problem, Path(name), compiler)
+        sides, again = (_sides(case, controller, Sqp(problem, solver)) for _ in range(2))
+    commands = {'step': commanded, **{side: np.array([answer(*call) for call in calls])
+                                      for side, answer in sides.items()}}
+    apart = {side: float(np.max(np.abs(commands[side] - commands['law'])[_UNTIMED:]
+                                / (case.upper - case.lower))) for side in TOLERANCE}
+    for side, most in TOLERANCE.items():
+        if not apart[side] <= most:
+            raise ValueError(f'{plant}: the commands of {side} and of the law differ by '
+                             f'{apart[side]:.2g} of the range, at most {most:g} is explained: '
+                             'the sides do not solve one problem')
+    state = State()
+    taken: dict[str, list[tuple[int, int]]] = {side: [] for side in ('step', *again)}
+    for block in range(0, samples, _BLOCK):
+        numbers = range(block, min(block + _BLOCK, samples))
+        for k in numbers:
+            if k in requested:
+                state, _ = controller.request_setpoint(state, requested[k])
+            used, start = thread_time_ns(), perf_counter_ns()
+            state, _, _ = controller.step(
+                state, calls[k][0], after_a_second(round(k * case.period * NANOSECONDS)))
+            taken['step'].append((perf_counter_ns() - start, thread_time_ns() - used))
+        for side, answer in again.items():
+            for k in numbers:
+                used, start = thread_time_ns(), perf_counter_ns()
+                answer(*calls[k])
+                taken[side].append((perf_counter_ns() - start, thread_time_ns() - used))
+    found: dict[str, Any] = {'steps': samples, 'states': case.system.n_x,
+                             'compiled': compiler is not None, 'agreement': apart}
+    for side, pairs in taken.items():
+        wall, cpu = 1e-3 * np.array(pairs[_UNTIMED:]).T
+        for clock, values in (('', wall), ('cpu_', cpu)):
+            for label, percent in (('median', 50), ('p99', 99)):
+                found[f'{side}_{clock}{label}_us'] = float(np.percentile(values, percent))
+    return found
+
+
+def _controller(case: Case) -> Controller:
+    """Return a controller that measures every state, its law alone on the shipped lift."""
+    model = case.lift
+    return Controller(model, case.tuning(
+        model, estimator='measured_state', noise=0.0, wander=0.0, initial_error=0.0,
+        levels=('mpc',), validity_margin=_MARGIN))
+
+
+def _course(case: Case, controller: Controller, samples: int
+            ) -> tuple[list[Call], Array, dict[int, Array]]:
+    """Let the controller lead the true plant; return calls, commands, set-points by sample."""
+    wanted = SETPOINTS[case.plant]
+    requested = {k: np.array(wanted[k // _HELD % len(wanted)]) for k in range(0, samples, _HELD)}
+    loop = simulate(controller, Process(case.system, 0, *case.start), [
+        at(k * case.period, SetpointRequest(0, value)) for k, value in requested.items()],
+        duration=(samples - 1) * case.period, period=case.period,
+        noise=np.array(_NOISE[case.plant]))
+    if set(loop.levels) != {'mpc'}:
+        raise ValueError(f'{case.plant}: the law does not act at every sample')
+    level, model = controller.levels['mpc'], controller.model
+    targets = {tuple(value): level.target(value, np.zeros(model.n_x), None)
+               for value in requested.values()}
+    calls = []
+    for y, setpoint in zip(loop.measured, loop.setpoints, strict=True):
+        target = targets[tuple(setpoint)]
+        assert target is not None
+        calls.append((y, target))
+    return calls, loop.commands, requested
+
+
+def _problem(case: Case, controller: Controller) -> Problem:
+    """Return what the law plans, with the plant's own equations."""
+    model, law = controller.model, controller.levels['mpc'].law
+    assert isinstance(law, RecedingHorizon)
+    interval = case.period / case.system.seconds_per_time_unit
+    lengths = law.lengths(interval)
+    if len(lengths) != INTERVALS or not np.ptp(lengths) <= _UNIFORM * interval:
+        raise ValueError(f'{case.plant}: the horizon has {len(lengths)} intervals of '
+                         f'{lengths.min():g} to {lengths.max():g}, must be {INTERVALS} samples')
+    return Problem(EQUATIONS[case.plant], lengths, case.Q, case.R, case.cost_to_go, case.lower,
+                   case.upper, (model.states.scale, model.inputs.scale))
+
+
+def _sides(case: Case, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
+    """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
+    # here, as whoever starts a comparison does without do-mpc
+    from studies.partly_measured.dompc import Planner
+
+    model, law = controller.model, controller.levels['mpc'].law
+    planner, none = Planner(case), np.zeros(case.directions.shape[1])
+    memory: object = None
+
+    def own(y: Array, target: Target) -> Array:
+        nonlocal memory
+        result = law.compute(Estimate(model.states.to_deviation(y), np.zeros(model.n_x)), target,
+                             case.limits, memory, case.period)
+        memory = result.memory
+        assert result.u is not None
+        return result.u
+
+    def other(y: Array, target: Target) -> Array:
+        planner.aim(model.states.to_physical(target.x), model.inputs.to_physical(target.u), none)
+        return planner.step(y)
+
+    return {'law': own, 'do_mpc': other, 'sqp': lambda y, target: sqp.step(
+        y, model.states.to_physical(target.x), model.inputs.to_physical(target.u))}

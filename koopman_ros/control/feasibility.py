@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Feasibility of a set-point: whether an input within its range holds it, and the nearest one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.fallback import Level
+from koopman_ros.control.laws.base import Target
+from koopman_ros.control.steady_state import nearest_steady_state, resting_state
+from koopman_ros.lifting import Coordinates
+from koopman_ros.reasons import Code, Reason, reason
+
+_HALVINGS = 24  # to 1e-7 of the way
+_MOST_MOVES = 10
+_SINGULAR = 1e9  # condition from which on a model has no steady state for each input
+# What rounding may add to an input, in scaled deviations, and to a state, in half-ranges.
+_SLACK = 1e-6
+# With fewer inputs than controlled states a set-point counts as held where a steady state is so
+# near, in half-ranges of the training box: nobody states one to all its digits.
+_NEAR = 0.01
+
+
+@dataclass(frozen=True)
+class Feasibility:
+    """Set-points that a level can hold under a disturbance."""
+
+    level: Level  #: whose model tells
+    margin: float  #: distance outside the training box, in half-ranges, that is allowed
+    w: Array  #: (n_x,) disturbance of the state's rate, scaled
+    start: Array | None  #: (n_x + n_u,) where the steady state is looked for, in units
+
+    @property
+    def box(self) -> Coordinates:
+        """The controlled states."""
+        return self.level.controlled_states
+
+    def infeasibility(self, goal: Array, others: Iterable[Array | None], command: Array | None,
+                whole: bool) -> Reason | None:
+        """
+        Return why a set-point (n_c,), in state units, cannot be held, or None.
+
+        :param goal: NaN for what is left open.
+        :param others: (n_c,) set-points from which on the nearest one that can be held is looked
+            for, the first one that is held itself.
+        :param command: (n_u,) input that holds another one, in input units, or None.
+        :param whole: whether every signal was asked for: else the others are to stay.
+        """
+        given = np.isfinite(goal)
+        if not given.all():
+            kept = tuple(name for name, is_given in zip(self.box.names, given, strict=True)
+                         if is_given)
+            some = replace(self, level=self.level.controlling(kept))
+            return some.infeasibility(goal[given], (), command, whole)
+        cause = self._cause(self._target(goal))
+        if cause is None:
+            return None
+        nearest = self._on_the_way(goal, (*others, self.box.center, self._under(command)))
+        if nearest is not None and len(goal) > 1 and (whole or self._too_few_inputs):
+            nearest = self._nearer(nearest, goal)
+        shares = (goal - (self.box.center if nearest is None else nearest)) / (
+            self.box.upper - self.box.lower)
+        worst = int(np.argmax(np.abs(shares)))
+        signal, value = self.box.names[worst], float(goal[worst])
+        if nearest is None:
+            return reason(Code.NO_SETPOINT_HELD, signal=signal, value=value, cause=cause)
+        return reason(Code.SETPOINT_NOT_HELD, signal=signal, value=value, cause=cause,
+                      nearest=float(nearest[worst]),
+                      held=tuple(zip(self.box.names, nearest.tolist(), strict=True)))
+
+    def _target(self, setpoint: Array) -> Target | None:
+        return self.level.target(setpoint, self.w, self.start)
+
+    def _under(self, command: Array | None) -> Array | None:
+        """Return what (n_c,) is held by a command (n_u,), or by the nominal input."""
+        model = self.level.model
+        u = self.level.limits.within(model.inputs.center if command is None else command)
+        start = np.zeros(model.n_x) if self.start is None else (
+            model.states.to_deviation(self.start[:model.n_x]))
+        x = resting_state(model, model.inputs.to_deviation(u), self.w, start)
+        return None if x is None else self.level.controlled_of(model.states.to_physical(x))
+
+    @property
+    def _too_few_inputs(self) -> bool:
+        """Whether the controlled states outnumber the inputs."""
+        return self.level.controls_all and self.level.model.n_u < self.level.model.n_x
+
+    def _on_the_way(self, goal: Array, others: Iterable[Array | None]) -> Array | None:
+        """Return the last set-point that is held on the way to a goal, None where none is."""
+        held = next((other for other in others if other is not None and self._held(other)), None)
+        if held is None:
+            return None
+        beyond = goal
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (held + beyond)
+            if self._held(middle):
+                held = middle
+            else:
+                beyond = middle
+        return held
+
+    def _nearer(self, held: Array, goal: Array) -> Array:
+        """Move the inputs within their range for the least squares of what is left to a goal."""
+        model, half = self.level.model, 0.5 * (self.box.upper - self.box.lower)
+        lower, upper = (model.inputs.to_deviation(end) for end in (
+            self.level.limits.lower, self.level.limits.upper))
+        for _ in range(_MOST_MOVES):
+            target, left = self._target(held), (goal - held) / half
+            assert target is not None  # it is held
+            slope = model.drift_jacobian(target.x) + model.forcing_jacobian(target.x, target.u)
+            if not np.linalg.cond(slope) < _SINGULAR:
+                break
+            gain = model.states.scale[:, None] * -np.linalg.solve(
+                slope, model.input_matrix(target.x))
+            gain = np.array([self.level.controlled_of(column) for column in gain.T]).T
+            move = lsq_linear(gain / half[:, None], left, (lower - target.u, upper - target.u),
+                              method='bvls').x
+            for halving in range(_MOST_MOVES):
+                x = resting_state(model, target.u + 0.5 ** halving * move, self.w, target.x)
+                if x is None:
+                    continue
+                found = self.level.controlled_of(model.states.to_physical(x))
+                shorter = float(np.linalg.norm(left) - np.linalg.norm((goal - found) / half))
+                if shorter > 0.0 and self._held(found):
+                    held = found
+                    break
+            else:
+                break
+            if shorter < _SLACK:
+                break
+        return held
+
+    def _held(self, setpoint: Array) -> bool:
+        return self.box.violation(setpoint) == 0.0 and self._cause(self._target(setpoint)) is None
+
+    def _cause(self, target: Target | None) -> Reason | None:
+        """Return what keeps a target from being held, or None."""
+        if target is None:
+            return reason(Code.NO_STEADY_STATE)
+        model = self.level.model
+        u, slack = model.inputs.to_physical(target.u), _SLACK * model.inputs.scale
+        for i, name in enumerate(model.inputs.names):
+            lower, upper = self.level.limits.lower[i], self.level.limits.upper[i]
+            if not lower - slack[i] <= u[i] <= upper + slack[i]:
+                return reason(Code.INPUT_NEEDED, signal=name, value=float(u[i]),
+                              lower=float(lower), upper=float(upper))
+        states = model.states
+        x, half = states.to_physical(target.x), 0.5 * (states.upper - states.lower)
+        reach = (self.margin + _SLACK) * half
+        for i, name in enumerate(states.names):
+            if not states.lower[i] - reach[i] <= x[i] <= states.upper[i] + reach[i]:
+                return reason(Code.STATE_LEAVES, signal=name, value=float(x[i]),
+                              lower=float(states.lower[i]), upper=float(states.upper[i]))
+        if self._too_few_inputs:
+            nearest = nearest_steady_state(model, target, self.w)
+            if nearest is None or not np.all(
+                    np.abs(nearest - target.x) * states.scale <= _NEAR * half):
+                return reason(Code.NO_STEADY_STATE)
+        return None

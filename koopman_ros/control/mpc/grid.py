@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The time grid of a horizon, and the transfer of a plan from one grid to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import brentq
+
+from koopman_ros.arrays import Array, frozen
+
+
+@dataclass(frozen=True)
+class HorizonGrid:
+    """Intervals from the present on, each with one input that is held."""
+
+    lengths: Array  #: (N,) in the model's time unit, the first that of a sample
+
+    @classmethod
+    def growing(cls, horizon: float, first: float, count: int, longest: float) -> HorizonGrid:
+        """
+        Return intervals that grow by a constant factor until they reach a horizon.
+
+        Parameters
+        ----------
+        horizon
+            Their sum, unless `longest` cuts them.
+        first
+            Length of the first one, and the least of all.
+        count
+            Their number.
+        longest
+            Length that none exceeds.
+
+        """
+        powers, total, factor = np.arange(count), horizon / first, 1.0
+        # near 1 the sum does not determine the factor
+        if count > 1 and total > count * (1.0 + 1e-9):
+            factor = brentq(lambda g: np.sum(g ** powers) - total, 1.0, total, xtol=1e-14)
+        return cls(frozen(np.minimum(first * factor ** powers, longest), 'intervals', (count,)))
+
+    @cached_property
+    def times(self) -> Array:
+        """The nodes (N + 1,) between the intervals, from 0."""
+        return np.concatenate(([0.0], np.cumsum(self.lengths)))
+
+    @property
+    def since_change(self) -> Array:
+        """Time (N, 1) from the input before to each input; before the first one, a sample."""
+        return np.concatenate((self.lengths[:1], self.lengths[:-1]))[:, None]
+
+    def shift(self, u: Array, x: Array, lengths: Array) -> tuple[Array, Array]:
+        """
+        Move the plan of the sample before to this grid, one sample later.
+
+        Parameters
+        ----------
+        u, x, lengths
+            (M, n_u) inputs, (M + 1, n_x) nodes and (M,) intervals of that plan.
+
+        Returns
+        -------
+        u
+            (N, n_u), the inputs that held in the middle of each interval.
+        x
+            (N + 1, n_x), interpolated linearly. Beyond the end of the plan its last values hold.
+
+        """
+        old, new = np.concatenate(([0.0], np.cumsum(lengths))), self.lengths[0] + self.times
+        middle = np.searchsorted(old[1:], 0.5 * (new[1:] + new[:-1]))
+        nodes = np.column_stack([np.interp(new, old, column) for column in x.T])
+        return u[np.minimum(middle, len(u) - 1)], nodes

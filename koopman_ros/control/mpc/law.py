@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The receding-horizon law; what it computes a plan with is loaded when it is constructed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+import time
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
+from koopman_ros.control.laws.riccati import StateDependentRiccati
+from koopman_ros.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
+from koopman_ros.estimation import Estimate
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.tuning import Tuning
+
+_PACKAGES = 'numba daqp'
+# Largest change of a scaled input after which a plan has converged, and with which it may be used.
+_CONVERGED, _USABLE = 1e-4, 0.05
+_MAX_ITERATIONS = 12
+_CHECKED = 3  # every third node, and the last, is checked for its distance from the training data
+
+
+@dataclass(frozen=True)
+class MPCParameters:
+    """Soft limits of the states, and the time limit of a plan."""
+
+    lower: Array = value_column(
+        'states', -UNBOUNDED, 'Soft lower limit of this state.', name='min', none=NO_LOWER)
+    upper: Array = value_column(
+        'states', UNBOUNDED, 'Soft upper limit of this state.', name='max', none=NO_UPPER)
+    time_limit: float = parameter(
+        0.0, 'Computing time of a plan after which the next law acts; 0: any.', 's', 0.0, 3600.0)
+
+
+class RecedingHorizon(Law):
+    """
+    Plan the inputs over a horizon at each sample, and command the first.
+
+    The plan minimises the integral of e'Q e + v'R v over the horizon plus the cost of the sampled
+    regulator from its end on, for the model's drift under the estimated disturbance. The plan of
+    the sample before is linearised, a quadratic program gives its change, and so on until that is
+    negligible. Range and rate of the inputs are constraints, the limits of the states are soft.
+
+    Direct multiple shooting by Runge-Kutta steps with their sensitivities, condensed to the
+    inputs; see M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear
+    optimization in optimal feedback control", SIAM J. Control Optim. 43 (2005).
+    """
+
+    Parameters = MPCParameters
+    parameters: MPCParameters
+
+    def __init__(self, model: LiftedModel, tuning: Tuning, parameters: MPCParameters) -> None:
+        super().__init__(model, tuning, parameters)
+        if not np.all(parameters.lower < parameters.upper):
+            raise ValueError('state limits must be min < max, got '
+                             f'{np.asarray(parameters.lower).tolist()} and '
+                             f'{np.asarray(parameters.upper).tolist()}')
+        self._riccati = StateDependentRiccati(model, tuning, None)
+        self.planner = None
+        try:
+            # compiles, or loads what was compiled before
+            from koopman_ros.control.mpc.planner import Planner
+        except ImportError:
+            return
+        self.planner = Planner(model, tuning, self.weights, *(
+            np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
+
+    def unusable(self) -> Reason | None:
+        """Return that its packages are not installed."""
+        return None if self.planner is not None else reason(
+            Code.PACKAGE_MISSING, package=_PACKAGES)
+
+    def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                previous: Array | None) -> LawResult:
+        """
+        Find the input for an estimate; see :class:`~koopman_ros.control.laws.base.Law`.
+
+        At the first sample, whose interval is not known, it is that of the Riccati equation.
+        """
+        planner = self.planner
+        if planner is None:
+            return LawResult(None, self.unusable())
+        if not interval > 0.0:
+            return self._riccati.compute(estimate, target, None, interval, previous)
+        began, limit = time.perf_counter(), self.parameters.time_limit or math.inf
+        try:
+            problem = planner.problem(estimate, target, interval, previous)
+            u, x = planner.first_guess(problem, memory)
+            for iteration in range(1, _MAX_ITERATIONS + 1):
+                found = planner.improve(problem, u, x)
+                if isinstance(found, Reason):
+                    return LawResult(None, found, passing=True)
+                change, u, x = found
+                spent = time.perf_counter() - began
+                if iteration == 1 and spent > limit:
+                    return LawResult(None, reason(
+                        Code.TOO_LATE, seconds=spent, deadline=limit), passing=True)
+                if change <= _CONVERGED or spent * (iteration + 1) / iteration > limit:
+                    break
+        except np.linalg.LinAlgError as error:
+            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
+        if not change <= _USABLE:
+            return LawResult(None, reason(Code.PLAN_MOVES, iterations=iteration), passing=True)
+        # a state outside the training data may return from there
+        here, *ahead = self.model.distances(np.concatenate((x[:-1:_CHECKED], x[-1:]))).tolist()
+        if max(ahead) > max(self.margin, here):
+            return LawResult(None, reason(
+                Code.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
+        plan = planner.plan(problem, u, x)
+        return LawResult(
+            plan.inputs[0], info=SolutionInfo('planned'), memory=(u, x, problem.grid.lengths),
+            plan=plan, clipped=bool(plan.at_range.any()))

@@ -1,0 +1,253 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The optimal control problem of a sample, and its quadratic programs, solved by daqp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.laws.base import Plan, Target, Weights
+from koopman_ros.control.laws.riccati import feedback
+from koopman_ros.control.mpc.condensing import condense, roll_out
+from koopman_ros.control.mpc.grid import HorizonGrid
+from koopman_ros.control.mpc.model_arrays import model_arrays
+from koopman_ros.estimation import Estimate
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.tuning import Tuning
+
+_MAX_INTERVALS, _MIN_INTERVALS = 30, 3
+# The horizon is so many time constants of the closed loop, unless the plant is unstable: over more
+# than this many of its time constants the effect of an input is too large to compute with.
+_CLOSED_LOOP, _UNSTABLE = 6.0, 8.0
+# A Runge-Kutta step is no longer than this share of the drift's fastest time constant. Intervals
+# grow to so many steps at the nominal point, and have at most the last number elsewhere.
+_STEP, _STEPS, _MAX_STEPS = 0.7, 6, 32
+_DIVERGED = 2.0  # distance in half-ranges, beyond which a simulated plan is of no use
+# Distance from a limit, scaled, at which it is active: of inputs, and of states, which follow from
+# all inputs.
+_AT_INPUT, _AT_STATE = 1e-9, 1e-6
+_INFINITY = 1e30  # of daqp
+_SOLVED = (1, 2)  # its exit flags: optimal, and optimal with a soft constraint violated
+_SOFT = 8  # its mark of a soft constraint
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The optimal control problem of a sample, in scaled deviations and the model's time unit."""
+
+    start: Array  #: (n_x,) estimated state
+    w: Array  #: (n_x,) estimated disturbance of its rate
+    target: Target  #: set-point
+    previous: Array | None  #: (n_u,) last command
+    grid: HorizonGrid  #: of N intervals
+    steps: int  #: of the integration in each interval
+    terminal: Array  #: (n_x, n_x) weight of the error at the end
+    change: Array  #: (N, n_u) largest change of an input from one interval to the next
+
+
+class Planner:
+    """
+    Plans of one model and tuning, in scaled deviations and the model's time unit.
+
+    A plan is its inputs u (N, n_u) and nodes x (N + 1, n_x).
+
+    :param weights: the cost.
+    :param state_lower: (n_x,) soft limits of the states, to `state_upper`, in state units.
+    """
+
+    def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
+                 state_upper: Array) -> None:
+        self._model, self._tuning, self._weights = model, tuning, weights
+        self._arrays = model_arrays(model)
+        inputs, limits = model.inputs, tuning.limits
+        self._lower = np.maximum(inputs.to_deviation(limits.lower), -_INFINITY)
+        self._upper = np.minimum(inputs.to_deviation(limits.upper), _INFINITY)
+        self._rate = limits.rate * model.seconds_per_time_unit / inputs.scale
+        self._state_lower, self._state_upper = (
+            model.states.to_deviation(bound) for bound in (state_lower, state_upper))
+        self._slope = model.drift_jacobian(np.zeros(model.n_x))
+        # the same from sample to sample, mostly
+        self._grid, self._cost_to_go = lru_cache(8)(self._new_grid), lru_cache(8)(self._new_cost)
+
+    # The problem of a sample.
+
+    def problem(self, estimate: Estimate, target: Target, interval: float,
+                previous: Array | None) -> Problem:
+        """
+        Return the problem of an estimate and a target.
+
+        :param interval: seconds between samples.
+        :param previous: (n_u,) last command, in input units, or None.
+        """
+        model, grid = self._model, self.grid(interval)
+        # B(x) changes the slope with the input
+        fastest, terminal = self._cost_to_go(
+            tuple(target.x.tolist()),
+            () if model.input_terms is None else tuple(target.u.tolist()),
+            float(grid.lengths[0]))
+        rate = max(_fastest(self._slope), fastest,
+                   _fastest(model.drift_and_jacobian(estimate.x)[1]))
+        steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
+        return Problem(
+            estimate.x, estimate.w, target,
+            None if previous is None else model.inputs.to_deviation(previous), grid, steps,
+            terminal, grid.since_change * self._rate)
+
+    def grid(self, interval: float) -> HorizonGrid:
+        """Return the horizon for samples so many seconds apart."""
+        return self._grid(interval / self._model.seconds_per_time_unit)
+
+    def _new_grid(self, sample: float) -> HorizonGrid:
+        A, B = self._slope, self._model.B
+        found = self._regulator(A, B, sample)
+        horizon = _MAX_INTERVALS * sample
+        closed = np.linalg.eigvals(A - B @ found.K).real
+        if found.status is RiccatiStatus.SOLVED and np.all(closed < 0.0):
+            horizon = _CLOSED_LOOP / float(np.min(-closed))
+        growing = float(np.max(np.linalg.eigvals(A).real))
+        if growing > 0.0:
+            horizon = min(horizon, _UNSTABLE / growing)
+        count = int(min(max(math.ceil(horizon / sample), _MIN_INTERVALS), _MAX_INTERVALS))
+        # modes much faster than those of the closed loop end it sooner
+        fastest = _fastest(A)
+        longest = max(sample, _STEPS * _STEP / fastest if fastest else math.inf)
+        return HorizonGrid.growing(horizon, sample, count, longest)
+
+    def _new_cost(self, x_ref: tuple[float, ...], u_ref: tuple[float, ...], sample: float
+                  ) -> tuple[float, Array]:
+        """Return the rate of the fastest mode at a target, and the cost (n_x, n_x) from there."""
+        model, x = self._model, np.array(x_ref)
+        A = model.drift_and_jacobian(x)[1]
+        fastest = _fastest(A)
+        if u_ref:
+            A = A + model.forcing_jacobian(x, np.array(u_ref))
+        found = self._regulator(A, model.input_matrix(x), sample)
+        # without a regulator the horizon alone counts
+        return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
+            self._weights.Q * float(self._grid(sample).lengths[-1]))
+
+    def _regulator(self, A: Array, B: Array, sample: float) -> RiccatiSolution:
+        return solve_riccati(
+            A, B, self._weights.Q, self._weights.R, interval=sample,
+            max_gain=self._tuning.max_gain, max_residual=self._tuning.max_riccati_residual)
+
+    # The first guess.
+
+    def first_guess(self, problem: Problem, memory: object) -> tuple[Array, Array]:
+        """Return the plan of the sample before, one sample later, or one under a feedback."""
+        match memory:
+            # not of a model of another size
+            case (np.ndarray() as u, np.ndarray() as x, np.ndarray() as lengths) if (
+                    u.shape == (len(lengths), self._model.n_u)
+                    and x.shape == (len(lengths) + 1, self._model.n_x)):
+                inputs, nodes = problem.grid.shift(u, x, lengths)
+                nodes[0] = problem.start
+                return inputs, nodes
+        return self._under_feedback(problem)
+
+    def _under_feedback(self, problem: Problem) -> tuple[Array, Array]:
+        """Simulate the model under the state-dependent Riccati law with its limits."""
+        model, target, x, last = self._model, problem.target, problem.start, problem.previous
+        inputs, nodes = [], [x]
+        for length, change in zip(problem.grid.lengths.tolist(), problem.change, strict=True):
+            found = feedback(model, x, target, self._weights, interval=length,
+                             max_gain=self._tuning.max_gain,
+                             max_residual=self._tuning.max_riccati_residual)
+            u = found.u if found.solved and np.isfinite(found.u).all() else target.u
+            u = np.clip(u, self._lower, self._upper)
+            last = u = u if last is None else np.clip(u, last - change, last + change)
+            rate = model.rate_under(u, problem.w)
+            for _ in range(problem.steps):
+                x = runge_kutta_step(rate, x, length / problem.steps)
+            inputs.append(u)
+            nodes.append(x)
+            if not (np.isfinite(x).all() and model.distances(x[None])[0] < _DIVERGED):
+                # a straight line to the target is as good a guess
+                N = len(problem.change)
+                return np.tile(target.u, (N, 1)), np.linspace(problem.start, target.x, N + 1)
+        return np.array(inputs), np.array(nodes)
+
+    # The quadratic program.
+
+    def improve(self, problem: Problem, u: Array, x: Array
+                ) -> tuple[float, Array, Array] | Reason:
+        """
+        Solve the quadratic program about a plan.
+
+        :return: the largest change of an input, and the changed plan; or why there is none.
+        """
+        start, w, x_ref, u_ref = (np.ascontiguousarray(value, dtype=np.float64) for value in (
+            problem.start, problem.w, problem.target.x, problem.target.u))
+        ends, cost = roll_out(
+            self._arrays, u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps,
+            self._weights.Q, self._weights.R)
+        if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
+            return reason(Code.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
+        nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
+        A, lower, upper, sense = self._constraints(problem, u, nodes, by_inputs)
+        v, _, flag, _ = daqp.solve(H, f, A, upper, lower, sense)
+        v = np.asarray(v, dtype=np.float64)
+        change = float(np.abs(v).max())
+        if flag not in _SOLVED or not math.isfinite(change):
+            return reason(Code.PLAN_NOT_SOLVED, flag=f'daqp returns {flag}')
+        return change, u + v.reshape(u.shape), nodes + by_inputs @ v
+
+    def _constraints(self, problem: Problem, u: Array, nodes: Array, by_inputs: Array
+                     ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
+        """Return A with lower <= (v, A v) <= upper for a change v, and which rows are soft."""
+        last, lower, upper = problem.previous, self._lower, self._upper
+        limited = np.isfinite(problem.change)
+        steps = np.diff(u, axis=0, prepend=u[:1] if last is None else last[None])
+        if last is None:
+            limited[0] = False
+        else:
+            # an input outside a range that was narrowed returns at its rate
+            reach = np.cumsum(problem.change, axis=0)
+            lower, upper = np.minimum(lower, last + reach), np.maximum(upper, last - reach)
+        count, n_u = u.size, u.shape[1]
+        differences = (np.eye(count) - np.eye(count, k=-n_u))[limited.ravel()]
+        change, steps = problem.change[limited], steps[limited]
+        bounded = np.isfinite(self._state_lower) | np.isfinite(self._state_upper)
+        states = nodes[1:, bounded].ravel()
+        low, high = (np.tile(bound[bounded], len(u))
+                     for bound in (self._state_lower, self._state_upper))
+        lower = np.concatenate(((lower - u).ravel(), -change - steps, low - states))
+        upper = np.concatenate(((upper - u).ravel(), change - steps, high - states))
+        sense = np.zeros(len(lower), dtype=np.int32)
+        sense[count + len(change):] = _SOFT
+        return (np.concatenate((differences, by_inputs[1:, bounded].reshape(-1, count))),
+                np.maximum(lower, -_INFINITY), np.minimum(upper, _INFINITY), sense)
+
+    # The result.
+
+    def plan(self, problem: Problem, u: Array, x: Array) -> Plan:
+        """Return a plan in the units of the signals, and its active limits."""
+        model, first = self._model, u[0]
+        step = np.zeros(model.n_u) if problem.previous is None else first - problem.previous
+        return Plan(
+            problem.grid.times * model.seconds_per_time_unit, model.states.to_physical(x),
+            model.inputs.to_physical(u),
+            _active(first, first, self._lower, self._upper, _AT_INPUT),
+            _active(step, step, -problem.change[0], problem.change[0], _AT_INPUT),
+            _active(x[1:].min(axis=0), x[1:].max(axis=0), self._state_lower, self._state_upper,
+                    _AT_STATE))
+
+
+def _fastest(slope: Array) -> float:
+    """Return the rate of the fastest mode of a slope (n_x, n_x) of the drift."""
+    return float(np.max(np.abs(np.linalg.eigvals(slope))))
+
+
+def _active(least: Array, most: Array, lower: Array, upper: Array, tolerance: float) -> Array:
+    """Return -1 where the lower limit is active, 1 where the upper one is, else 0."""
+    return np.asarray(1.0 * (most >= upper - tolerance) - (least <= lower + tolerance))

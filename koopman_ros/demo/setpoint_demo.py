@@ -1,0 +1,200 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The demo: a learned controller moves a plant to a set-point, beside the linear law and the optimum.
+
+The section `demo` of the plant's parameter file says what happens. The controller runs as a
+process in the loop; the linear law and the optimum are computed on the plant's equations.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+import math
+from pathlib import Path
+import time
+from typing import Any
+
+import numpy as np
+
+from koopman_ros.bags import summary
+from koopman_ros.demo.console import LiveTable, read_options, run_demo
+from koopman_ros.demo.loop import run_loop, running_loop, Scenario
+from koopman_ros.demo.results import read_run, Run
+from koopman_ros.lifting import load
+from koopman_ros.lifting.coordinates import Coordinates
+from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
+from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.wire import preset, shipped, Signals
+from koopman_ros.plants import steady_state
+from koopman_ros.plants.optimum import cost_along, Course, linear_law, optimum, Task
+from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
+from koopman_ros.resources import model_path
+from koopman_ros.units import conversion, display_unit, shown, unit_label
+
+PLANT = 'reactor'
+_PANEL_SPEED = 10.0  # at most, of a loop with the panel
+_STYLES: dict[str, dict[str, Any]] = {
+    'linear law': {'color': 'tab:red'},
+    'optimum': {'color': 'black', 'linestyle': (0, (1, 2)), 'linewidth': 1.5}}
+
+
+@dataclass(frozen=True)
+class _State:
+    """The course of a state."""
+
+    initial_offset: float = parameter(0.0, 'initial distance from the steady state', '{unit}')
+    setpoint: float = parameter(0.0, 'new set-point of a controlled state', '{shown}')
+    tolerance: float = parameter(0.0, 'error within which it has settled', '{unit}')
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    """The course of a demo."""
+
+    step_time: float = parameter(0.0, 'time of the set-point step', 's')
+    duration: float = parameter(600.0, 'length of the run', 's')
+    observer: bool = parameter(True, 'whether the controller estimates disturbances')
+    states: Mapping[str, _State] = per_signal(_State)
+
+
+def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
+    """Run the loop of a plant, compare it, and write and return its figures."""
+    begin = time.monotonic()
+    wiring = preset_wiring(name)
+    if wiring is None or 'duration' not in (own := preset(name, 'demo')):
+        raise ValueError(f'there is no demo of {name!r}: choose one of {", ".join(shipped())}')
+    signals = wiring.signals
+    plan = ParameterTable(_Parameters, signals={'states': signals.states}, defaults=own
+                          ).snapshot({})
+    plants = PlantTable({'system': name})
+    plant = plants.snapshot({})
+    system = plants.system(plant)
+    setpoints = {signal: conversion(display_unit(signals.states[signal]), signals.states[signal])(
+        plan.states[signal].setpoint) for signal in signals.controlled}
+    scenario = Scenario(
+        setpoints, name, plan.step_time, plan.duration, plant.sample_period, speed,
+        plant={f'{signal}.initial_offset': state.initial_offset
+               for signal, state in plan.states.items()},
+        controller={} if plan.observer else {'disturbance_bandwidth': 0.0})
+    logs = output / 'logs'
+    logs.mkdir(parents=True, exist_ok=True)
+    bag, picture = output / 'closed_loop.mcap', output / 'closed_loop.png'
+    for old in (bag, picture, output / 'summary.json'):
+        old.unlink(missing_ok=True)
+    change = ', '.join(f'{signal} -> {plan.states[signal].setpoint:.4g}'
+                       f' [{unit_label(signals.states[signal])}]'
+                       for signal in setpoints)
+    with LiveTable(f'{system.name}: {change} after {plan.step_time:g} s', signals,
+                   plan.duration) as table:
+        run_loop(scenario, bag, logs, table.show)
+
+    model = load(model_path(str(preset(name, 'controller')['model'])))
+    tuning = table_of(model, {'system': name}).snapshot({})
+    run = read_run(wiring, bag)
+    first = round(plan.step_time / plant.sample_period)
+    states, inputs = (np.stack(list(of.values()), axis=1)[first:]
+                      for of in (run.measured, run.commanded))
+    task = Task(system, states[0], *steady_state(system, setpoints),
+                np.array([tuning.states[signal].weight for signal in signals.states]),
+                np.array([tuning.inputs[signal].weight for signal in signals.inputs]),
+                plant.sample_period / system.seconds_per_time_unit, len(states) - 1)
+    courses = {'linear law': linear_law(task), 'optimum': optimum(task)}
+    linear, best = courses.values()
+    cost = cost_along(task, states, inputs[:-1])
+    title = (f'{system.name}: {change}. Cost over the optimum without rate limit: learned '
+             f'{cost / best.cost:.4f}, linear {linear.cost / best.cost:.4f}')
+    _draw(picture, title, run, courses, signals, scenario, model.states, tuning)
+    counts = summary(bag).counts
+    result: dict[str, object] = {
+        'unit': {signal: signals.states[signal] for signal in setpoints},
+        'setpoint': setpoints,
+        'final_error': {signal: abs(run.final_error(signal, setpoint))
+                        for signal, setpoint in setpoints.items()},
+        'linear_final_error': {
+            signal: float(abs(linear.states[-1, list(signals.states).index(signal)] - setpoint))
+            for signal, setpoint in setpoints.items()},
+        'settling_time_seconds': {
+            signal: run.settling_time(signal, setpoint, plan.step_time,
+                                      plan.states[signal].tolerance)
+            for signal, setpoint in setpoints.items()},
+        'cost': cost, 'optimal_cost': best.cost, 'linear_cost': linear.cost,
+        'measurements': len(run.seconds), 'commands': len(run.command_seconds),
+        'bag_messages': sum(counts.values()),
+        'wall_seconds': round(time.monotonic() - begin, 3),
+    }
+    write_figures(output / 'summary.json', result)
+    return result
+
+
+def _draw(path: Path, title: str, run: Run, courses: Mapping[str, Course], signals: Signals,
+          scenario: Scenario, box: Coordinates, tuning: ControllerParameters) -> None:
+    """Draw each signal: states with set-points and training range, inputs with limits."""
+    count = len(signals.states) + len(signals.inputs)
+    learned: dict[str, Any] = {
+        'color': 'tab:green', 'linewidth': 2.5, 'label': 'learned controller'}
+
+    def times(values: Any) -> Any:
+        return scenario.step_time + scenario.sample_period * np.arange(len(values))
+
+    with drawing(path, count, 1, sharex=True, size=(9.0, 2.0 + 1.8 * count)) as (figure, panels):
+        for i, ((signal, unit), panel) in enumerate(zip(
+                signals.states.items(), panels, strict=False)):
+            low, high = (float(shown(float(end[i]), unit)) for end in (box.lower, box.upper))
+            panel.axhspan(low, high, label='training range', **DRAWN_RANGE)
+            if signal in scenario.setpoints:
+                setpoint = scenario.setpoints[signal]
+                panel.plot([scenario.step_time, run.seconds[-1]],
+                           [float(shown(setpoint, unit))] * 2, 'k--', linewidth=1.0,
+                           label='set-point')
+                panel.text(
+                    0.99, 0.06, f'ends {run.final_error(signal, setpoint):+.1e} off, linear law '
+                    f'{courses["linear law"].states[-1, i] - setpoint:+.1e} [{unit}]',
+                    transform=panel.transAxes, ha='right', fontsize=8)
+            panel.plot(run.seconds, shown(run.measured[signal], unit), **learned)
+            for name, course in courses.items():
+                # a course that diverges stays at the edge
+                values = np.clip(np.nan_to_num(shown(course.states[:, i], unit), nan=high),
+                                 2.0 * low - high, 2.0 * high - low)
+                panel.plot(times(values), values, label=name, **_STYLES[name])
+            panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
+        for j, ((signal, unit), panel) in enumerate(zip(
+                signals.inputs.items(), panels[len(signals.states):], strict=True)):
+            limits = tuning.inputs[signal]
+            draw_limits(panel, (limits.min, limits.max), 'limits')
+            panel.step(run.command_seconds, shown(run.commanded[signal], unit), where='post',
+                       **learned)
+            for name, course in courses.items():
+                values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=limits.max),
+                                 limits.min, limits.max)
+                panel.step(times(values), values, where='post', label=name, **_STYLES[name])
+            panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
+        panels[0].set_title(title, fontsize=9)
+        panels[-1].set(xlabel='plant time [s]', xlim=(0.0, run.seconds[-1]))
+        legend(figure, panels, 6)
+
+
+def run_with_panel(plant: str, port: int, output: Path, speed: float) -> dict[str, object]:
+    """Run the loop of a plant until Ctrl-C, with the panel."""
+    if preset_wiring(plant) is None:
+        raise ValueError(f'there is no demo of {plant!r}: choose one of {", ".join(shipped())}')
+    logs = output / 'logs'
+    logs.mkdir(parents=True, exist_ok=True)
+    scenario = Scenario({}, plant, duration=0.0, speed=min(speed or _PANEL_SPEED, _PANEL_SPEED))
+    with running_loop(scenario, logs, {'output': output / 'panel.mcap'},
+                      panel={'port': port}) as operator:
+        print(f'{scenario.speed:g} times real time; Ctrl-C ends it', flush=True)
+        operator.run_until(math.inf)
+    return {}
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the demo from the command line."""
+    options = read_options(args, __doc__, 'out/demo', 60.0, plant=PLANT)
+    demo: Callable[[Path, float], Mapping[str, object]] = (
+        partial(run_with_panel, options.plant, options.port) if options.panel
+        else partial(run_plant, options.plant))
+    return run_demo(demo, options, 'closed_loop.png, closed_loop.mcap and summary.json')

@@ -1,0 +1,260 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Nonlinear Kalman filters on the model's drift: states that are not measured, disturbances."""
+
+from dataclasses import replace
+from functools import cached_property
+import math
+from typing import Any
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.signals import Outputs
+from koopman_ros.solvers import runge_kutta_step
+from koopman_ros.tuning import Tuning
+from koopman_ros.units import SECONDS_PER_MINUTE
+
+# Where the tuning does not say how uncertain the plant is: noise as a share of half the trained
+# range, the random walk as a share of the inputs', over the slowest time constant, and the first
+# estimate.
+_NOISE, _WANDER, _GUESS = 1e-3, 0.1, 0.5
+_LONGEST = 86400.0  # s, of time constants
+# One step of integration spans at most this share of the drift's fastest time constant.
+_STEP_SHARE = 0.5
+_MAX_STEPS = 40
+# A disturbance is at first as uncertain as after so many of the drift's slowest time constants,
+# but a day at most.
+_WANDERED, _A_DAY = 3.0, 86400.0
+# The singular values of a matrix count as 0 below this share of the largest.
+_RANK = 1e-9
+_NO_VARIANCE = 1e-14  # likewise of a covariance
+# A prediction says nothing whose standard deviation is so many times that of a first guess, and so
+# many half widths of the training data. That also bounds the condition of the covariance, which
+# rounding would make indefinite.
+_LOST = 10.0
+
+
+def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
+                ) -> tuple[Array, Array, Array]:
+    """
+    Return noise, random walk and error of the first estimate: as tuned, or derived from the model.
+
+    The noise of an output that is a state is that of the record that the model was learned from,
+    where there was one.
+
+    :return: (n_y,) in the outputs' units, (n_u,) in scaled deviations per square root of a
+        second, and (n_x,) in scaled deviations.
+    """
+    metrics, names = model.provenance.metrics, model.states.names
+    recorded = np.array([metrics.get(
+        f'noise_{name}' if len(names) > 1 else 'noise', 0.0) if name in names else 0.0
+        for name in outputs.names])
+    half = 0.5 * (model.states.upper - model.states.lower)
+    slowest = float(np.min(np.abs(np.linalg.eigvals(
+        model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
+    per_minute = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
+        SECONDS_PER_MINUTE * max(slowest, 1.0 / _LONGEST))
+    noise, wander, error = (
+        np.where(own > 0.0, own, default) for own, default in (
+            (tuning.noise, np.where(recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half)),
+            (tuning.wander, per_minute), (tuning.initial_error, _GUESS * half)))
+    return (noise, wander / (math.sqrt(SECONDS_PER_MINUTE) * model.inputs.scale),
+            error / model.states.scale)
+
+
+class ExtendedKalmanFilter(Estimator):
+    """
+    The extended Kalman filter of state and disturbance: dx/dt = f(x) + B u + w, y = C x + noise.
+
+    There is one disturbance for each output, a random walk: where there are as many inputs, it
+    acts like a change of them, otherwise on the outputs' own rates. It is what leaves no offset
+    (G. Pannocchia, J. B. Rawlings, AIChE J. 49 (2003)). Prediction is by Runge-Kutta steps with
+    their variational equations, correction in the form of Joseph. See A. H. Jazwinski,
+    *Stochastic Processes and Filtering Theory* (1970), section 8.3.
+
+    :raises ValueError: where the outputs leave states or disturbances open.
+    """
+
+    def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
+                 ) -> None:
+        super().__init__(model, outputs, tuning, parameters)
+        self._noise, self._wander, self._initial_error = uncertainty(model, outputs, tuning)
+        #: (n_y, n_x) outputs, in their units, of scaled deviations
+        self._H = outputs.C * model.states.scale
+        self._R = np.diag(self._noise ** 2)
+        self._slope = model.drift_jacobian(np.zeros(model.n_x))
+        #: (n_x,) sizes of the eigenvalues of the drift at the nominal point, in 1/time unit
+        self._rates = np.abs(np.linalg.eigvals(self._slope))
+        directions = self._directions()
+        #: (n_x, n_x) by which the covariance of the disturbance grows in a second
+        self._intensity = directions @ directions.T
+        #: (n_x, n_x) projection on what disturbances can be
+        self._onto_directions = directions @ np.linalg.pinv(directions)
+
+    def _directions(self) -> Array:
+        """(n_x, n_y) rates of the state that each disturbance adds to, as far as it wanders."""
+        model, H = self.model, self._H
+        by_input = model.B * self._wander
+        # an output that no input moves at once wanders as the others do, each in its own size
+        sizes = np.linalg.norm(H, axis=1)
+        moved = np.max(np.abs(H @ by_input), axis=1)
+        usual = np.max(moved / sizes, initial=0.0) or float(np.max(np.linalg.norm(
+            by_input, axis=0)))
+        by_output = np.linalg.pinv(H) * np.where(moved > _RANK * usual * sizes, moved,
+                                                 usual * sizes)
+        candidates = [by_input] if model.n_u == len(H) else []
+        for found in (*candidates, by_output):
+            if self._determined(found):
+                return found
+        names = ', '.join(self.outputs.names)
+        raise ValueError(f'{names}, measured, do not determine the states '
+                         f'{", ".join(model.states.names)} and a disturbance for each: measure '
+                         'another signal')
+
+    def _determined(self, directions: Array) -> bool:
+        """Tell whether outputs show all modes that do not decay, and each disturbance."""
+        n, H = self.model.n_x, self._H
+        n_d = directions.shape[1]
+        A = np.zeros((n + n_d, n + n_d))
+        A[:n, :n], A[:n, n:] = self._slope, directions
+        C = np.concatenate((H, np.zeros((len(H), n_d))), axis=1)
+        # Hautus' test; modes that decay may stay unseen
+        for value in np.linalg.eigvals(A):
+            if value.real >= -_RANK * max(1.0, float(np.max(self._rates))):
+                sizes = np.linalg.svd(np.concatenate((A - value * np.eye(n + n_d), C)),
+                                      compute_uv=False)
+                if not sizes[-1] > _RANK * sizes[0]:
+                    return False
+        return True
+
+    @cached_property
+    def initial_covariance(self) -> Array:
+        """(2 n_x, 2 n_x) of a first guess."""
+        n = self.model.n_x
+        slowest = float(np.min(self._rates))
+        since = min(_A_DAY, _WANDERED * self.model.seconds_per_time_unit / slowest
+                    if slowest > 0.0 else _A_DAY)
+        P = np.zeros((2 * n, 2 * n))
+        P[:n, :n] = np.diag(self._initial_error ** 2)
+        P[n:, n:] = since * self._intensity
+        return P
+
+    @cached_property
+    def _lost(self) -> Array:
+        """(n_x,) variances from which on a prediction of the state is worth nothing."""
+        return (_LOST * np.maximum(
+            self._initial_error, self.model.states.half_widths)) ** 2
+
+    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Integrate the model, and the covariance with it; see :class:`Estimator`."""
+        duration = seconds / self.model.seconds_per_time_unit
+        steps = max(1, math.ceil(duration * float(np.max(self._rates)) / _STEP_SHARE))
+        if steps > _MAX_STEPS:
+            return None
+        n = self.model.n_x
+        P = (self.initial_covariance if estimate.covariance is None
+             else estimate.covariance).copy()
+        # the disturbance wanders first, and then stays for the interval
+        P[n:, n:] += seconds * self._intensity
+        x, P = self._propagated(estimate.x, estimate.w, P, u, duration / steps, steps)
+        if not np.all(np.diag(P)[:n] <= self._lost):
+            return None
+        return replace(estimate, x=x, covariance=0.5 * (P + P.T))
+
+    def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
+                    ) -> tuple[Array, Array]:
+        """Return state and covariance after so many steps of h, in time units."""
+        model = self.model
+        n = model.n_x
+        forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
+        # x and its derivatives by what x and w were
+        whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
+
+        def rate(whole: Array) -> Array:
+            x = whole[:, 0]
+            f, J = model.drift_and_jacobian(x)
+            if model.input_terms is not None:
+                J = J + model.forcing_jacobian(x, u)
+            return np.concatenate(((f + model.forcing(x, u) + w)[:, None],
+                                   J @ whole[:, 1:] + forced), axis=1)
+
+        for _ in range(steps):
+            whole = runge_kutta_step(rate, whole, h)
+        F = np.eye(2 * n)
+        F[:n] = whole[:, 1:]
+        return whole[:, 0].copy(), F @ P @ F.T
+
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Take the outputs of a state (n_x,) into account, in the form of Joseph."""
+        n, H = self.model.n_x, self._H
+        P = self.initial_covariance if predicted.covariance is None else predicted.covariance
+        innovation = H.dot(x - predicted.x)
+        PH = P[:, :n] @ H.T
+        S = H @ PH[:n] + self._R
+        gain = np.linalg.solve(S, PH.T).T
+        keep = np.eye(2 * n)
+        keep[:, :n] -= gain @ H
+        P = keep @ P @ keep.T + gain @ self._R @ gain.T
+        step = gain.dot(innovation)
+        square = float(innovation.dot(np.linalg.solve(S, innovation))) / len(innovation)
+        return Estimate(
+            predicted.x + step[:n], self.bounded(predicted.w + step[n:]), 0.5 * (P + P.T),
+            _averaged(predicted.innovation, innovation / np.sqrt(np.diag(S)), square))
+
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """Start from a state (n_x,) with the measured outputs; see the observer's."""
+        if predicted is not None:
+            w = predicted.w
+        elif u is None:
+            w = np.zeros_like(x)
+        else:
+            w = self.bounded(-self._onto_directions.dot(self.model.rate_under(u)(x)))
+        started = self.correct(Estimate(x, w), x, 0.0)
+        return replace(started, innovation=None)
+
+    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+        """Let the disturbance make up for the difference between the two models, where it can."""
+        w = self._onto_directions.dot(estimate.w + rate - self.model.drift(estimate.x))
+        return replace(estimate, w=self.bounded(w))
+
+
+class UnscentedKalmanFilter(ExtendedKalmanFilter):
+    """
+    The same by sigma points in place of derivatives.
+
+    See S. J. Julier, J. K. Uhlmann, "Unscented filtering and nonlinear estimation", Proc. IEEE 92
+    (2004), with kappa = max(0, 3 - n), where no weight is negative. As outputs are linear in the
+    state, the correction is the same.
+    """
+
+    def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
+                    ) -> tuple[Array, Array]:
+        """Return mean and covariance of points that are moved so many steps of h."""
+        model, n = self.model, self.model.n_x
+        values, vectors = np.linalg.eigh(P)
+        size = int(np.count_nonzero(values > _NO_VARIANCE * values[-1]))
+        kappa = max(0.0, 3.0 - size)
+        root = vectors[:, -size:] * np.sqrt((size + kappa) * values[-size:])
+        points = np.concatenate((x, w)) + np.concatenate(
+            (np.zeros((1, 2 * n)), root.T, -root.T))
+        weights = np.full(len(points), 0.5 / (size + kappa))
+        weights[0] = kappa / (size + kappa)
+        rate, moved = model.rate_under(u, points[:, n:]), points[:, :n]
+        for _ in range(steps):
+            moved = runge_kutta_step(rate, moved, h)
+        points = np.concatenate((moved, points[:, n:]), axis=1)
+        mean = weights @ points
+        deviation = points - mean
+        return mean[:n], (weights[:, None] * deviation).T @ deviation
+
+
+def _averaged(before: Innovation | None, normalised: Array, square: float) -> Innovation:
+    if before is None:
+        return Innovation(normalised, square, 1)
+    count = min(before.count + 1, INNOVATION_WINDOW)
+    return Innovation(
+        normalised, before.mean_square + (square - before.mean_square) / count, count)

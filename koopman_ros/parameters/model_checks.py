@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Models for a controller: loaded, and refused where they do not suit it."""
+
+import contextlib
+from dataclasses import dataclass
+from datetime import datetime, UTC
+from pathlib import Path
+import time
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import compare, Controller, State, Windows
+from koopman_ros.control.usable import unusable
+from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
+from koopman_ros.parameters.controller import built, ControllerParameters, table_of
+from koopman_ros.parameters.wire import Signals, signals_of, words_of
+from koopman_ros.reasons import Code
+from koopman_ros.resources import model_path
+from koopman_ros.units import display_unit, NANOSECONDS, shown
+
+_LONGEST_PATH = 4096  # bytes, as Linux has it
+# What a control step may take of a processor, in s: the largest model that is read takes some
+# milliseconds, and measurements come once a second.
+_LONGEST_STEP = 0.1
+_TRIALS = 3
+
+
+@dataclass(frozen=True)
+class LoadedModel:
+    """A model with what tells its versions apart."""
+
+    name: str  #: of a shipped model, or the path of a file
+    model: LiftedModel
+    file_time: str  #: when the file was written, in UTC
+    digest: str  #: SHA-256 of the file
+    comparison: str = ''  #: with the model before, on what was measured then; empty at the start
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What records name it by."""
+        return {'name': self.name, 'digest': self.digest}
+
+    @property
+    def about(self) -> str:
+        """The model in a few words."""
+        return (f'model {self.name}: {self.model.kind}, trained for {ranges(self.model)}; '
+                f'{self.model.provenance.acceptance}')
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a new model has to cope with."""
+
+    parameters: ControllerParameters
+    state: State
+    measured: Array  #: (n_y,) last measurement; NaN before the first
+    recent: Windows | None  #: what was measured lately; None while that is too little
+
+    def controller(self, model: LiftedModel) -> Controller:
+        """Return what would act with a model; ModelFileError where that cannot be."""
+        try:
+            return built(self.parameters, model)
+        except ValueError as error:
+            raise ModelFileError(f'the model does not suit the parameters: {error}') from error
+
+
+def ranges(model: LiftedModel) -> str:
+    """Write the training range of each state for the operator."""
+    states = model.states
+    return ', '.join(
+        f'{name} {shown(low, unit):.6g} to {shown(high, unit):.6g} {display_unit(unit)}'
+        for name, unit, low, high in zip(states.names, states.units, states.lower.tolist(),
+                                         states.upper.tolist(), strict=True))
+
+
+def load_suitable(name: str, signals: Signals | None = None, *, force: bool = False
+                  ) -> LoadedModel:
+    """
+    Load a model, of these signals where they are given; ModelFileError with the reason.
+
+    :param force: whether to load a model that its training refused.
+    """
+    if not name:
+        raise ModelFileError('model is empty: name a shipped model or a .safetensors file')
+    if len(name.encode()) > _LONGEST_PATH or '\0' in name:
+        raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
+                             f'{_LONGEST_PATH} bytes: check it')
+    path = model_path(name)
+    model, digest = load_with_digest(path)
+    if reason := unusable(model):
+        raise ModelFileError(f'{path}: {reason}')
+    if model.provenance.accepted is False and not force:
+        raise ModelFileError(
+            f'{path} was {model.provenance.acceptance}: train it again, or set '
+            'load_refused_model to true to control with it all the same')
+    own = signals_of(model)
+    if signals is not None and not (own.inputs == signals.inputs
+                                    and signals.states.items() <= own.states.items()):
+        raise ModelFileError(
+            f'{path} has {own}, this controller was started for {signals}: choose a model of '
+            'the same signals, or start it anew')
+    _refuse_slow(path, model)
+    written = 'unknown'
+    # the file may be gone since it was read
+    with contextlib.suppress(OSError):
+        written = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(
+            timespec='milliseconds')
+    return LoadedModel(name, model, written, digest)
+
+
+def _refuse_slow(path: Path, model: LiftedModel) -> None:
+    controller = built(table_of(model, {'system': ''}).snapshot({}), model)
+    state = State()
+    needed = []
+    for k in range(1, _TRIALS + 1):
+        # of this thread alone, for a busy machine says nothing of a model
+        begun = time.thread_time()
+        state, _, report = controller.step(state, model.states.center, k * NANOSECONDS)
+        if report.reason is not None and report.reason.code is Code.CALCULATION_FAILED:
+            raise ModelFileError(f'{path}: a control step with the model fails '
+                                 f'({report.reason.values["error"]}): train it again')
+        try:
+            controller.equivalent_bias(state)
+        except (ArithmeticError, ValueError) as error:
+            raise ModelFileError(f'{path}: a control step with the model fails ({error}): train '
+                                 'it again') from error
+        needed.append(time.thread_time() - begun)
+    if min(needed) > _LONGEST_STEP:
+        raise ModelFileError(
+            f'{path}: a control step with the model takes {min(needed):.3g} s of a processor, at '
+            f'most {_LONGEST_STEP:g} s are allowed: train one with fewer coordinates (n_z = '
+            f'{model.n_z})')
+
+
+def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
+    """Raise ModelFileError for a model that cannot track what the operator asked for."""
+    controller = situation.controller(model)
+    if (refusal := controller.untrained(situation.state.setpoint)) is not None:
+        raise ModelFileError(words_of(signals_of(model))(refusal))
+
+
+def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
+    """Raise ModelFileError for a model without a law where the plant is or shall go."""
+    controller, asked = situation.controller(model), situation.state.setpoint
+    margin = controller.usable.law.margin
+    for setpoint in [value for value in (asked.active, asked.requested)
+                     if value is not None and np.isfinite(value).all()] or [
+                         controller.controlled.center]:
+        for place in (controller.steady_state(setpoint), controller.position(situation.measured)):
+            # neither before the first measurement, nor where the learned law would not act
+            if not model.distance(place) <= margin:
+                continue
+            if (problem := controller.try_law(place, setpoint)) is not None:
+                tried = (f'tried at {listed(model.states, place)} with the set-point '
+                         f'{listed(controller.controlled, setpoint)} the model fails '
+                         f'({words_of(signals_of(model))(problem)})')
+                # another model fails for the same reason
+                raise ModelFileError(tried if controller.usable.unusable is not None else
+                                     f'{tried}: train it again, or change the weights')
+
+
+def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation) -> str:
+    """
+    Raise ModelFileError for a model that predicts what was measured lately much worse.
+
+    :return: how well it does beside the present one, in words.
+    """
+    found = None if situation.recent is None else compare(
+        situation.controller(present), situation.controller(model), situation.recent)
+    if found is None:
+        return 'not compared with the model before: too little was measured so far'
+    i = int(np.argmax(found.ratio))
+    name, unit = list(situation.parameters.states)[i], list(signals_of(
+        model, measured=situation.parameters.states).states.values())[i]
+    words = (f'predicts {name} of the last {found.seconds:.3g} s with an error of '
+             f'{found.candidate[i]:.2g} {unit}, the {{}} with {found.present[i]:.2g} {unit}')
+    # written so that NaN is refused, too
+    most = situation.parameters.model_check_factor
+    if most and not found.ratio[i] <= most:
+        raise ModelFileError(
+            f'the model {words.format("present one")}, at most '
+            f'{most * found.allowance[i]:.2g} {unit} are allowed: train it again '
+            'with more data, or set model_check_factor = 0 to load it all the same')
+    return words.format('model before') + (
+        '' if found.tells else '; nothing moved that would tell more')
+
+
+def listed(signals: Coordinates, values: Array) -> str:
+    """Write values (n,) for the operator."""
+    return ', '.join(
+        f'{name} {shown(value, unit):.6g} {display_unit(unit)}' for name, unit, value in zip(
+            signals.names, signals.units, values.tolist(), strict=True))
+
+
+def rests_outside(controller: Controller) -> str:
+    """Say that the safe input keeps the plant where no law may act, or return ''."""
+    model, rest = controller.model, controller.rest
+    # a model without training data is a linearisation, which does not know where that is
+    if rest.holding is None or not model.provenance.data_digest:
+        return ''
+    safe, holding = controller.safe_input, rest.holding
+    where = 'does not come to rest' if np.isnan(rest.x).any() else (
+        f'rests at about {listed(model.states, rest.x)} if one extrapolates')
+    better = ', '.join(
+        f'{name}.safe = {shown(held, unit):.6g} {display_unit(unit)} or '
+        f'{"more" if held > now else "less"}'
+        for name, unit, now, held in zip(model.inputs.names, model.inputs.units, safe.tolist(),
+                                         holding.tolist(), strict=True))
+    under = ', '.join(
+        f'{name}.safe = {shown(now, unit):.6g} {display_unit(unit)}' for name, unit, now in zip(
+            model.inputs.names, model.inputs.units, safe.tolist(), strict=True))
+    return (f'under {under} the plant leaves the trained range, {ranges(model)}, and '
+            f'{where}: no law can act there, and the way back is slow; record data from there and '
+            f'train again, or set {better} if that is still safe')

@@ -1,0 +1,345 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Status of the controller: that of the control level, and one for each kind of warning."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.assembler import Assembler
+from koopman_ros.control import Arrival, Controller, HOLD, Mode, Report, SAFE, State
+from koopman_ros.control.state import TargetReport
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.wire import Signals, words_of
+from koopman_ros.reasons import Code, level_words
+from koopman_ros.ros.controller_messages import by_label
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.timing import PAUSED, Timing
+from koopman_ros.time_base import Advance
+from koopman_ros.units import display_unit, shown
+from koopman_ros.wire import stem
+
+_REACHED = 1e-3  # of a range; so near a set-point is reached
+_PATIENCE = 10.0  # s after which a measurement is old where no time-out is set
+_UNRECEIVED = 3.0  # s without a subscriber after which commands are lost
+# Tasks of the diagnostics, so that none hides another.
+CONTROL = 'control'
+CONNECTIONS, MEASUREMENTS, REQUESTS, MODEL, SETPOINT, ACTUATORS = CONDITIONS = (
+    'connections', 'measurements', 'requests', 'model', 'set-point', 'actuators')
+TASKS = (CONTROL, *CONDITIONS)
+_ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
+_WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
+_INACTIVE = 'inactive'
+
+
+@dataclass
+class Counts:
+    """How many measurements came, late, not at all or refused, and how many plans did not."""
+
+    measurements: int = 0
+    late: int = 0
+    missed: int = 0
+    refused: int = 0
+    late_plans: int = 0
+    unsolved_plans: int = 0
+
+    def take(self, report: Report) -> None:
+        """Count an answered measurement."""
+        self.measurements += 1
+        self.late += report.measurement.arrival is Arrival.LATE
+        self.missed += report.measurement.missed
+        self.refused += report.measurement.arrival is Arrival.REJECTED
+        if report.reason is not None and (cause := report.reason.cause) is not None:
+            self.late_plans += cause.code is Code.TOO_LATE
+            self.unsolved_plans += cause.code in (Code.PLAN_NOT_SOLVED, Code.PLAN_MOVES)
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What the statuses are made of."""
+
+    controller: Controller
+    parameters: ControllerParameters
+    signals: Signals
+    state: State
+    report: Report
+    counts: Counts
+    timing: Timing
+    assembler: Assembler  #: of the measurements
+    measured: Array  #: (n_y,) last measured, in the units of the signals
+    complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
+    unheard: Sequence[str]  #: topics of the commands without a subscriber
+    unheard_for: float  #: s for which not all have had one
+    setpoint_received: bool
+    request: str  #: why the operator's last request was refused or limited, or empty
+    model_refused: str  #: why the last model was refused, or empty
+    model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
+
+    @property
+    def reason(self) -> str:
+        """Why the level acts, in words, or empty."""
+        return words_of(self.signals)(self.report.reason)
+
+    @property
+    def input(self) -> str:
+        """What an operator calls the inputs."""
+        return ' and '.join(stem(name, unit) for name, unit in self.signals.inputs.items())
+
+    @property
+    def awaited(self) -> str:
+        """Parts of a measurement that are missing, or empty."""
+        return f' of {self.assembler.awaited}' if self.assembler.awaited else ''
+
+    def commanded(self, command: Array) -> str:
+        """Write a command (n_u,) with names and units."""
+        return ', '.join(
+            f'{stem(name, unit)} at {shown(value, unit):.2f} {display_unit(unit)}'
+            for (name, unit), value in zip(self.signals.inputs.items(), command.tolist(),
+                                           strict=True))
+
+
+def statuses(now: Situation) -> dict[str, Status]:
+    """Return the status of each of :data:`TASKS`."""
+    warnings = list(_warnings(now))
+    found = {CONTROL: _control_status(now, warnings)}
+    for condition in CONDITIONS:
+        sentences = [sentence for of, sentence in warnings if of == condition]
+        found[condition] = Status(Level.WARN, '; '.join(sentences)) if sentences else Status(
+            Level.OK, 'in order')
+    return found
+
+
+def inactive(now: Situation) -> dict[str, Status]:
+    """Return the statuses of a node that answers no measurement."""
+    return {**dict.fromkeys(CONDITIONS, Status(Level.OK, _INACTIVE)),
+            CONTROL: Status(Level.OK, _INACTIVE, lambda: _figures(now, CONTROL))}
+
+
+def _control_status(now: Situation, warnings: Sequence[tuple[str, str]]) -> Status:
+    level, message = _control(now)
+    condition = CONTROL
+    if not message and warnings:
+        level, message = Level.WARN, '; '.join(warning for _, warning in warnings)
+        condition = warnings[0][0]
+    elif not message:
+        message = _in_order(now)
+    if now.complaint and now.timing.no_news(_PATIENCE) is Advance.TWO_SOURCES:
+        message += f'; {now.complaint}'
+    return Status(level, message, lambda: _figures(now, condition))
+
+
+def _in_order(now: Situation) -> str:
+    mode, command = now.state.mode, now.report.command
+    if mode is Mode.AUTOMATIC and not now.setpoint_received:
+        return f'{mode.value}, no set-point yet: what was first measured is held'
+    if command.at_range:
+        return f'{mode.value}, {now.input} at a limit'
+    return f'{mode.value}, {now.input} at a rate limit' if command.at_rate else mode.value
+
+
+def _control(now: Situation) -> tuple[Level, str]:
+    """Return what keeps the best law from acting, or an empty sentence."""
+    report, mode = now.report, now.state.mode
+    timeout = now.parameters.measurement_timeout
+    if not now.counts.measurements:
+        waiting = f'waiting for the first measurement{now.awaited}'
+        if mode is Mode.MANUAL and now.state.command is None:
+            waiting += f': the applied {now.input} is not known, and no manual command goes out'
+        return Level.WARN, now.complaint or waiting
+    silence = now.timing.silence
+    # /clock is not read meanwhile
+    if timeout and (silence > timeout or (
+            now.timing.busy and now.timing.wall_silence > timeout)):
+        command = now.state.command
+        doing = '' if command is None else f', {now.commanded(command)}'
+        action = 'manual mode' if mode is Mode.MANUAL else (
+            _ACTIONS[HOLD] if report.depth == 0 else _action(now))
+        if now.timing.busy:
+            return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
+                                 f'node is busy: {action}{doing}; ask for less at once')
+        if (why := now.timing.no_news(timeout)) is not None:
+            what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
+                    else 'two sources have published the measurement in turn')
+            return Level.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
+                                 'the clock of the sensor, and that it has one publisher')
+        return Level.ERROR, (f'no measurement{now.awaited} for more than {timeout:g} s: '
+                             f'{action}{doing}; check sensor and plant')
+    if report.reason is not None and mode is Mode.MANUAL:
+        return Level.ERROR, f'{mode.value}: {now.reason}'
+    if mode is Mode.AUTOMATIC and report.depth > 0:
+        level = Level.ERROR if report.level in _ACTIONS else Level.WARN
+        action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
+        return level, f'{action}: {now.reason}'
+    return Level.OK, ''
+
+
+def _action(now: Situation) -> str:
+    level = now.report.level
+    return _ACTIONS.get(level, '').format(now.input) or level_words(level)
+
+
+def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
+    """Yield every warning with the name of its condition, the most urgent first."""
+    report, states = now.report, now.controller.model.states
+    age, oldest = now.timing.age, now.parameters.max_measurement_age
+    if now.complaint:
+        yield CONNECTIONS, now.complaint
+    if now.unheard and now.unheard_for > _UNRECEIVED:
+        yield CONNECTIONS, (
+            f'no subscriber on {", ".join(now.unheard)}: the commands reach no plant; start the '
+            'plant, or check its topic and domain')
+    if now.timing.paused:
+        yield MEASUREMENTS, (
+            f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
+            'has ended, and the last command stays')
+    interval = 0.0 if math.isinf(now.state.interval) else now.state.interval
+    overdue = max(_PATIENCE, 3.0 * interval)
+    # manual commands are also sent between two measurements
+    unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.recovery
+                  and now.timing.silence > max(1.0, 2.0 * interval))
+    if report.measurement.arrival is Arrival.REPEATED or (
+            now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
+        yield MEASUREMENTS, (
+            'the stamp of the measurement does not advance: the last command is held; stamp '
+            'measurements with their time')
+    elif now.timing.silence > overdue or (unmeasured and now.counts.measurements):
+        yield MEASUREMENTS, (
+            f'the last measurement is {now.timing.silence:.0f} s old: commands follow from '
+            'the model and from requests alone; check sensor and plant')
+    if now.timing.without_clock:
+        yield MEASUREMENTS, (
+            'use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
+            'clock; set use_sim_time to false, or publish_clock of the plant to true')
+    if now.request:
+        yield REQUESTS, now.request
+    if now.model_refused:
+        yield MODEL, now.model_refused
+    if report.measurement.outside > 0.0:
+        box = states.only(tuple(now.signals.states))
+        outside = [f'{name} is outside the trained range [{shown(lower, unit):.6g}, '
+                   f'{shown(upper, unit):.6g}] {display_unit(unit)}'
+                   for name, unit, lower, upper, value in zip(
+                       box.names, box.units, box.lower.tolist(), box.upper.tolist(),
+                       now.measured.tolist(), strict=True) if not lower <= value <= upper]
+        yield MODEL, (f'{", ".join(outside) or "the state is far from the training data"}: '
+                      'the model extrapolates')
+    if oldest and abs(age) > oldest:
+        yield MEASUREMENTS, (
+            f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
+            'expected: check the connection and the clocks')
+    if report.target is not None and (short := _out_of_reach(now, report.target)):
+        yield SETPOINT, short
+    if not report.measurement.follows:
+        yield ACTUATORS, (
+            f'the {now.input} does not follow its command within '
+            f'{_listed(now, now.controller.tuning.tolerance)}: the observer goes by what is measured; check the '
+            'actuator and its limits')
+    if report.estimate is not None and report.estimate.at_bound:
+        yield MODEL, (
+            f'the disturbance estimate is at its bound of {_listed(now, now.controller.tuning.max_disturbance)} '
+            f'of {now.input}: the plant is far from its model; retrain')
+
+
+def _out_of_reach(now: Situation, target: TargetReport) -> str:
+    """Say that the inputs do not suffice for the set-point as things are, or return ''."""
+    if target.state is None or target.input is None:
+        return ''
+    states, limits = now.controller.model.states, now.controller.tuning.limits
+    # where every state has a set-point, that is where it leads
+    for name, wanted in () if target.state is target.setpoint else zip(
+            now.signals.controlled, target.setpoint.tolist(), strict=True):
+        place, unit = states.names.index(name), now.signals.states[name]
+        found, width = float(target.state[place]), 2.0 * states.half_widths[place]
+        if abs(found - wanted) > _REACHED * width * states.scale[place]:
+            return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
+                    f'cannot be held within the range of the {now.input}: '
+                    f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
+    for (name, unit), wanted, low, high in zip(
+            now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
+            limits.upper.tolist(), strict=True):
+        slack = _REACHED * (high - low)
+        if not low - slack <= wanted <= high + slack:
+            return (f'the set-point would need the {stem(name, unit)} at '
+                    f'{shown(wanted, unit):.6g} {display_unit(unit)}, its range is '
+                    f'{shown(low, unit):.6g} to {shown(high, unit):.6g}: it is not reached')
+    return ''
+
+
+def _listed(now: Situation, values: Array) -> str:
+    return ', '.join(f'{value:g} {unit}' for value, unit in zip(
+        values.tolist(), now.signals.inputs.values(), strict=True))
+
+
+def _figures(now: Situation, condition: str) -> dict[str, object]:
+    report, state, timing, signals = now.report, now.state, now.timing, now.signals
+    target, law, estimate = report.target, report.command.law, report.estimate
+    transfer = np.zeros(len(signals.inputs)) if report.command.transfer is None else (
+        report.command.transfer)
+    inputs = {stem(name, unit): unit for name, unit in signals.inputs.items()}
+    # a bias of what is not measured is no sensor's
+    bias = None if estimate is None or signals.estimated else (
+        now.controller.equivalent_bias(state))
+    unit = {name: signals.states[name] for name in signals.controlled}
+    return {
+        'condition': condition,
+        'mode': state.mode.value,
+        'active law': level_words(report.level),
+        'law': law.form or 'none',
+        'reason': now.reason or 'none',
+        **now.model(),
+        **{f'{name} [{display_unit(own)}]': shown(value, own) for (name, own), value in zip(
+            signals.states.items(), now.measured.tolist(), strict=True)},
+        **by_label(unit, 'set-point [{}]', None if target is None else target.setpoint),
+        **{f'{name} [{display_unit(own)}]': value for (name, own), value in zip(
+            inputs.items(), by_label(inputs, '{}', state.command).values(), strict=True)},
+        **by_label(inputs, f'disturbance [{{}} of {now.input}]' if len(inputs) == 1
+                else 'disturbance [{}]', None if estimate is None else estimate.disturbance, True),
+        **by_label(signals.states, 'equivalent sensor bias [{}]', bias, True),
+        **_estimated(now),
+        'distance outside training box [half widths]': float(report.measurement.outside),
+        'set-point outside training box [half widths]': (
+            np.nan if target is None else float(target.outside)),
+        f'{now.input} outside training box [half widths]': float(report.command.outside),
+        'Riccati residual': float(law.residual),
+        'gain norm': float(law.gain),
+        'predicted growth per sample': float(law.growth),
+        **by_label(inputs, 'transfer [{}]', transfer, True),
+        'scheduled set-points': len(state.setpoint.scheduled),
+        'measurements': now.counts.measurements,
+        'late measurements': now.counts.late,
+        'missed measurements': now.counts.missed,
+        'measurements rejected': now.counts.refused,
+        **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
+           if 'mpc' in now.parameters.tuning.levels else {}),
+        **{f'{what} parts of {name}': count for what, counts in (
+            ('late', now.assembler.late), ('missing', now.assembler.missing),
+            ('doubled', now.assembler.doubled)) for name, count in counts.items()},
+        'since last measurement [s]': timing.wall_silence,
+        'age of measurement [s]': timing.age,
+        'latency from stamp to command [s]': timing.age + timing.answer_seconds,
+        'latency from arrival to command [s]': timing.answer_seconds,
+    }
+
+
+def _estimated(now: Situation) -> dict[str, object]:
+    """Return what is estimated of states that are not measured, and how well it fits."""
+    estimate, states = now.report.estimate, now.controller.model.states
+    found: dict[str, object] = {}
+    if estimate is None or estimate.deviation is None:
+        return found
+    for name, unit, value, deviation in zip(states.names, states.units, estimate.state.tolist(),
+                                            estimate.deviation.tolist(), strict=True):
+        if name in now.signals.estimated:
+            found[f'{name}, estimated [{display_unit(unit)}]'] = (
+                f'{shown(value, unit):.6g} +/- {deviation:.2g}')
+    if estimate.innovation is not None:
+        (lower, upper), square = estimate.innovation.expected, estimate.innovation.mean_square
+        fits = 'consistent' if lower <= square <= upper else (
+            'more than the noise explains' if square > upper else 'less than the noise said')
+        found['innovations, mean square over expected'] = (
+            f'{square:.3g}: {fits} ({lower:.3g} to {upper:.3g})')
+    return found

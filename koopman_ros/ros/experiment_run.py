@@ -1,0 +1,356 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A run of an identification experiment: from its first measurement until it lets go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import contextlib
+from functools import partial
+import math
+import time
+from typing import Any
+
+import numpy as np
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.task import Future
+from std_msgs.msg import String
+
+from koopman_ros.arrays import Array
+from koopman_ros.assembler import Assembler
+from koopman_ros.experiment import (
+    advance,
+    begin,
+    end,
+    Experiment,
+    Phase,
+    Progress,
+    TrackingMonitor,
+)
+from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
+from koopman_ros.parameters.wire import Wiring
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.replay import records
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.node import Owned
+from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs, Outlet
+from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.wire import Place, stem
+
+_TICK = 0.1  # s
+_DEVIATIONS = 10  # commands of a controller, and
+_DEVIATION_TIME = 1.0  # s, after which it is said not to follow
+_PATIENCE = 0.5  # s that the first measurement waits for the present inputs
+_FAREWELL = 2.0  # s for the way back at the end of the process
+_ACKNOWLEDGED = 0.2  # s for the last command to arrive
+
+
+def stepped(settings: TrainerParameters, wiring: Wiring) -> dict[str, Place]:
+    """Return where an experiment publishes, by name of the signal that it steps."""
+    if settings.experiment_on == SETPOINT:
+        return wiring.setpoints
+    return wiring.manual if settings.experiment_on == MANUAL else wiring.commands
+
+
+class ExperimentRun:
+    """
+    Step the signals from the first measurement on until :meth:`destroy`.
+
+    :param commanded: last command of the inputs, by name, as far as it is known.
+    :param on_end: called when the steps are over, with the reason when it must command no more.
+    :raises ValueError: for bounds that are no plan.
+    """
+
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
+                 commanded: Mapping[str, float], on_end: Callable[[Reason | None], None]) -> None:
+        places = stepped(settings, wiring)
+        signals = wiring.signals
+        self._settings, self._signals = settings, signals
+        self._on_setpoints = settings.experiment_on == SETPOINT
+        self._units = {name: (signals.states if self._on_setpoints else signals.inputs)[name]
+                       for name in places}
+        # what is known of the controller
+        self._tracked: dict[str, float] = {}  # set-points, by name
+        self._automatic = False
+        # set-points stand in with which the bounds can be tried before those of now are known
+        self.plan: Experiment = settings.experiment(
+            signals, np.zeros(len(places)) if self._on_setpoints else None)
+        self._topics = [node.resolve_topic_name(place.topic) for place in places.values()]
+        self.progress: Progress | None = None
+        # why it cannot start, or None with the first measurement
+        self.started = Future()
+        self._node = node
+        self._patience, self._on_end = settings.experiment_timeout, on_end
+        self._commanded = commanded
+        self._applied = MeasuredInputs(self._units)
+        # the first measurement, while the present inputs are not known, and when it came
+        self._first: tuple[int, Array, str] | None = None
+        self._first_at = math.inf
+        self._frame_id, self._heard_at = '', time.monotonic()
+        self._sent: Array | None = None
+        self._monitors = [TrackingMonitor(span)
+                          for span in (self.plan.upper - self.plan.lower).tolist()]
+        self._owned = owned = Owned(node)
+        self.destroy = owned.destroy  #: commands no more
+        self._assembler = Assembler(
+            tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
+        self._measured = Inlet(
+            node, self._subscribe, wiring.measured, signals.states, self._on_measurement)
+        self._answers = Inlet(
+            node, self._subscribe, wiring.commands, signals.inputs, self._on_command) if (
+                settings.experiment_on != COMMAND) else None
+        self._inputs = None if self._on_setpoints else Inlet(
+            node, self._subscribe, wiring.applied, signals.inputs, self._on_applied)
+        if self._on_setpoints:
+            Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
+                  signals.states, lambda heard: self._tracked.update(heard.values))
+            self._subscribe(topics.CONTROLLER_EVENTS, self._on_record, String)
+        self._outlet = Outlet(places, self._units, lambda topic, kind: owned.keep(
+            node.create_publisher(kind, topic, topics.LOOP_QOS)))
+        owned.timer(_TICK, self._on_tick)
+
+    def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
+                   latched: bool = False) -> Subscription:
+        # a sensor driver may publish best effort
+        offers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
+                       for info in offers)
+        latched = latched or (bool(offers) and all(
+            info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for info in offers))
+        return self._owned.keep(self._node.create_subscription(
+            kind, topic, callback, topics.profile(
+                topics.LOOP_QOS.depth, reliable=reliable, latched=latched)))
+
+    @property
+    def topics(self) -> str:
+        """Where it publishes."""
+        return ', '.join(dict.fromkeys(self._topics))
+
+    @property
+    def running(self) -> bool:
+        """Whether it waits for its first measurement, or steps."""
+        return self.progress is None or self.progress.phase is Phase.RUNNING
+
+    @property
+    def _setpoints_missing(self) -> bool:
+        return self._on_setpoints and (
+            not self._automatic or len(self._tracked) < len(self._units))
+
+    @property
+    def going_home(self) -> str:
+        """Say where the signals go when the steps are over."""
+        return f'{self._listed("to", self.plan.home)}, held there'
+
+    def _listed(self, preposition: str, values: Array) -> str:
+        """Write values (m,) with their names and units."""
+        return ', '.join(
+            f'{self._called(name)} {preposition} {shown(value, unit):.6g} {display_unit(unit)}'
+            for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True))
+
+    @property
+    def _inputs_missing(self) -> bool:
+        """Whether the present inputs are likely to be known in a moment."""
+        if self._inputs is None or time.monotonic() - self._first_at > _PATIENCE:
+            return False
+        # a controller answers the first measurement, too
+        return (self._answers is not None and not self._commanded) or (
+            not self._applied.complete and self._inputs.published())
+
+    def _present(self, stamp_ns: int) -> Array:
+        """
+        Return the present inputs (m,) at a stamp, from which the steps begin.
+
+        Each is the one measured within `experiment_timeout` of the stamp, or else the last
+        command, an older measurement, or the safe value.
+        """
+        start = self.plan.home.copy()
+        recent = round(self._patience * NANOSECONDS)
+        for i, (name, unit) in enumerate(self._units.items()):
+            stamp, measured = self._applied.get(name)
+            found = [measured] if abs(stamp_ns - stamp) <= recent else []
+            found += [self._commanded.get(name, math.nan), measured]
+            start[i] = next(filter(math.isfinite, found), start[i])
+            if not any(map(math.isfinite, found)):
+                self._node.get_logger().warning(
+                    f'experiment: {self._called(name)} is not measured and was not commanded: '
+                    f'the steps begin at its safe value, {shown(start[i], unit):.6g} '
+                    f'{display_unit(unit)}')
+        return start
+
+    def _on_applied(self, heard: Heard) -> None:
+        self._applied.take(heard)
+        self._answer_first()
+
+    def _answer_first(self) -> None:
+        """Answer the first measurement when the present inputs are known, or after a moment."""
+        if self._first is not None and not self._inputs_missing:
+            first, self._first = self._first, None
+            self._answer(*first)
+
+    def _called(self, name: str) -> str:
+        return name if self._on_setpoints else stem(name, self._units[name])
+
+    def figures(self, what: str, values: Array) -> dict[str, float]:
+        """Return values (m,) by name with unit."""
+        return {f'{self._called(name)} {what} [{display_unit(unit)}]': shown(value, unit)
+                for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True)}
+
+    def stop(self, phase: Phase, why: Reason | None = None) -> None:
+        """End the steps; the signals then go home."""
+        if self.progress is not None:
+            self.progress = end(self.progress, phase, why)
+
+    def farewell(self) -> None:
+        """Answer measurements for a moment with the way back, and leave the signals there."""
+        if self.progress is None:
+            return
+        deadline = time.monotonic() + _FAREWELL
+        while time.monotonic() < deadline and not self._home:
+            for stamp_ns in self._waiting_stamps():
+                self.progress = advance(self.plan, self.progress, None, stamp_ns)
+                self._command(self.progress.command, stamp_ns)
+            time.sleep(0.001)
+        for publisher in self._outlet.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
+        if not self._home:
+            self._node.get_logger().warning(
+                f'experiment: ended on the way back: {self._listed("at", self.progress.command)}, '
+                f'held there, in place of {self._listed("at", self.plan.home)}; command them by '
+                'hand or start the controller')
+
+    @property
+    def _home(self) -> bool:
+        return self.progress is not None and bool((self.progress.command == self.plan.home).all())
+
+    def _waiting_stamps(self) -> list[int]:
+        """Take one measurement from each topic, past the executor; return their stamps."""
+        found = []
+        for subscription in self._measured.subscriptions:
+            with (handle := subscription.handle):
+                if taken := handle.take_message(subscription.msg_type, False):
+                    header = getattr(taken[0], 'header', None)
+                    found.append(self._node.get_clock().now().nanoseconds if (
+                        header is None) else stamp_nanoseconds(header.stamp))
+        return found
+
+    def _on_measurement(self, heard: Heard) -> None:
+        if (whole := self._assembler.take(heard.stamp_ns, heard.values)) is not None:
+            self._answer(*whole, heard.frame_id)
+
+    def _answer(self, stamp_ns: int, measured: Array, frame_id: str) -> None:
+        if self.progress is None and not self._started(stamp_ns, measured, frame_id):
+            return
+        assert self.progress is not None
+        newest_ns, was_running = self.progress.time_ns, self.running
+        self._frame_id = frame_id
+        if self._on_setpoints and not self._followed(self._tracked, Code.NOT_TRACKED):
+            return
+        self.progress = advance(self.plan, self.progress, measured, stamp_ns)
+        if self.progress.time_ns != newest_ns:
+            # a stamp that stands still or lags is no news
+            self._heard_at = time.monotonic()
+        self._command(self.progress.command, stamp_ns)
+        if was_running and not self.running:
+            self._on_end(None)
+
+    def _started(self, stamp_ns: int, measured: Array, frame_id: str) -> bool:
+        """Start with a measurement, if all is known that has to be; tell whether it did."""
+        if self.started.done() or self._setpoints_missing:
+            return False
+        self._first_at = min(self._first_at, time.monotonic())
+        if self._inputs_missing:
+            self._first = stamp_ns, measured, frame_id
+            return False
+        if self._on_setpoints:
+            self.plan = self._settings.experiment(
+                self._signals, np.array([self._tracked[name] for name in self._units]))
+        self.started.set_result(refusal := self.plan.refusal(measured))
+        if refusal is not None:
+            return False
+        self.progress = begin(
+            self.plan, stamp_ns, None if self._on_setpoints else self._present(stamp_ns))
+        self._heard_at = time.monotonic()
+        return True
+
+    def _command(self, values: Array, stamp_ns: int) -> None:
+        if self._on_setpoints and self._sent is not None and (values == self._sent).all():
+            # a set-point stays where it was asked to be
+            return
+        self._sent = values
+        self._outlet.send(values, stamp_message(stamp_ns), self._frame_id)
+
+    def _on_command(self, heard: Heard) -> None:
+        """Watch a controller that should be in manual mode."""
+        self._answer_first()
+        if self.progress is not None and not self._on_setpoints:
+            self._followed(heard.values, Code.NOT_FOLLOWED)
+
+    def _on_record(self, message: String) -> None:
+        """Watch a controller that should be in automatic mode."""
+        with contextlib.suppress(records.RecordError):
+            mode = records.parse(message.data).fields.get('mode')
+            self._automatic = self._automatic or mode == 'automatic'
+            if mode == 'manual':
+                why = reason(Code.IN_MANUAL_MODE)
+                if self.progress is not None:
+                    self._on_end(why)
+                elif not self.started.done():
+                    self.started.set_result(why)
+
+    def _followed(self, values: Mapping[str, float], code: Code) -> bool:
+        """Tell whether a controller does as it is asked; where it does not, all is over."""
+        assert self.progress is not None
+        now = time.monotonic()
+        for i, name in enumerate(self._units):
+            if name not in values:
+                continue
+            value, asked = values[name], float(self.progress.command[i])
+            monitor = self._monitors[i] = self._monitors[i].after(value, asked, now)
+            if monitor.deviations >= _DEVIATIONS and now - monitor.since >= _DEVIATION_TIME:
+                self._on_end(reason(code, signal=name, value=value, requested=asked))
+                return False
+        return True
+
+    def _on_tick(self) -> None:
+        """Look for other commanders, and for measurements that stay away."""
+        self._answer_first()
+        why = None
+        for topic in dict.fromkeys(self._topics):
+            if others := other_publishers(self._node, topic, own=1):
+                why = reason(Code.OTHER_PUBLISHER, nodes=others, topic=topic)
+        if why is None and self._answers is not None and not self._answers.published():
+            why = reason(Code.CONTROLLER_GONE)
+        elif why is None and time.monotonic() - self._heard_at > self._patience:
+            why = reason(Code.NOTHING_TRACKED if self._setpoints_missing else Code.SILENCE,
+                         timeout=self._patience)
+        if self.progress is None:
+            if why is not None and not self.started.done():
+                self.started.set_result(why)
+        elif why is not None and why.code is Code.SILENCE:
+            was_running = self.running
+            # the way back goes by the wall clock
+            self.progress = advance(
+                self.plan, end(self.progress, Phase.ABORTED, why), None,
+                self.progress.time_ns + round(_TICK * NANOSECONDS))
+            self._command(self.progress.command, self.progress.time_ns)
+            if was_running:
+                self._on_end(None)
+        elif why is not None:
+            self._on_end(why)
+
+
+def other_publishers(node: Node, topic: str, own: int = 0) -> str:
+    """Name the nodes that publish on a topic, but for so many publishers of a node's own."""
+    # a publisher may be known before its node is
+    names = ['another node' if 'UNKNOWN' in info.node_name else topics.node_name(info)
+             for info in node.get_publishers_info_by_topic(topic)]
+    me = node.get_fully_qualified_name()
+    # another node may have the same name
+    others = {name for name in names if name != me}
+    return ' and '.join(sorted(others | ({me} if names.count(me) > own else set())))

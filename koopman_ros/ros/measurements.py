@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Measurements of a controller: its messages put together, with the measured inputs."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from rclpy.timer import Timer
+
+from koopman_ros.arrays import Array
+from koopman_ros.assembler import Assembler
+from koopman_ros.parameters.wire import LONGEST_FRAME_ID, Wiring
+from koopman_ros.ros import topics
+from koopman_ros.ros.hosted import HostedNode, wall_timer
+from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
+from koopman_ros.ros.timing import Timing
+from koopman_ros.time_base import TimeBase
+from koopman_ros.units import NANOSECONDS
+
+_PATIENCE = 0.5  # s that the first measurement waits for the measured inputs
+
+
+class Sample(NamedTuple):
+    """A measurement that is to be answered."""
+
+    stamp_ns: int
+    values: Array  #: (n_y,) in the units of the signals
+    two_sources: bool  #: whether several publishers send such measurements in turn
+
+
+class Measurements:
+    """
+    Hand over measurements when they are whole.
+
+    :param exclusive: topics on which only one node may publish.
+    :param tolerance: s by which stamps of one measurement may differ.
+    :param answer: called with each measurement.
+    """
+
+    def __init__(self, node: HostedNode, matching: topics.Matching, wiring: Wiring,
+                 exclusive: Mapping[str, str], tolerance: float,
+                 answer: Callable[[Sample], None]) -> None:
+        signals = wiring.signals
+        self._node, self._matching, self._answer = node, matching, answer
+        self.assembler = Assembler(tuple(signals.states), round(tolerance * NANOSECONDS))
+        self.applied = MeasuredInputs(signals.inputs)
+        self.frame_id, self._frame_length = '', 0
+        # by topic of the measurements with one publisher: the numbers of its messages
+        self._sources = {place.topic: TimeBase(late=-1) for place in wiring.measured.values()
+                         if place.topic in exclusive}
+        self._waiting: list[Sample] = []  # that came before the measured inputs
+        self._patience: Timer | None = None
+        self._inputs = Inlet(
+            node, matching.subscribe, wiring.applied, signals.inputs, self._on_applied)
+        measured = Inlet(
+            node, matching.subscribe, wiring.measured, signals.states, self._on_measurement)
+        if measured.unstamped:
+            node.get_logger().warning(
+                f'messages of {", ".join(measured.unstamped)} have no stamp: they are stamped at '
+                'their arrival')
+        self._active = False
+
+    def begin(self, timing: Timing, window: Callable[[], float], begun: Callable[[], bool]
+              ) -> None:
+        """
+        Hand over measurements from now on.
+
+        :param window: s between two changes of the source within which one may take over.
+        :param begun: whether there was a command, before which the measured inputs are awaited.
+        """
+        self._timing, self._window, self._begun, self._active = timing, window, begun, True
+        self._sources = {topic: TimeBase(late=-1) for topic in self._sources}
+        self._waiting.clear()
+
+    def end(self) -> None:
+        """Hand over no measurement, not even one that waits."""
+        self._active = False
+        self._waiting.clear()
+
+    @property
+    def complaint(self) -> str:
+        """What is wrong with the messages, or an empty string."""
+        return '' if self._frame_length <= LONGEST_FRAME_ID else (
+            f'the frame_id of the measurement has {self._frame_length} characters, of which '
+            f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
+
+    def _on_measurement(self, heard: Heard) -> None:
+        self.frame_id = heard.frame_id[:LONGEST_FRAME_ID]
+        self._frame_length = len(heard.frame_id)
+        late = self.assembler.late.total()
+        whole = self.assembler.take(heard.stamp_ns, heard.values)
+        if not self._active:
+            return
+        source, at = self._sources.get(heard.topic), self._timing.now()
+        if source is not None and heard.number is not None:
+            source.take(heard.number, at[0], self._window())
+        if self.assembler.late.total() > late:
+            self._timing.ignore(at)
+        if whole is None:
+            return
+        sample = Sample(*whole, two_sources=any(
+            one.conflict or (one.newest is None and self._matching.shared(topic))
+            for topic, one in self._sources.items()))
+        # whether the measured inputs will be known in a moment
+        if self._waiting or (not self._begun() and not self.applied.complete
+                             and self._patience is None and self._inputs.published()):
+            self._waiting.append(sample)
+            if self._patience is None:
+                self._patience = wall_timer(self._node, _PATIENCE, self._answer_waiting)
+            return
+        self._answer(sample)
+
+    def _on_applied(self, heard: Heard) -> None:
+        self.applied.take(heard)
+        if self._waiting and self.applied.complete:
+            self._answer_waiting()
+
+    def _answer_waiting(self) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+        waiting, self._waiting = self._waiting, []
+        for sample in waiting:
+            self._answer(sample)

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Requests of the operator to a controller: set-points, manual commands, the mode."""
+
+from collections.abc import Callable
+import math
+import time
+
+import numpy as np
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import events, Mode
+from koopman_ros.parameters.wire import Wiring, words_of
+from koopman_ros.ros import topics
+from koopman_ros.ros.control_loop import ControlLoop
+from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
+from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.wire import stem
+
+_SHOWN = 60.0  # s for which a request that was refused or limited is a warning
+
+
+class OperatorRequests:
+    """
+    Pass requests on to the control loop, and say which were refused or limited.
+
+    :param applied: measured inputs, from which a first manual command begins.
+    :param changed: called after each request.
+    :ivar setpoint_received: whether a set-point was accepted.
+    """
+
+    def __init__(self, node: Node, matching: topics.Matching, wiring: Wiring, loop: ControlLoop,
+                 applied: MeasuredInputs, changed: Callable[[], None]) -> None:
+        self._log, self._loop, self._applied = node.get_logger(), loop, applied
+        self._signals, self._changed = wiring.signals, changed
+        self._words = words_of(wiring.signals)
+        self._note, self._noted = '', 0.0
+        self.setpoint_received = False
+        # volatile, so that `ros2 topic pub` matches
+        for name, place in wiring.setpoints.items():
+            Inlet(node, matching.subscribe, {name: place}, wiring.signals.states,
+                  self._on_setpoint)
+        for name, place in wiring.manual.items():
+            Inlet(node, matching.subscribe, {name: place}, wiring.signals.inputs,
+                  self._on_manual)
+        node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
+
+    @property
+    def complaint(self) -> str:
+        """Why the last request was refused or limited, for a minute; or an empty string."""
+        return self._note if time.monotonic() - self._noted < _SHOWN else ''
+
+    def _on_setpoint(self, heard: Heard) -> None:
+        (name, value), = heard.values.items()
+        several = len(self._signals.controlled) > 1
+        if self._change(events.SetpointRequest(
+                heard.stamp_ns, np.array([value]), (name,) if several else None)):
+            self.setpoint_received = True
+            scheduled = any(entry[0] == heard.stamp_ns
+                            for entry in self._loop.state.setpoint.scheduled)
+            when = f', holds from {heard.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
+            unit = self._signals.states[name]
+            self._log.info(
+                f'set-point {shown(value, unit):.6g} {display_unit(unit)} of {name} accepted'
+                f'{when}', throttle_duration_sec=1.0)
+        self._changed()
+
+    def _on_manual(self, heard: Heard) -> None:
+        state = self._loop.state
+        held = state.command if state.manual_input is None else state.manual_input
+        # the others stay
+        requested = np.array([heard.values.get(name, math.nan if held is None else held[i])
+                              for i, name in enumerate(self._signals.inputs)])
+        if state.command is None and (known := self._applied.latest) is not None:
+            self._change(events.Initialisation(known))
+        if self._change(events.ManualCommand(requested)) and (
+                limited := self._limited(requested)):
+            self._warn(limited)
+        self._changed()
+
+    def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
+                          ) -> SetBool.Response:
+        mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
+        self._change(events.ModeChange(mode))
+        response.success, response.message = True, f'{mode.value} mode'
+        self._log.info(response.message)
+        self._changed()
+        return response
+
+    def _change(self, event: events.Event) -> bool:
+        """Apply an event; return whether it is not refused."""
+        refused = self._loop.change(event).refused
+        self._note = ''
+        if refused is not None:
+            self._warn(f'request refused: {self._words(refused)}')
+        return refused is None
+
+    def _warn(self, note: str) -> None:
+        self._note, self._noted = note, time.monotonic()
+        self._log.warning(note, throttle_duration_sec=1.0)
+
+    def _limited(self, requested: Array) -> str:
+        """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
+        within = self._loop.controller.tuning.limits.within(requested)
+        return ', '.join(
+            f'manual {stem(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
+            f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
+            for (name, unit), wanted, limit in zip(
+                self._signals.inputs.items(), requested.tolist(), within.tolist(), strict=True)
+            if wanted != limit)

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The plant that a plant node simulates: equations, actuators, sensors and their parameters."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from koopman_ros import plants
+from koopman_ros.arrays import Array
+from koopman_ros.parameters.plant import PlantParameters, PlantTable
+from koopman_ros.units import display_unit, shown
+from koopman_ros.wire import stem
+
+
+class SimulatedPlant:
+    """
+    A plant at its initial state, in its units.
+
+    :ivar note: why it does not start from a steady state of its own, or an empty string.
+    """
+
+    def __init__(self, table: PlantTable, parameters: PlantParameters, time_ns: int) -> None:
+        self._table, self._parameters = table, parameters
+        self.signals, self.note = table.described, ''
+        try:
+            system = table.system(parameters)
+        except plants.EquilibriumError as error:
+            nominal = table.system(table.snapshot({})).nominal_state
+            system = table.system(parameters, nominal)
+            self.note = f'{error}; the plant starts at {system.describe_state(nominal)} instead'
+        self._process = self._initial(system, time_ns)
+
+    def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
+        x = system.nominal_state + self._column('initial_offset')
+        return plants.Process(system, time_ns, x, system.nominal_input,
+                              self._table.actuator(self._parameters), system.nominal_input)
+
+    def _column(self, attribute: str) -> Array:
+        """Return a parameter of all states (n_x,)."""
+        return np.array([getattr(self._parameters.states[name], attribute)
+                         for name in self.signals.states])
+
+    @property
+    def name(self) -> str:
+        """The name of the plant."""
+        return self._process.system.name
+
+    @property
+    def time_ns(self) -> int:
+        """Its time."""
+        return self._process.time_ns
+
+    @property
+    def inputs(self) -> Array:
+        """(n_u,) applied inputs."""
+        return self._process.u
+
+    @property
+    def commanded(self) -> Array:
+        """(n_u,) commands that the actuators follow."""
+        return self._process.followed
+
+    def advance(self, time_ns: int) -> None:
+        """Simulate up to an instant; raise IntegrationError for a plant that runs away."""
+        self._process = self._process.until(time_ns)
+
+    def skip_to(self, time_ns: int) -> None:
+        """Set its time, which stood still."""
+        self._process = replace(self._process, time_ns=max(time_ns, self.time_ns))
+
+    def command(self, values: Array) -> None:
+        """Command the inputs (n_u,)."""
+        self._process = self._process.commanded(values, self.time_ns)
+
+    def reset(self) -> None:
+        """Put it back to its initial state; time goes on."""
+        self._process = self._initial(self._process.system, self.time_ns)
+
+    def tune(self, parameters: PlantParameters) -> None:
+        """Take over other parameters; the nominal point stays the same, for :meth:`reset`."""
+        self._parameters, before = parameters, self._process.system
+        try:
+            system = self._table.system(parameters)
+        except plants.EquilibriumError:
+            system = self._table.system(parameters, before.nominal_state)
+        self._process = replace(
+            self._process, actuator=self._table.actuator(parameters), system=replace(
+                system, nominal_state=before.nominal_state, nominal_input=before.nominal_input))
+
+    def measure(self, sample: int) -> tuple[Array, Array, Array]:
+        """Return measurement, variance and resolution of all states (n_x,) for a sample."""
+        noise, resolution = self._column('noise'), self._column('resolution')
+        drawn = np.array([plants.sensor_noise(one, self._parameters.seed, sample, i)
+                          for i, one in enumerate(noise.tolist())])
+        # the steps of the scale have the variance of a uniform error
+        variance = noise ** 2 + resolution ** 2 / 12.0
+        return self._process.x + drawn + self._column('bias'), variance, resolution
+
+    def figures(self) -> dict[str, float]:
+        """Return states and inputs with their names and units."""
+        inputs = {stem(name, unit): unit for name, unit in self.signals.inputs.items()}
+        signals = [*self.signals.states.items(), *inputs.items()]
+        values = [*self._process.x.tolist(), *self._process.u.tolist()]
+        return {f'{name} [{display_unit(unit)}]': shown(value, unit)
+                for (name, unit), value in zip(signals, values, strict=True)}

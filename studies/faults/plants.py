@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The plants of the campaign: their signals in the units of their messages, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+import math
+from typing import Any
+
+from koopman_ros.demo import reactor
+from koopman_ros.lifting import load
+from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
+from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.parameters.table import ParameterTable
+from koopman_ros.parameters.wire import preset, Wiring
+from koopman_ros.resources import model_path
+from koopman_ros.units import unit_label
+
+LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
+# While a controller is dead, the plant goes on at so many samples a second.
+PATIENT = {**LOCKSTEP, 'lockstep_timeout': 0.05}
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A plant that is shipped; controlled states share a unit, and so do inputs."""
+
+    name: str  #: by which it is called on the command line
+    setpoint: tuple[float, ...]  #: of the controlled states, that it is held at
+    other: tuple[float, ...]  #: that can be held, too, at each other's values as well
+    by_hand: tuple[float, ...]  #: inputs that hold it somewhere
+    band: float  #: distance from the set-point that counts as back
+    settle: float = 240.0  #: plant time from the start until a fault, s
+    afterwards: float = 360.0  #: plant time that the loop runs on after it, s
+    recovery: float = 300.0  #: of this, within which the plant must be back, s
+    #: parameters of both nodes, and of every controller, beside those of its file
+    wired: Mapping[str, str] = field(default_factory=dict)
+    tuned: Mapping[str, Any] = field(default_factory=dict)
+    simulated: Mapping[str, float] = field(default_factory=dict)  #: and of every plant
+    #: a set-point that no input can hold beside the others
+    never: Mapping[str, float] = field(default_factory=dict)
+    highest: float = math.inf  #: of the controlled states, from which on it is lost
+    kind: str = ''  #: what plant and controller are told that they are; its name by default
+
+    @property
+    def system(self) -> str:
+        """What plant and controller are told that they are."""
+        return self.kind or self.name
+
+    @cached_property
+    def table(self) -> ParameterTable[ControllerParameters]:
+        """Parameters of its controllers."""
+        return table_of(load(model_path(self._model)), {**self.tuned, 'system': self.system})
+
+    @cached_property
+    def parameters(self) -> ControllerParameters:
+        """What its controllers are started with."""
+        return self.table.snapshot({**self.wired, **self.tuned})
+
+    @property
+    def _model(self) -> str:
+        return str({**preset(self.system, 'controller'), **self.tuned}['model'])
+
+    @cached_property
+    def wiring(self) -> Wiring:
+        """Where its signals are."""
+        signals = signals_of(load(model_path(self._model)), self.parameters.controlled,
+                             self.parameters.states)
+        return Wiring(signals, self.parameters.states, self.parameters.inputs)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """All states that are measured."""
+        return tuple(self.wiring.signals.states)
+
+    @property
+    def controlled(self) -> tuple[str, ...]:
+        """Those that have a set-point."""
+        return self.wiring.signals.controlled
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The inputs."""
+        return tuple(self.wiring.signals.inputs)
+
+    @property
+    def unit(self) -> str:
+        """Of the controlled states, to be read behind a difference: a kelvin is no degree."""
+        return self.wiring.signals.states[self.controlled[0]]
+
+    @property
+    def input_unit(self) -> str:
+        """Of the inputs, likewise."""
+        return self.wiring.signals.inputs[self.inputs[0]]
+
+    @property
+    def shown_units(self) -> tuple[str, str]:
+        """Units of the values of states and inputs."""
+        return unit_label(self.unit), unit_label(self.input_unit)
+
+    @cached_property
+    def period(self) -> float:
+        """Time between measurements, s."""
+        return PlantTable({'system': self.system}).snapshot({}).sample_period
+
+    @cached_property
+    def rate(self) -> float:
+        """Fastest change of a command, 1/s."""
+        return max(item.rate_limit for item in self.parameters.inputs.values()) or math.inf
+
+    def default(self, parameter: str) -> Any:
+        """Return what a parameter of its controllers is when nobody has changed it."""
+        return self.tuned.get(parameter, self.table.rows[parameter].default)
+
+
+def _each(names: tuple[str, ...], **values: float) -> dict[str, float]:
+    return {f'{name}.{item}': value for name in names for item, value in values.items()}
+
+
+REACTOR = Plant(
+    # 5 K below the steady state that it starts from; its operating points end below 54 degC
+    reactor.SYSTEM, setpoint=(46.0,), other=(44.0,), by_hand=(20.0,), band=0.3, highest=60.0)
+# Two levels and two pumps, each on a topic of its own: samples are put together by their stamps.
+TWO_TANKS = Plant(
+    'two_tanks', setpoint=(0.1, 0.15), other=(0.09, 0.14), by_hand=(7.0, 2.0), band=0.002,
+    settle=80.0, afterwards=200.0, recovery=180.0, never={'level_2': 0.08}, highest=0.35, tuned={
+        **_each(('level_1', 'level_2'), max_rate=0.03, max_jump=0.01),
+        **_each(('pump_1', 'pump_2'), rate_limit=2.0), 'transfer_time': 10.0})
+# Four levels in one message, two of them controlled.
+_LEVELS = ('level_1', 'level_2', 'level_3', 'level_4')
+QUADRUPLE_TANK = Plant(
+    'quadruple_tank', setpoint=(0.15, 0.1), other=(0.14, 0.11), by_hand=(3.2, 2.8), band=0.002,
+    settle=200.0, afterwards=300.0, recovery=270.0, never={'level_2': 0.042}, highest=0.25,
+    wired={f'{name}.topic': 'levels' for name in _LEVELS}, tuned={
+        **_each(_LEVELS, max_rate=0.01, max_jump=0.01),
+        **_each(('pump_1', 'pump_2'), rate_limit=1.0), 'transfer_time': 10.0})
+# The reactor of two states where no coolant that is held holds it, its concentration estimated.
+SADDLE = Plant(
+    'saddle', kind='two_state', setpoint=(76.85,), other=(73.85,), by_hand=(26.85,), band=0.5,
+    settle=120.0, afterwards=420.0, recovery=300.0, highest=110.0,
+    simulated={'concentration.initial_offset': -0.37733466,
+               'temperature.initial_offset': 25.53008526, 'temperature.noise': 0.05}, tuned={
+        'model': 'two_state_saddle', 'states_measured': ('temperature [K]',),
+        'levels': ('mpc', 'sdre', 'pi'), 'temperature.noise': 0.05,
+        'concentration.initial_error': 0.2, 'temperature.max_rate': 2.0,
+        'temperature.max_jump': 2.0, 'pi.temperature.gain': 6.0,
+        'pi.temperature.integral_time': 60.0,
+        **_each(('coolant_temperature',), wander=0.775, min=-20.0, max=100.0, rate_limit=1.0)})
+# It falls where nothing acts; its rate is estimated from the angle.
+PENDULUM = Plant(
+    'pendulum', setpoint=(0.0,), other=(0.1,), by_hand=(0.0,), band=math.inf, settle=4.0,
+    afterwards=2.0, recovery=2.0, tuned={'states_measured': ('angle [rad]',)})
+PLANTS = {plant.name: plant for plant in (
+    REACTOR, TWO_TANKS, QUADRUPLE_TANK, SADDLE, PENDULUM)}

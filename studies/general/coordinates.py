@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the linear coordinates of a lift add to its drift, and what classes do in harder cases."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import averaged, recentred
+from koopman_ros.learning import NoUsefulLift, rollout_rmse, train
+from koopman_ros.learning.validation import drift_error
+from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
+from koopman_ros.plant_data import Samples, split_by_episode
+from koopman_ros.plants import describe
+from studies.general.learners import LEARNERS, RECIPES
+from studies.general.loops import judged, known, loops, STARTS
+from studies.general.systems import Case, CASES
+from studies.paper.campaign import Experiment
+from studies.paper.datasets import Metrics, Models
+
+PLACE = 'coordinates'  # of its figures in the summary
+SEEDS = 3  # as many of those of the study
+NOISE = 0.03  # of the derivatives, beside their root mean square
+FEW = 0.1  # share of the episodes
+BEYOND = 0.2  # how far starts lie beyond the box at its upper ends, in units of it
+_HELD_OUT = 40
+_POLYNOMIALS = ('EDMD-3', 'EDMD-5')
+LIFTS = ('identity lift', 'free lift')
+_DEGREE = 3  # of the monomials in discrete time
+_FAR = 1e3  # half widths, beyond which a prediction has diverged
+
+
+def noisy(samples: Samples, seed: int) -> Samples:
+    """Return samples whose derivatives are measured with noise."""
+    rng = np.random.default_rng(seed)
+    size = NOISE * np.sqrt(np.mean(samples.dxdt ** 2, axis=0))
+    return replace(samples, dxdt=samples.dxdt + size * rng.normal(size=samples.dxdt.shape))
+
+
+def few(samples: Samples, seed: int) -> Samples:
+    """Return the first episodes alone."""
+    episodes = np.unique(samples.episode)
+    return samples.take(episodes[:round(FEW * len(episodes))])
+
+
+CONDITIONS: Mapping[str, Callable[[Samples, int], Samples]] = {
+    'rx': lambda samples, seed: samples, 'rx_noisy': noisy, 'rx_few': few}
+
+
+def beyond(case: Case, box: Box, seed: int) -> Samples:
+    """Return held-out samples outside of a box, of episodes that go beyond its upper ends."""
+    more = BEYOND * (box.states.upper - box.states.lower)
+    wider = replace(case, lower=0.5 * (box.states.lower + box.states.upper),
+                    upper=box.states.upper + more, design=replace(
+                        case.design, state_lower=box.states.lower,
+                        state_upper=box.states.upper + 1.5 * more))
+    found = wider.samples(seed, _HELD_OUT)
+    return found.where(np.any(found.x > box.states.upper, axis=1))
+
+
+def rolled_in_z(model: LiftedModel, samples: Samples) -> Array:
+    """
+    Predict every episode by dz/dt = A z + J(x) B u alone, x the first coordinates of z.
+
+    :return: (n_x,) root mean square errors in state units; infinite where one diverges.
+    """
+    n, squares, count = model.n_x, np.zeros(model.n_x), 0
+    x, v = model.states.to_deviation(samples.x), model.inputs.to_deviation(samples.u)
+    assert samples.time is not None
+    for number in np.unique(samples.episode):
+        rows = np.flatnonzero(samples.episode == number)
+        z = model.lift(x[rows[0]])
+        for k, following in pairwise(rows):
+            def rate(_: float, z: Array, u: Array = v[k]) -> Array:
+                return model.A @ z + model.jacobian(z[:n]) @ model.forcing(z[:n], u)
+
+            with np.errstate(all='ignore'):
+                found = solve_ivp(rate, (0.0, samples.time[following] - samples.time[k]), z,
+                                  rtol=1e-6, atol=1e-9, method='DOP853')
+                z = found.y[:, -1]
+            if not found.success or not np.all(np.abs(z) < _FAR):
+                return np.full(n, np.inf)
+            squares += (model.states.scale * (z[:n] - x[following])) ** 2
+            count += 1
+    return np.sqrt(squares / count)
+
+
+def discrete(case: Case, box: Box, samples: Samples, held_out: Samples, delays: int) -> float:
+    """
+    Predict held-out episodes by EDMD in discrete time, with inputs and delay coordinates.
+
+    z_k+1 = A z_k + B u_k by least squares, z the monomials of the state and, with delays, the last
+    states and inputs; once lifted it is not lifted again. (Korda, Mezic 2018.)
+
+    :return: root mean square error from the first state with a past, of the worst state, in half
+        widths of the box.
+    """
+    terms = PolynomialObservables.total_degree(case.system.n_x, _DEGREE)
+    n = case.system.n_x
+
+    def lifted(given: Samples) -> list[tuple[Array, Array, Array]]:
+        found = []
+        for number in np.unique(given.episode):
+            rows = given.episode == number
+            x = box.states.to_deviation(given.x[rows])
+            u = box.inputs.to_deviation(given.u[rows])
+            last = len(x)
+            past = [part[1 - i:last - i] for i in range(1, delays + 1) for part in (x, u)]
+            found.append((np.hstack([terms.lift(x[1:]), *past, np.ones((last - 1, 1))]),
+                          u[1:], x[1:]))
+        return found
+
+    known_ones = lifted(split_by_episode(samples, 0)[0])
+    before = np.vstack([np.hstack([z[:-1], u[:-1]]) for z, u, _ in known_ones])
+    after = np.vstack([z[1:] for z, _, _ in known_ones])
+    weights = np.linalg.lstsq(before, after, rcond=None)[0]
+    squares, count = np.zeros(n), 0
+    with np.errstate(all='ignore'):
+        for z, u, x in lifted(held_out):
+            state = z[0]
+            for k in range(len(x) - 1):
+                state = np.concatenate([state, u[k]]) @ weights
+                squares += (box.states.scale * (state[:n] - x[k + 1])) ** 2
+                count += 1
+    return float(np.max(np.sqrt(squares / count) / case.units[0]))
+
+
+def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
+    """
+    Learn a case by several classes from good, noisy and few data, and use each model's parts.
+
+    :return: figures named ``<class>/<figure>``: relative errors of the drift `rx`, `rx_noisy`,
+        `rx_few` on the same exact held-out data, and `rx_beyond` outside of the box; `rollout` by
+        the drift, for lifts `rollout_z` by the linear coordinates; for lifts ``averaged`` and
+        ``recentred``, the largest cost of each law over that of the better law that knows the
+        plant, with ``..._missed`` as in :func:`judged`.
+    """
+    case = CASES[name]
+    samples, held_out = case.samples(seed), case.samples(1000 + seed, _HELD_OUT)
+    plant = describe(case.system)
+    box = Box.of(plant, samples.x, samples.u)
+    outside = beyond(case, box, 2000 + seed)
+    found: dict[str, Metrics] = {}
+    for label in (*_POLYNOMIALS, *RECIPES):
+        figures: Metrics = {}
+        found[label] = figures
+        for figure, change in CONDITIONS.items():
+            given = change(samples, seed)
+            try:
+                model = LEARNERS[label](plant, given, seed).model if label in _POLYNOMIALS else (
+                    train(plant, given, RECIPES[label](case.system.n_x), seed=seed, starts=1,
+                          refuse=False).model)
+            except NoUsefulLift:
+                figures[figure] = None
+                continue
+            figures[figure] = drift_error(model, held_out)
+            if figure == 'rx':
+                figures |= _used(name, model, held_out, outside, label in LIFTS, starts)
+    for delays in (0, 1):
+        found[f'in discrete time, {delays} delays'] = {
+            'rollout': discrete(case, box, samples, held_out, delays)}
+    return {f'{label}/{figure}': value for label, figures in found.items()
+            for figure, value in figures.items()}, {}
+
+
+def _used(name: str, model: LiftedModel, held_out: Samples, outside: Samples, lift: bool,
+          starts: int) -> Metrics:
+    """Judge a model of good data by what it is used for."""
+    case = CASES[name]
+    error = rollout_rmse(model, held_out)
+    found: Metrics = {
+        'rx_beyond': drift_error(model, outside),
+        'rollout': None if error is None else float(np.max(error / case.units[0]))}
+    if not lift:
+        return found
+    if model.identity:
+        found['rollout_z'] = float(np.max(rolled_in_z(model, held_out) / case.units[0]))
+    for law in (averaged, recentred):
+        figures = judged(loops(case, model, starts, law), known(name, starts))
+        found |= {law.__name__: figures['ratio_worst'],
+                  f'{law.__name__}_missed': figures['missed']}
+    return found
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    f'{PLACE}/{name}': partial(run, name) for name in CASES}

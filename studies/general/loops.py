@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a law costs on the true plant, beside laws that know the plant and beside the least."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+import math
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import Feedback, feedback, Form, run_closed_loop, Target, Weights
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plants.optimum import optimum, Task
+from koopman_ros.solvers import solve_riccati
+from studies.general.systems import Case, CASES
+from studies.paper.datasets import Metrics
+
+STARTS = 20
+OPTIMA = 5  # of the first of them, as the least cost takes a second to find
+ARRIVED = 0.1  # distance from the nominal state, in half widths of the box
+HELD_TO = 1.05  # most that a law may cost, over the better of those that know the plant
+_SAMPLES = 800  # of the least cost, for each of which the inputs are held
+_MAX_EVALUATIONS = 5000  # of a law; what needs more chatters
+
+
+@dataclass(frozen=True)
+class End:
+    """How a loop ended."""
+
+    cost: float  #: infinite where the plant did not arrive
+    no_gain: bool = False  #: whether the law had none somewhere on the way
+
+
+@dataclass(frozen=True)
+class Known:
+    """What laws that know the plant get, by start."""
+
+    lqr: tuple[End, ...]  #: with the linear-quadratic gain of the nominal state
+    sdre: tuple[End, ...]  #: with that of the true drift as :meth:`Case.factorised` factorises it
+    least: tuple[float, ...]  #: least costs; infinite where none was found, or looked for
+
+    @property
+    def better(self) -> tuple[float, ...]:
+        """The smaller cost of the two at each start."""
+        return tuple(min(one.cost, other.cost)
+                     for one, other in zip(self.lqr, self.sdre, strict=True))
+
+
+@cache
+def known(name: str, starts: int) -> Known:
+    """Find what there is to compare with: the same for all seeds and models of a case."""
+    case = CASES[name]
+
+    def natural(model: LiftedModel, x: Array, target: Target, weights: Weights) -> Feedback:
+        scale = model.states.scale
+        A = case.factorised(model.states.to_physical(x)) * scale / scale[:, None]
+        found = solve_riccati(A, model.B, weights.Q, weights.R)
+        return Feedback(target.u - found.K @ (x - target.x), Form.AVERAGED, found, A,
+                        -model.B @ found.K)
+
+    return Known(tuple(loops(case, case.truth, starts)),
+                 tuple(loops(case, case.truth, starts, natural)),
+                 tuple(_least(case, x0) if number < OPTIMA else math.inf
+                       for number, x0 in enumerate(case.starts(starts))))
+
+
+def loops(case: Case, model: LiftedModel, starts: int,
+          law: Callable[..., Feedback] = feedback) -> list[End]:
+    """Regulate the true plant by a law on a model, in continuous time, from the first starts."""
+    nominal, ends = case.system.nominal_state, []
+    for x0 in case.starts(starts):
+        solved: list[bool] = []
+
+        def watched(*state: object, solved: list[bool] = solved) -> Feedback:
+            found = law(*state)
+            solved.append(found.solved)
+            return found
+
+        loop = run_closed_loop(
+            model, case.system.derivative, x0, nominal, case.weights(model), case.horizon,
+            law=watched, u_ref=case.system.nominal_input, samples=2, rtol=1e-4,
+            max_evaluations=_MAX_EVALUATIONS)
+        away = float(np.max(np.abs(loop.states[-1] - nominal) / case.units[0]))
+        ends.append(End(loop.cost if away < ARRIVED else math.inf, not all(solved)))
+    return ends
+
+
+def _least(case: Case, x0: Array) -> float:
+    """Return the least cost from a start (n_x,), on the true equations with inputs held."""
+    system = case.system
+    Q, R = (1.0 / unit ** 2 for unit in case.units)
+    try:
+        return optimum(Task(system, x0, system.nominal_state,
+                            system.nominal_input, Q, R, case.horizon / _SAMPLES, _SAMPLES, 1)).cost
+    except ValueError:
+        return math.inf
+
+
+def judged(ends: Sequence[End], beside: Known) -> Metrics:
+    """
+    Count and compare how loops ended, start by start.
+
+    :return: `no_gain` and `not_arrived`, numbers of starts; `missed`, the number from which the
+        law did not arrive or cost more than HELD_TO times the better law that knows the plant;
+        `ratio` and `ratio_worst`, that cost ratio at the median and the largest, over starts
+        from which it arrived; `least_ratio`, the largest over the least cost.
+    """
+    costs, better = np.array([end.cost for end in ends]), np.array(beside.better)
+    arrived = np.isfinite(costs)
+
+    def over(below: Array) -> Array:
+        both = arrived & np.isfinite(below)
+        ratios: Array = costs[both] / below[both]
+        return ratios
+
+    ratios, over_least = over(better), over(np.array(beside.least))
+    return {'no_gain': sum(end.no_gain for end in ends), 'not_arrived': int(np.sum(~arrived)),
+            'missed': int(np.sum(~(arrived & (costs <= HELD_TO * better)))),
+            'ratio': float(np.median(ratios)) if len(ratios) else None,
+            'ratio_worst': float(np.max(ratios)) if len(ratios) else None,
+            'least_ratio': float(np.max(over_least)) if len(over_least) else None}

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Run the study (needs the `demo`, `mpc` and `bench` requirements): table, figures, picture."""
+
+import argparse
+from collections.abc import Callable
+import sys
+
+from koopman_ros.reports import machine, write_figures, write_page
+from studies.options import add_output, add_plants, add_seeds, read
+from studies.partly_measured.cases import CASES
+from studies.partly_measured.contenders import Contender, LINEAR, OWN
+from studies.partly_measured.dompc import WithFilter, WithWindow
+from studies.partly_measured.report import draw, figures_of, table_of
+from studies.partly_measured.study import judge, run
+
+CONTENDERS: dict[str, Callable[..., Contender]] = {
+    **OWN, 'do-mpc with its MHE': WithWindow, 'do-mpc, same filter': WithFilter, **LINEAR}
+_PACKAGES = ('numpy', 'casadi', 'do-mpc', 'daqp', 'control')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run every controller on every plant from several seeds."""
+    parser = argparse.ArgumentParser(
+        prog='python -m studies.partly_measured',
+        description='Control plants that are measured in part, beside do-mpc and an LQG.')
+    add_plants(parser, CASES)
+    add_seeds(parser)
+    add_output(parser, 'out/studies-partial')
+    options = read(parser, args, CASES)
+    found = {}
+    for plant in options.plants or CASES:
+        case = CASES[plant]
+        found[plant] = {name: [
+            (made, judge(case, made)) for made in (
+                run(case, make(case), seed) for seed in range(options.seeds))]
+            for name, make in CONTENDERS.items()}
+        print(f'{plant} is done', file=sys.stderr, flush=True)
+    figures = {plant: {name: figures_of(runs) for name, runs in contenders.items()}
+               for plant, contenders in found.items()}
+    text = table_of(figures, CASES)
+    write_figures(options.output / 'summary.json', {
+        'machine': machine(*_PACKAGES), 'seeds': options.seeds, 'plants': figures})
+    picture = draw(found, CASES, options.output / 'partly_measured.png')
+    write_page(options.output / 'report.md', 'Plants measured in part',
+               [text, str(picture)], _PACKAGES)
+    print(f'{options.seeds} seeds; processor time of a step, estimator and all\n\n{text}\n\n'
+          f'{options.output} holds all figures and a picture')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

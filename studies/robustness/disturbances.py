@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What changed plants, lags, biases, saturation and noise do to the loop."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+import math
+from typing import Any
+
+import numpy as np
+
+from koopman_ros.control import at, perfect, Sensor, Simulation, Timed
+from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
+from studies.paper.datasets import Metrics
+from studies.robustness import loop
+from studies.robustness.loop import at_setpoint, changed_reactor, on_plant, REACTOR, START
+
+SETPOINT = START - 10.0
+LEAD = 10.0  # s of rest before a change
+SECONDS = 1500.0
+NOISE = 0.1  # K
+BIAS = 2.0  # K
+BANDWIDTHS = (0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 20.0)  # 1/min
+CHANGED = {
+    'UA −20 %': changed_reactor(heat_transfer=0.8), 'UA +20 %': changed_reactor(heat_transfer=1.2),
+    'C_A −10 %': changed_reactor(concentration=0.9),
+    'C_A +10 %': changed_reactor(concentration=1.1),
+    'T_i −5 K': changed_reactor(feed=-5.0), 'T_i +5 K': changed_reactor(feed=5.0)}
+# The coolant cannot hold this set-point while the feed is so much warmer.
+SATURATED_SETPOINT, WARM_FEED, SATURATED_SECONDS = 308.0, 20.0, 900.0
+REACHED = 298.15  # K, the coldest coolant of an actuator that is stuck
+
+
+@dataclass(frozen=True)
+class Case:
+    """A loop that is disturbed or whose set-point steps."""
+
+    name: str  #: for the tables
+    changes: Sequence[Timed]  #: what happens when, in s
+    reference: float = START  #: where the true temperature ought to go, in K
+    system: ControlAffineSystem = REACTOR  #: the plant
+    x0: Sequence[float] = (START,)  #: its state at the start
+    since: float = LEAD  #: when the time to get there starts, in s
+    overshoot: bool = False  #: whether its deviation counts from the first time that it gets there
+    actuator: Actuator | None = None  #: between command and plant; perfect when None
+    tells: bool = False  #: whether the applied coolant is measured
+    seconds: float = SECONDS  #: how long
+    sensor: Sensor = perfect  #: of the temperature
+
+    def run(self, bandwidth: float = loop.BANDWIDTH) -> Simulation:
+        """Simulate it with the default controller, from rest."""
+        coolant = float(equilibrium_input(self.system, self.x0)[0])
+        return loop.run_loop(
+            loop.reactor_controller(bandwidth=bandwidth), self.system, np.array(self.x0), coolant,
+            self.seconds, self.changes, actuator=self.actuator, tells=self.tells,
+            sensor=self.sensor)
+
+
+def _step(words: str, *changes: Timed, **details: Any) -> Case:
+    return Case(f'set-point −10 K{words}', [at(LEAD, at_setpoint(SETPOINT)), *changes], SETPOINT,
+                overshoot=True, **details)
+
+
+def cases() -> Iterator[Case]:
+    """Make the cases of the table of offsets."""
+    for name, system in CHANGED.items():
+        yield Case(f'{name}, in the loop', [at(LEAD, on_plant(system=system))])
+    yield _step('')
+    for name, system in CHANGED.items():
+        yield _step(f', {name} all along', system=system)
+    told = ((False, ''), (True, ', measured'))
+    for (words, actuator), (tells, measured) in product((
+            *((f'lags by {lag:g} s', Actuator(lag=lag)) for lag in (5.0, 10.0, 20.0)),
+            ('one sample late', Actuator(delay=1.0)), ('10 s late', Actuator(delay=10.0))), told):
+        yield _step(f', coolant {words}{measured}', actuator=actuator, tells=tells)
+    two = two_state_reactor()
+    for words, change in (('−3 K', -3.0), ('+1.5 K', 1.5)):
+        reference = float(two.nominal_state[1]) + change
+        yield Case(f'set-point {words} on the two-state reactor',
+                   [at(LEAD, at_setpoint(reference))], reference, two, two.nominal_state.tolist(),
+                   overshoot=True)
+    yield Case('sensor bias +2 K', [at(0.0, at_setpoint(START - 5.0))], START - 5.0,
+               x0=[START - 5.0], sensor=loop.biased(BIAS, LEAD))
+    end = LEAD + SATURATED_SECONDS
+    for setpoint, words in ((SATURATED_SETPOINT, 'coolant saturated'),
+                            (START, 'coolant in its range')):
+        yield Case(f'T_i +{WARM_FEED:g} K for 15 min, {words}, after its end',
+                   [at(0.0, at_setpoint(setpoint)),
+                    at(LEAD, on_plant(system=changed_reactor(feed=WARM_FEED))),
+                    at(end, on_plant(system=REACTOR))], setpoint, x0=[setpoint], since=end,
+                   overshoot=setpoint == SATURATED_SETPOINT, seconds=end + SECONDS)
+    for tells, measured in told:
+        yield _step(f', coolant stuck at {REACHED:g} K for 15 min, after its end{measured}',
+                    at(end, on_plant(actuator=Actuator())), since=end,
+                    actuator=Actuator(lower=REACHED), tells=tells, seconds=end + SECONDS)
+
+
+def judge(case: Case) -> Metrics:
+    """Run a case; times are None for never, `learned` is whether no other law ever acted."""
+    course = case.run()
+    away = loop.errors(course, case.reference, case.since)
+    last = course.reports[-1].estimate
+    bias = float(course.loop.controller.equivalent_bias(course.loop.state)[0])
+    if case.overshoot:
+        away = -math.copysign(1.0, away[0]) * away
+    return {
+        'largest_kelvin': float(np.max(away if case.overshoot else np.abs(away))),
+        'seconds_to_0.2_kelvin': loop.settling(course, case.reference, 0.2, case.since),
+        'seconds_to_0.001_kelvin': loop.settling(course, case.reference, 1e-3, case.since),
+        'final_kelvin': float(np.mean(loop.errors(course, case.reference)[-60:])),
+        'disturbance_kelvin': math.nan if last is None else float(last.disturbance[0]),
+        'equivalent_bias_kelvin': bias if math.isfinite(bias) else None,
+        'learned': loop.worst(course) == 'sdre'}
+
+
+def noise_against_speed(bandwidth: float) -> Metrics:
+    """
+    Measure what an observer's bandwidth in 1/min costs and brings.
+
+    :return: standard deviations over half an hour with noise of 0.1 K at 1 Hz, `change` from one
+        second to the next; times (None for never) and what is left at the end after UA -20 %
+        (`fouled`) and after a step by -10 K (`step`).
+    """
+    noisy = loop.run_loop(
+        loop.reactor_controller(bandwidth=bandwidth), REACTOR, np.array([START]), loop.COOLANT,
+        2400.0, [at(0.0, at_setpoint(START))], noise=NOISE)
+    settled = noisy.times >= 600.0
+    coolant = noisy.commands[settled, 0]
+    metrics: Metrics = {
+        'coolant_kelvin': float(np.std(coolant)),
+        'coolant_change_kelvin': float(np.std(np.diff(coolant))),
+        'temperature_kelvin': float(np.std(noisy.states[settled, 0]))}
+    for name, change, reference in (
+            ('fouled', on_plant(system=CHANGED['UA −20 %']), START),
+            ('step', at_setpoint(SETPOINT), SETPOINT)):
+        course = Case(name, [at(LEAD, change)], reference).run(bandwidth)
+        for tolerance in (0.2, 1e-3):
+            metrics[f'{name}_to_{tolerance:g}_kelvin'] = loop.settling(
+                course, reference, tolerance, LEAD)
+        metrics[f'{name}_final_kelvin'] = float(loop.errors(course, reference)[-1])
+    return metrics

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Lifts of too narrow data, asked for more than they know, without fallback and with it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from koopman_ros import control
+from koopman_ros.control import at, Controller, Simulation
+from koopman_ros.learning import Growth, Linearisation, train
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plants import box_episodes, describe, RandomStepDesign
+from studies.paper import two_state
+from studies.paper.datasets import Metrics
+from studies.robustness import loop
+from studies.robustness.loop import REACTOR, START
+
+HALF_WIDTH = 1.5  # K
+# Coolant and reactor in K, times in min.
+DESIGN = RandomStepDesign(
+    input_lower=295.0, input_upper=305.0, state_lower=START - HALF_WIDTH,
+    state_upper=START + HALF_WIDTH, hold_time=(0.1, 0.25), sample_period=0.05, max_redraws=20)
+SECONDS = 1200.0
+LINEAR_MARGINS, MARGIN_BANDWIDTHS = (0.2, 0.5, 1.0), (0.0, 2.0, 6.0)
+_DISTURBED = 60.0  # s
+_ESCAPED = 100.0  # in either state of the two-state example
+_BOUND = 200.0  # of its input, in 1/s
+_SAMPLE = 0.05  # s
+_HORIZON = 60.0  # s
+_HOLDING = float(two_state.START[0] ** 2 - two_state.START[1])  # holds x2 where it starts
+NARROWEST = '[3,6]x[3,8]'
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a lift of narrow data is asked for."""
+
+    name: str  #: for the tables
+    temperature: float  #: of the reactor at the start, in K
+    bandwidth: float = loop.BANDWIDTH  #: of the observer, in 1/min
+    changes: Sequence[control.Timed] = ()  #: what happens when, in s
+
+    def run(self, controller: Controller) -> Simulation:
+        """Drive the true reactor to its steady state."""
+        return loop.run_loop(
+            controller, REACTOR, np.array([self.temperature]), loop.COOLANT, SECONDS,
+            [at(0.0, loop.at_setpoint(START)), *self.changes],
+            stop=lambda x, *_: bool(x[0] > 420.0))
+
+
+TRIALS = (
+    Trial('start at 338 K', 338.0),
+    Trial('UA −40 % after 1 min, no observer', START, 0.0,
+          (at(_DISTURBED, loop.on_plant(system=loop.changed_reactor(heat_transfer=0.6))),)),
+    Trial('start at 300 K', 300.0))
+
+
+def reactor_courses() -> dict[tuple[str, str], Simulation]:
+    """Run all trials: by their name and ``narrow``, ``guarded`` (with fallback) or ``wide``."""
+    # an hour of steps within 1.5 K of the steady state
+    samples = box_episodes(REACTOR, DESIGN, 60, 1.0, 0)
+    lift = train(describe(REACTOR), samples, Growth(3), seed=0, starts=1, refuse=False).model
+    return {(trial.name, kind): trial.run(loop.reactor_controller(
+        bandwidth=trial.bandwidth, fallback=fallback, model=model)) for trial in TRIALS
+        for kind, model, fallback in (('narrow', lift, False), ('guarded', lift, True),
+                                      ('wide', None, True))}
+
+
+def judge_reactor(course: Simulation, since: float = 0.0) -> Metrics:
+    """Say what became of a trial; it ran away above 350 K, and time counts from `since` s on."""
+    hottest = float(np.max(course.states))
+    return {'hottest_kelvin': hottest, 'final_kelvin': float(course.states[-1, 0]),
+            'seconds_to_0.2_kelvin': loop.settling(course, START, 0.2, since),
+            'ran_away': bool(course.failure) or hottest > 350.0,
+            'safe_share': float(np.mean([level == control.SAFE for level in course.levels]))}
+
+
+def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
+    """Judge the loop with the shipped lift after it has lost 40 % of UA, from then on."""
+    controller = loop.reactor_controller(bandwidth=bandwidth, linear_margin=linear_margin)
+    return judge_reactor(TRIALS[1].run(controller), _DISTURBED)
+
+
+def two_state_courses() -> dict[tuple[str, str], Simulation]:
+    """Run the two-state example by the box of its lift and ``narrow`` or ``guarded``."""
+    system, boxes = two_state.SYSTEM, {**two_state.NARROW, 'wide': two_state.WIDE}
+    models = {name: train(
+        describe(system), two_state.samples(box, 0),
+        two_state.WIDE_RECIPE if name == 'wide' else two_state.NARROW_RECIPE, seed=0, starts=1,
+        refuse=False).model for name, box in boxes.items()}
+    models['true linearisation'] = Linearisation(system.drift_jacobian(np.zeros(2))).learn(
+        describe(system), two_state.samples(two_state.WIDE, 0, episodes=5))
+    return {(name, kind): _two_state_course(model, fallback=kind == 'guarded')
+            for name, model in models.items() for kind in ('narrow', 'guarded')}
+
+
+def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
+    """Regulate the two-state example from (5, 5) to the origin, sampled 20 times a second."""
+    controller = Controller(model, control.Tuning.for_model(
+        model, state_weight=np.ones(2), input_weight=np.ones(1),
+        limits=control.InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
+        safe=np.zeros(1), transfer_time=1.0,
+        **({'recovery_time': 1.0} if fallback else loop.NO_FALLBACK)))
+
+    # put into the controller's state, since it refuses set-points outside its data
+    def to_origin(before: control.Loop) -> control.Loop:
+        origin = control.Setpoint(np.zeros(2), np.zeros(2))
+        return replace(before, state=replace(before.state, setpoint=origin))
+
+    return loop.run_loop(
+        controller, two_state.SYSTEM, two_state.START, _HOLDING, _HORIZON, [at(0.0, to_origin)],
+        period=_SAMPLE, stop=lambda x, *_: bool(np.max(np.abs(x)) > _ESCAPED))
+
+
+def judge_two_state(course: Simulation) -> Metrics:
+    """Say what became of the example; `left_after` are s until another law than the learned."""
+    below = [level != 'sdre' for level in course.levels]
+    return {'largest_x2': float(np.max(np.abs(course.states[:, 1]))),
+            'final_distance': float(np.linalg.norm(course.states[-1])),
+            'escaped': bool(np.max(np.abs(course.states)) > _ESCAPED),
+            'left_after': float(course.times[below.index(True)]) if any(below) else None}

@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The report of the robustness study, in Markdown, with its pictures."""
+
+from collections.abc import Iterable, Mapping
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import Simulation
+from koopman_ros.reasons import level_words
+from koopman_ros.reports import drawing, DRAWN_RANGE, legend, Picture, table, write_page
+from studies.paper import two_state
+from studies.robustness import disturbances, narrow
+from studies.robustness.loop import BANDWIDTH, shipped_model, START
+from studies.robustness.stability import End, hottest_cooled
+from studies.robustness.study import BANDWIDTHS, COOLANT_WEIGHTS, Found, TEMPERATURES
+
+_MARKS: dict[End, dict[str, Any]] = {
+    End.LEARNED: {'marker': 'o', 'color': 'tab:green'},
+    End.LINEAR: {'marker': 's', 'color': 'tab:blue'},
+    End.SAFE: {'marker': 'D', 'color': 'tab:orange'},
+    End.ELSEWHERE: {'marker': 'P', 'color': 'tab:purple'},
+    End.RAN_AWAY: {'marker': 'x', 'color': 'tab:red'}}
+_LEVELS = {'sdre': _MARKS[End.LEARNED], 'linear': _MARKS[End.LINEAR],
+           'hold': _MARKS[End.ELSEWHERE], 'safe': _MARKS[End.SAFE]}
+_PATHS: dict[str, dict[str, Any]] = {
+    'narrow': {'color': 'tab:red', 'linestyle': '--', 'label': 'narrow lift, no fallback'},
+    'guarded': {'color': 'tab:green', 'label': 'narrow lift, fallback'},
+    'wide': {'color': '0.5', 'linestyle': ':', 'label': 'lift of wide data, fallback'}}
+
+
+def write_report(found: Found, folder: Path) -> None:
+    """Write tables and pictures."""
+    figures = found.figures
+    ends = found.grids[True], found.grids[False], found.two_state_grid
+    write_page(folder / 'report.md', 'How far the loop can be pushed', [
+        '## Margins, smallest over the trained range', _margin_table(found),
+        f'In simulation at {START:.1f} K with the default parameters, 3 % below and above:',
+        _table(figures['verified']),
+        '## Disturbances: deviation of the temperature; of steps, overshoot',
+        _table(figures['disturbances']),
+        '## Noise of 0.1 K at 1 Hz, and the time after UA −20 % and a step by −10 K',
+        _table(figures['noise']),
+        '## Region of attraction',
+        'Under the coldest coolant the reactor heats up by itself above '
+        f'{hottest_cooled():.2f} K. The hottest start that comes back:',
+        _table(figures['attraction']['hottest_start']),
+        table(('of all starts', 'with fallback', 'without', 'two-state reactor'), [
+            (end.value, *(sum(one is end for one in grid.values()) for grid in ends))
+            for end in End]),
+        'Back from the safe coolant:', _table(figures['attraction']['from_the_safe_coolant']),
+        f'## Narrow data: within ±{narrow.HALF_WIDTH:g} K of the steady state',
+        'The lift of narrow data alone (narrow) and with fallback (guarded), and the shipped one '
+        '(wide):', _table(figures['narrow']['reactor']),
+        'The shipped lift after UA −40 %:', _table(figures['narrow']['heat_transfer_-40%']),
+        'The two-state example, by the box of its data:', _table(figures['narrow']['two_state']),
+        '## Figures', *(str(draw(found, folder / f'{name}.png')) for name, draw in (
+            ('margins', _draw_margins), ('noise', _draw_noise),
+            ('attraction', _draw_attraction), ('narrow', _draw_narrow)))],
+        ('torch', 'numpy', 'scipy'))
+
+
+def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a table of figures, under their names."""
+    return table(('', *map(_heading, next(iter(rows.values())))),
+                 [(row, *map(_cell, figures.values())) for row, figures in rows.items()])
+
+
+def _heading(name: str) -> str:
+    """Return the name of a figure with its unit in brackets."""
+    words, unit = name.replace('ladder', 'fallback').split('_'), ''
+    if 'to' in words:  # the time until a deviation is no larger
+        words, unit = [word for word in words if word != 'seconds'], ' [s]'
+    elif words[-1] == 'kelvin':
+        words, unit = words[:-1], ' [K]'
+    return ' '.join(words).replace('kelvin', 'K') + unit
+
+
+def _cell(value: float | bool | None) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: 'never', True: 'yes', False: 'no'}[value]
+    return '0' if abs(value) < 5e-4 else f'{value:.5g}'
+
+
+def _margin_table(found: Found) -> str:
+    rows = []
+    for weight, bandwidth in product(COOLANT_WEIGHTS, BANDWIDTHS):
+        at = [found.margins[weight, bandwidth, kelvin] for kelvin in TEMPERATURES]
+        rows.append((f'{weight:g}', f'{bandwidth:g}', *(
+            f'{min(getattr(m, name) for m in at):.{digits}f}' for name, digits in (
+                ('gain', 0), ('phase', 0), ('delay', 1), ('distance', 2)))))
+    return table(('coolant_weight', 'observer [1/min]', 'gain', 'phase [°]', 'delay [s]',
+                  'least distance from −1'), rows)
+
+
+def _draw_margins(found: Found, path: Path) -> Picture:
+    with drawing(path, 1, 3, size=(11.0, 3.8), sharex=True) as (_, axes):
+        for axis, name, unit in zip(axes, ('gain', 'phase', 'delay'), ('', ' [°]', ' [s]'),
+                                    strict=True):
+            for number, bandwidth in enumerate(BANDWIDTHS):
+                for weight, style in zip(COOLANT_WEIGHTS, ('-', '--'), strict=True):
+                    values = [getattr(found.margins[weight, bandwidth, kelvin], name)
+                              for kelvin in TEMPERATURES]
+                    axis.plot(TEMPERATURES, values, style, color=f'C{number}',
+                              label=f'{bandwidth:g} 1/min' if weight == 1.0 else None)
+            axis.set(xlabel='set-point [K]', ylabel=f'{name} margin{unit}')
+        for axis in (axes[0], axes[2]):
+            axis.set_yscale('log')
+        axes[1].legend(title='observer', fontsize=8)
+        axes[0].set_title('solid: coolant_weight 1,  dashed: 0.1', fontsize=9)
+    usual = [found.margins[1.0, BANDWIDTH, kelvin] for kelvin in TEMPERATURES]
+    return Picture(path.name, (
+        'Margins of the true reactor under the sampled controller, opened at the coolant. With '
+        f'the default parameters the gain may rise {min(m.gain for m in usual):.0f}-fold, and '
+        f'{min(m.delay for m in usual):.0f} s of dead time may be added, anywhere in the range.'))
+
+
+def _draw_noise(found: Found, path: Path) -> Picture:
+    with drawing(path, 1, 2, size=(11.0, 3.8)) as (_, (left, right)):
+        bandwidths = list(found.noise)
+        for name, label in (('coolant_kelvin', 'coolant'),
+                            ('coolant_change_kelvin', 'coolant, change in a second'),
+                            ('temperature_kelvin', 'true temperature')):
+            left.plot(bandwidths, [m[name] for m in found.noise.values()], 'o-', label=label)
+        left.axhline(disturbances.NOISE, color='0.5', linestyle=':', label='measurement')
+        left.axvline(BANDWIDTH, color='0.7', linestyle='--')
+        left.set(xlabel='observer_bandwidth [1/min]', ylabel='standard deviation [K]',
+                 yscale='log')
+        left.legend(fontsize=8)
+        back = {f'{bandwidth:g}': m for bandwidth, m in found.noise.items()
+                if m['fouled_to_0.2_kelvin'] is not None}
+        noise = [m['coolant_kelvin'] for m in back.values()]
+        for tolerance in ('0.2', '0.001'):
+            right.plot(noise, [m[f'fouled_to_{tolerance}_kelvin'] for m in back.values()], 'o-',
+                       label=f'to {tolerance} K')
+        for words, m in back.items():
+            right.annotate(words, (m['coolant_kelvin'], m['fouled_to_0.2_kelvin']),
+                           textcoords='offset points', xytext=(2, -12), fontsize=8)
+        right.set(xlabel='standard deviation of the coolant [K]', ylabel='time after UA −20 % [s]',
+                  xscale='log', title='numbers: observer_bandwidth [1/min]')
+        right.legend(fontsize=8)
+    usual = found.noise[BANDWIDTH]
+    return Picture(path.name, (
+        f'Noise of 0.1 K at 1 Hz against speed. The default of {BANDWIDTH:g} 1/min moves the '
+        f'coolant by {usual["coolant_kelvin"]:.2g} K and is within 0.2 K '
+        f'{usual["fouled_to_0.2_kelvin"]:.0f} s after the jacket lost a fifth of UA.'))
+
+
+def _scatter(axis: Axes, ends: Iterable[tuple[float, float, End]]) -> None:
+    """Mark how the loop ends from some starts, over the trained range."""
+    points = list(ends)
+    for end, mark in _MARKS.items():
+        chosen = [(x, y) for x, y, found in points if found is end]
+        if chosen:
+            x, y = np.array(chosen).T
+            axis.scatter(x, y, s=18, label=end.value, **mark)
+    states = shipped_model().states
+    axis.axhspan(states.lower[0], states.upper[0], **DRAWN_RANGE)
+
+
+def _draw_attraction(found: Found, path: Path) -> Picture:
+    with drawing(path, 1, 4, size=(11.0, 4.6)) as (figure, axes):
+        for axis, fallback in zip(axes, (True, False), strict=False):
+            _scatter(axis, ((goal, start, end)
+                            for (start, goal), end in found.grids[fallback].items()))
+            axis.set(title=f'{"with" if fallback else "without"} fallback', xlabel='set-point [K]',
+                     ylabel='temperature at the start [K]')
+        for name, label, style in (
+                ('physics_kelvin', 'no coolant saves it above', 'k-'),
+                ('ladder_kelvin', 'the loop with fallback', 'o--'),
+                ('no_ladder_kelvin', 'the learned law alone', 'x:')):
+            axes[2].plot(list(found.boundaries), [m[name] for m in found.boundaries.values()],
+                         style, label=label)
+        axes[2].set(title='hottest start that comes back', xlabel='coolant at the start [K]',
+                    ylabel='[K]')
+        axes[2].legend(fontsize=7)
+        _scatter(axes[3], ((c, kelvin, end) for (kelvin, c), end in found.two_state_grid.items()))
+        axes[3].set(title='two-state reactor', xlabel='C$_A$ at the start [mol/L]')
+        legend(figure, (axes[0], axes[1], axes[3]), 5)
+    return Picture(path.name, (
+        'Where the loop comes back from (grey: the trained range). Above '
+        f'{hottest_cooled():.1f} K no coolant within its limits cools the reactor; '
+        'with the coolant at 300 K, which falls by 1 K a second at most, none saves it from above '
+        f'{found.boundaries[300.0]["physics_kelvin"]:.1f} K.'))
+
+
+def _path(axis: Axes, course: Simulation, kind: str, x: Array, y: Array, **style: Any) -> None:
+    """Draw a course; where it has fallbacks, mark where another level takes over."""
+    axis.plot(x, y, **{**_PATHS[kind], **style})
+    for number, level in enumerate(course.levels if kind == 'guarded' else ()):
+        if number == 0 or level != course.levels[number - 1]:
+            axis.plot(x[number], y[number], markersize=6, linestyle='none', markeredgecolor='k',
+                      **_LEVELS[level])
+
+
+def _draw_narrow(found: Found, path: Path) -> Picture:
+    with drawing(path, 1, 4, size=(11.0, 4.6)) as (figure, axes):
+        *others, last = axes
+        for axis, trial in zip(others, narrow.TRIALS, strict=True):
+            for kind in _PATHS:
+                course = found.reactor[trial.name, kind]
+                _path(axis, course, kind, course.times / 60.0, course.states[:, 0])
+            axis.axhspan(START - narrow.HALF_WIDTH, START + narrow.HALF_WIDTH, **DRAWN_RANGE)
+            axis.set(title=trial.name, xlabel='time [min]', ylim=(295.0, 350.0))
+        axes[0].set_ylabel('temperature [K]')
+        for kind in _PATHS:
+            key = ('wide', 'guarded') if kind == 'wide' else (narrow.NARROWEST, kind)
+            _path(last, found.two_state[key], kind, *found.two_state[key].states.T, label=None)
+        last.plot(*found.two_state['true linearisation', 'narrow'].states.T, color='k',
+                  linewidth=0.8, label='true linearisation')
+        last.legend(fontsize=8, loc='lower right')
+        box = two_state.NARROW[narrow.NARROWEST]
+        last.fill_between((box.lower[0], box.upper[0]), box.lower[1], box.upper[1], **DRAWN_RANGE)
+        last.set(title=f'two-state example, {narrow.NARROWEST}', xlabel='x$_1$', ylabel='x$_2$',
+                 ylim=(-40.0, 40.0))
+        for axis in axes:
+            axis.title.set_fontsize(9)
+        for level, mark in _LEVELS.items():
+            axes[0].plot([], [], linestyle='none', markeredgecolor='k',
+                         label=f'takes {level_words(level)}', **mark)
+        legend(figure, axes[:1], 4)
+    return Picture(path.name, (
+        'Lifts of narrow data (grey: the data) asked for more than they know. On the reactor the '
+        'fallback keeps the loop from running away, and leads it back from the cold; the '
+        'two-state example is unstable by itself and no constant input saves it.'))

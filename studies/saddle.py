@@ -1,0 +1,274 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The two-state reactor held at its saddle from its temperature alone, and what that costs.
+
+Run it as ``python -m studies.saddle`` (needs the `train` and `mpc` requirements).
+"""
+
+import argparse
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+import itertools
+import sys
+import time
+
+import numpy as np
+
+from koopman_ros.control import (
+    at,
+    Controller,
+    Initialisation,
+    InputLimits,
+    Loop,
+    SetpointRequest,
+    simulate,
+    Tuning,
+)
+from koopman_ros.control.simulate import Change, Simulation
+from koopman_ros.jobs.backends import Backend, backend_of
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
+from koopman_ros.plants.library.reactor import ReactorParameters
+from koopman_ros.reports import table
+from koopman_ros.signals import Outputs
+from studies.general.systems import SADDLE
+from studies.options import add_scheduler, add_seeds, over, read
+from studies.true_model import TrueModel
+from studies.unstable import LIMITS, MARGIN, REACHED, SADDLE_TEMPERATURE, steady, SYSTEM
+
+TEMPERATURE = Outputs(('temperature',), ('K',), np.array([[0.0, 1.0]]))
+NOISE = 0.1  # K
+WANDER = 0.1  # K of coolant in a second
+FIRST_GUESS = np.array([0.2, 2.0])  # mol/L and K
+# With the coolant from 278 to 305 K a fouled jacket that cools too well cannot be made up for.
+WIDE = InputLimits(np.array([253.15]), np.array([373.15]), np.ones(1))
+QUICK = replace(WIDE, rate=np.full(1, 2.0))
+LAWS = {'mpc': ('mpc', 'sdre'), 'sdre': ('sdre',)}
+PERIODS = (1.0, 5.0, 15.0, 30.0)  # s
+# Set-points in K by the time in s from which they hold; then the jacket fouls.
+COURSE, FOULED, END = {0.0: 350.0, 60.0: 355.0, 500.0: 345.0}, 1000.0, 1600.0
+UA = ReactorParameters().heat_transfer_coefficient
+FOULING = {'heat_transfer_coefficient': 0.85 * UA}
+DISTURBANCES: dict[str, tuple[dict[str, float], InputLimits]] = {
+    'UA -15 %': (FOULING, WIDE),
+    'UA +15 %': ({'heat_transfer_coefficient': 1.15 * UA}, WIDE),
+    'C_Af -10 %': ({'feed_concentration': 0.9}, WIDE),
+    'C_Af +10 %': ({'feed_concentration': 1.1}, WIDE),
+    'T_f -5 K': ({'feed_temperature': 345.0}, WIDE),
+    'T_f +5 K': ({'feed_temperature': 355.0}, WIDE),
+    'UA -20 %': ({'heat_transfer_coefficient': 0.8 * UA}, WIDE),
+    'UA -20 %, coolant at 2 K/s': ({'heat_transfer_coefficient': 0.8 * UA}, QUICK)}
+STARTS, ARRIVAL = 40, 600.0  # s
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a run was worth."""
+
+    #: integrals of (T - T_ref)^2 + (T_c - T_c,ref)^2 in K^2 min: until the jacket fouls, and after
+    costs: tuple[float, float]
+    #: largest mean distances of the temperature from a set-point in the end, in K, likewise
+    offsets: tuple[float, float]
+    concentration: float  #: root mean square error of its estimate until then, in mol/L
+
+    @property
+    def lost(self) -> tuple[bool, bool]:
+        """Whether a set-point was not reached, until the jacket fouls and after."""
+        return self.offsets[0] > REACHED, self.offsets[1] > REACHED
+
+
+def truth() -> TrueModel:
+    """Return the reactor's own equations in the range of the lifts."""
+    return TrueModel.of(SYSTEM, np.array([0.1, 325.0]), np.array([0.95, 375.0]),
+                        LIMITS.lower, LIMITS.upper)
+
+
+def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = LIMITS, *,
+               informed: bool = False) -> Controller:
+    """
+    Return a controller of the temperature.
+
+    :param laws: best first.
+    :param informed: whether it measures the concentration, too.
+    """
+    n_y = 2 if informed else 1
+    return Controller(model, Tuning.for_model(
+        model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
+        controlled=('temperature',), transfer_time=0.0,
+        estimator='extended_kalman_filter', noise=np.array([1e-4, NOISE])[-n_y:],
+        wander=np.full(1, WANDER * np.sqrt(60.0)), initial_error=FIRST_GUESS,
+        levels=laws, validity_margin=MARGIN, linear_margin=MARGIN),
+        None if informed else TEMPERATURE)
+
+
+def becomes(system: ControlAffineSystem) -> Change:
+    """Let the plant go on as another one."""
+    def change(loop: Loop) -> Loop:
+        plant = loop.plant
+        return replace(loop, plant=Process(system, plant.time_ns, plant.x, plant.u))
+
+    return change
+
+
+def reactor(constants: dict[str, float]) -> ControlAffineSystem:
+    """Return the reactor with other constants."""
+    return two_state_reactor(ReactorParameters(**constants), nominal_state=SADDLE)
+
+
+def run(one: Controller, seed: int, period: float = 1.0) -> Figures:
+    """Take the temperature along its course, and let the jacket foul."""
+    x0, u0 = steady(COURSE[0.0])
+    fouled, informed = reactor(FOULING), one.measured.all_states
+    loop = simulate(one, Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(FOULED, becomes(fouled)),
+        *(at(when, SetpointRequest(0, np.array([value]))) for when, value in COURSE.items())],
+        duration=END, period=period, noise=np.array([0.0, NOISE])[0 if informed else 1:],
+        seed=seed)
+    T, t, u = loop.states[:, 1], loop.times, loop.commands[:, 0]
+    costs, offsets = [0.0, 0.0], [0.0, 0.0]
+    for begin, end in itertools.pairwise([*COURSE, FOULED, END]):
+        part, after = (t >= begin) & (t < end), begin == FOULED
+        value = COURSE.get(begin, COURSE[max(COURSE)])
+        u_ref = steady_state(fouled if after else SYSTEM, {'temperature': value})[1][0]
+        costs[after] += float(np.sum((T[part] - value) ** 2 + (u[part] - u_ref) ** 2)) * (
+            period / 60.0)
+        if begin:
+            # what is left after two thirds of the time
+            late = part & (t >= end - (end - begin) / 3.0)
+            left = abs(float(np.mean(T[late])) - value) if late.any() else np.inf
+            offsets[after] = max(offsets[after], left)
+    known = np.array([np.nan if report.estimate is None else report.estimate.state[0]
+                      for report in loop.reports])
+    error = (known - loop.states[:, 0])[(t > 60.0) & (t < FOULED)]
+    return Figures((costs[0], costs[1]), (offsets[0], offsets[1]),
+                   float(np.sqrt(np.mean(error ** 2))))
+
+
+def _gave_up(loop: Simulation) -> bool:
+    return bool(loop.failure) or bool({'hold', 'safe'} & set(loop.levels))
+
+
+def disturbed(one: Controller, constants: dict[str, float], seed: int) -> tuple[float, float]:
+    """Change the reactor at 350 K; return the largest and the last mean distance, in K."""
+    x0, u0 = steady(SADDLE_TEMPERATURE)
+    loop = simulate(one, Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)),
+        at(0.0, SetpointRequest(0, np.array([SADDLE_TEMPERATURE]))),
+        at(60.0, becomes(reactor(constants)))],
+        duration=ARRIVAL, noise=np.array([0.0, NOISE])[-len(one.measured.names):], seed=seed)
+    away = loop.states[:, 1] - SADDLE_TEMPERATURE
+    return float(np.max(np.abs(away))), abs(float(np.mean(away[-200:])))
+
+
+def lost(one: Controller, seed: int) -> set[int]:
+    """Return which of the starts about the steady states do not come to 350 K."""
+    rng, found = np.random.default_rng(seed), set()
+    informed = one.measured.all_states
+    for start in range(STARTS):
+        begin = float(rng.uniform(335.0, 370.0))
+        x0 = np.array([steady(begin)[0][0] + rng.uniform(-0.2, 0.2), begin])
+        loop = simulate(one, Process(SYSTEM, 0, x0, steady(begin)[1]), [
+            at(0.0, Initialisation(steady(begin)[1])),
+            at(0.0, SetpointRequest(0, np.array([SADDLE_TEMPERATURE])))],
+            duration=ARRIVAL, noise=np.array([0.0, NOISE])[0 if informed else 1:], seed=start)
+        if _gave_up(loop) or not abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED:
+            found.add(start)
+    return found
+
+
+def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS,
+                backend: Backend | None = None) -> list[list[str]]:
+    """Return a row for each law and time between samples, over all models."""
+    periods = tuple(periods)
+
+    def three(key: tuple[str, float, int]) -> list[Figures]:
+        name, period, seed = key
+        return [run(controller(model, LAWS[name], informed=informed), seed, period)
+                for model, informed in ((models[seed], False), (truth(), False), (truth(), True))]
+
+    found_by = over(backend, three, itertools.product(LAWS, periods, range(len(models))))
+    rows = []
+    for name in LAWS:
+        for period in periods:
+            runs = [found_by[name, period, seed] for seed in range(len(models))]
+            own = [found[0] for found in runs]
+            over_true, over_full = ([found[0].costs[0] / found[k].costs[0] for found in runs]
+                                    for k in (1, 2))
+            fouled = [found[0].costs[1] / found[1].costs[1] for found in runs
+                      if not (found[0].lost[1] or found[1].lost[1])]
+            rows.append([
+                name, f'{period:g}', f'{np.mean(over_true):.4f}', f'{np.max(over_true):.4f}',
+                f'{np.mean(over_full):.4f}', f'{np.max(over_full):.4f}',
+                f'{max(found.offsets[0] for found in own):.3f}',
+                f'{max(found.concentration for found in own):.4f}',
+                f'{sum(found.lost[0] for found in own)} of {len(own)}',
+                f'{np.mean(fouled):.4f}' if fouled else '',
+                *(f'{sum(found[k].lost[1] for found in runs)} of {len(runs)}' for k in (0, 2))])
+            print(*rows[-1], sep='\t', file=sys.stderr, flush=True)
+    return rows
+
+
+def disturbance_rows(models: list[LiftedModel], backend: Backend | None = None
+                     ) -> list[list[str]]:
+    """Return a row for each disturbance: of the lifts, and of the true model fully informed."""
+    def all_of(name: str) -> tuple[list[tuple[float, float]], tuple[float, float]]:
+        constants, limits = DISTURBANCES[name]
+        return [disturbed(controller(model, LAWS['mpc'], limits), constants, seed)
+                for seed, model in enumerate(models)], disturbed(
+            controller(truth(), LAWS['mpc'], limits, informed=True), constants, 0)
+
+    rows = []
+    for name, (own, best) in over(backend, all_of, DISTURBANCES).items():
+        rows.append([name, f'{max(peak for peak, _ in own):.2f}',
+                     f'{max(offset for _, offset in own):.3f}', f'{best[0]:.2f}',
+                     f'{best[1]:.3f}'])
+        print(*rows[-1], sep='\t', file=sys.stderr, flush=True)
+    return rows
+
+
+def main(args: list[str] | None = None) -> int:
+    """Learn from several seeds and print the tables."""
+    parser = argparse.ArgumentParser(
+        prog='python -m studies.saddle',
+        description='Hold the two-state reactor at its saddle from its temperature alone.')
+    add_seeds(parser)
+    add_scheduler(parser, '')
+    options = read(parser, args)
+    with backend_of(options.scheduler) as backend:
+        _report(options.seeds, backend)
+    return 0
+
+
+def _report(seeds: int, backend: Backend) -> None:
+    # torch is needed to learn alone
+    from studies.unstable import learn
+
+    begin = time.monotonic()
+    models = list(over(backend, learn, range(seeds)).values())
+    print(f'learned {seeds} lifts, {time.monotonic() - begin:.0f} s', file=sys.stderr, flush=True)
+    head = ['law', 'sample [s]', 'cost / true model', 'worst', 'cost / full information', 'worst',
+            'offset [K]', 'error of C_A [mol/L]', 'lost', 'fouling: cost / true model', 'lost',
+            'lost with full information']
+    print(f'{seeds} lifts, 0.1 K of noise, 350 -> 355 -> 345 K, then UA -15 %; coolant '
+          f'from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at 1 K/s\n')
+    print(table(head, course_rows(models, backend=backend), range(1, len(head))))
+    print('\nDisturbances at 350 K, `mpc`, coolant from 253 to 373 K at 1 K/s: largest distance, '
+          'and mean in the end, in K\n')
+    head = ['disturbance', 'from T alone', 'end', 'true model, full information', 'end']
+    print(table(head, disturbance_rows(models, backend), range(1, len(head))))
+
+    print(f'\nOf {STARTS} starts from 335 to 370 K, C_A up to 0.2 mol/L from steady, do not come '
+          'to 350 K (coolant from 253 to 373 K):\n')
+
+    def losses(law: str) -> list[int]:
+        return [len(lost(controller(model, LAWS[law], WIDE, informed=informed), 0))
+                for model, informed in ((models[0], False), (truth(), True))]
+
+    rows = [[name, *found] for name, found in over(backend, losses, LAWS).items()]
+    print(table(['law', 'from T alone', 'true model, full information'], rows, (1, 2)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The two-state reactor about its saddle, learned under a pre-feedback: figures, closed loops.
+
+Run it as ``python -m studies.unstable`` (needs the `train` and `bench` requirements).
+"""
+
+import argparse
+from dataclasses import replace
+import sys
+import time
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import (
+    at,
+    Controller,
+    Initialisation,
+    InputLimits,
+    SetpointRequest,
+    simulate,
+    Tuning,
+)
+from koopman_ros.control.simulate import Simulation
+from koopman_ros.jobs.backends import Backend, backend_of, Tell
+from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
+from koopman_ros.learning.starts import Recipe
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Samples
+from koopman_ros.plants import (
+    box_episodes,
+    describe,
+    Process,
+    RandomStepDesign,
+    steady_state,
+    two_state_reactor,
+)
+from koopman_ros.plants.optimum import cost_along, Course, optimum, Task
+from koopman_ros.reports import table
+from studies.equations import EQUATIONS
+from studies.general.systems import SADDLE
+from studies.least import least_course
+from studies.options import add_scheduler, add_seeds, read
+
+# the range about the saddle, in mol/L and K, holds another steady state with its coolant of 300 K,
+# an unstable focus
+SYSTEM = two_state_reactor(nominal_state=SADDLE)
+DESIGN = RandomStepDesign(
+    input_lower=278.15, input_upper=305.15, state_lower=[0.1, 325.0], state_upper=[0.95, 375.0],
+    hold_time=(0.02, 0.05), sample_period=0.02, max_redraws=20, rtol=1e-9)
+EPISODES, DURATION = 400, 0.1  # in min
+# A feedback under which the range has one steady state makes as many free coordinates as states
+# enough.
+LIFT = Growth(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
+              pre_feedback=0.05, other_whitenings=(10.0,))
+RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift((16,)), 'free lift': LIFT}
+STARTS = 2
+UNLIMITED = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
+# With these the laws are compared, also from where they may lose the plant.
+LIMITS = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
+FRESH_EPISODES = 200  # that a lift is judged on
+LIMITED_SAMPLES, LIMITED_STARTS, MARGIN = 400, 40, 0.3
+SADDLE_TEMPERATURE, REACHED = 350.0, 1.0  # K
+# From one temperature to another, in K.
+STEPS = ((350.0, 345.0), (350.0, 355.0), (340.0, 350.0), (365.0, 350.0))
+PERIOD, SAMPLES = 1.0, 240  # of a loop, in s
+
+
+def samples(seed: int, episodes: int) -> Samples:
+    """Simulate episodes from whose ends the coolant can bring the reactor back to the saddle."""
+    return box_episodes(SYSTEM, DESIGN, episodes, DURATION, seed, keep_recoverable=True)
+
+
+def learn(seed: int) -> LiftedModel:
+    """Learn the free lift, and units for its drift."""
+    return compare(describe(SYSTEM), samples(seed, EPISODES), RECIPES, degrees=(2,),
+                   choose='free lift', seed=seed, starts=STARTS, loops=0).model
+
+
+def cost_ratio(model: LiftedModel, begin: float, end: float) -> float:
+    """
+    Step the temperature, in K, by the law of a model on the true reactor, sampled each second.
+
+    :return: the integral of (T - T_ref)^2 + (T_c - T_c,ref)^2 over the least a held input can.
+    """
+    x0, (x_ref, u_ref) = steady(begin)[0], steady(end)
+    weights, one = np.array([0.0, 1.0]), np.ones(1)
+    task = Task(SYSTEM, x0, x_ref, u_ref, weights, one, PERIOD / SYSTEM.seconds_per_time_unit,
+                SAMPLES)
+    loop = run(model, ('sdre',), UNLIMITED, 0.1, begin, end, x0, SAMPLES)
+    if set(loop.levels) != {'sdre'}:
+        return float('inf')
+    return cost_along(task, loop.states, loop.commands[:-1]) / optimum(task).cost
+
+
+def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: float,
+        begin: float, end: float, x0: Array, samples: int) -> Simulation:
+    """
+    Run laws on the true reactor, sampled each second, from a state to a temperature.
+
+    :param laws: best first.
+    :param margin: half widths of the training box by which they may leave that.
+    :param begin: in K; its coolant is on before.
+    :param x0: (2,) in mol/L and K.
+    """
+    settings = Tuning.for_model(
+        model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
+        controlled=('temperature',), transfer_time=0.0,
+        levels=laws, validity_margin=margin, linear_margin=margin)
+    before = steady(begin)[1]
+    return simulate(
+        Controller(model, settings), Process(SYSTEM, 0, x0, before),
+        [at(0.0, Initialisation(before)), at(0.0, SetpointRequest(0, steady(end)[0][1:]))],
+        period=PERIOD, duration=PERIOD * samples)
+
+
+def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
+    """
+    Return what laws cost in each step under limits, and from how many starts they lose the plant.
+
+    The cost is in K^2 min, infinite where the set-point is not reached. Lost is what leaves their
+    margin, so that the safe input acts, or has not arrived in the end.
+    """
+    costs = []
+    for begin, end in STEPS:
+        task = _limited_task(begin, end)
+        x0 = task.x0
+        loop = run(model, laws, LIMITS, MARGIN, begin, end, x0, LIMITED_SAMPLES)
+        costs.append(cost_along(task, loop.states, loop.commands[:-1])
+                     if abs(loop.states[-1, 1] - end) < REACHED else float('inf'))
+    rng, lost = np.random.default_rng(0), 0
+    for _ in range(LIMITED_STARTS):
+        begin = float(rng.uniform(335.0, 370.0))
+        x0 = np.array([steady(begin)[0][0] + rng.uniform(-0.2, 0.2), begin])
+        loop = run(model, laws, LIMITS, MARGIN, begin, SADDLE_TEMPERATURE, x0, LIMITED_SAMPLES)
+        lost += 'safe' in loop.levels or not (
+            abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED)
+    return [laws[0], *(f'{cost:.2f}' for cost in costs), f'{lost} of {LIMITED_STARTS}']
+
+
+def least_costs(model: LiftedModel) -> list[str]:
+    """Return the least cost of each step under limits, found from what the law `mpc` did."""
+    costs = []
+    for begin, end in STEPS:
+        task = _limited_task(begin, end)
+        loop = run(model, ('mpc', 'sdre'), LIMITS, MARGIN, begin, end, task.x0, LIMITED_SAMPLES)
+        costs.append(least_course(
+            task, EQUATIONS['two_state'], LIMITS.lower, LIMITS.upper, step=PERIOD * LIMITS.rate,
+            guess=Course(loop.states, loop.commands[:LIMITED_SAMPLES], 0.0)).cost)
+    return ['the least', *(f'{cost:.2f}' for cost in costs), '']
+
+
+def _limited_task(begin: float, end: float) -> Task:
+    return Task(SYSTEM, steady(begin)[0], *steady(end), np.array([0.0, 1.0]), np.ones(1),
+                PERIOD / SYSTEM.seconds_per_time_unit, LIMITED_SAMPLES)
+
+
+def steady(temperature: float) -> tuple[Array, Array]:
+    """Return the state and the coolant that hold a temperature, in K."""
+    return steady_state(SYSTEM, {'temperature': temperature})
+
+
+def main(args: list[str] | None = None) -> int:
+    """Learn from several seeds and print a row for each, judged on fresh samples."""
+    parser = argparse.ArgumentParser(
+        prog='python -m studies.unstable',
+        description='Learn the two-state reactor about its saddle under a pre-feedback.')
+    add_seeds(parser)
+    add_scheduler(parser, '')
+    options = read(parser, args)
+    with backend_of(options.scheduler) as backend:
+        return _report(options.seeds, backend)
+
+
+def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
+    """Learn from a seed; return the lift and its row, or why there is none."""
+    begin = time.process_time()
+    try:
+        model, fresh = learn(seed), samples(1000 + seed, FRESH_EPISODES)
+    except NoUsefulLift as refusal:
+        return f'seed {seed}: {refusal}'
+    seconds = time.process_time() - begin
+    found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)
+                       for one in (model, replace(model, readout=None)))
+    return model, [str(seed), f'{found.rw:.0e}', f'{found.rx:.0e}', f'{found.cond:.1f}',
+                   f'{by_rates.rx:.0e}', *(f'{cost_ratio(model, *step):.4f}' for step in STEPS),
+                   f'{seconds:.0f}']
+
+
+def _report(seeds: int, backend: Backend) -> int:
+    """Print the tables; return the exit status, 1 where a seed gave no lift."""
+    rows, refused, first = [], False, None
+    for _, outcome in backend.run(judged, {f'seed {seed}': seed for seed in range(seeds)}):
+        if isinstance(outcome, str):
+            print(outcome, file=sys.stderr)
+            refused = True
+            continue
+        model, row = outcome
+        first = first or model
+        rows.append(row)
+        print(*row, sep='\t', file=sys.stderr, flush=True)
+    steps = [f'{begin:.0f} to {end:.0f} K' for begin, end in STEPS]
+    head = ['seed', 'rw', 'rx', 'cond', 'rx by the rates of z', *steps, 's']
+    print(table(head, rows, range(len(head))))
+    if first is not None:
+        print(f'\nThe first of them, coolant from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at '
+              f'{LIMITS.rate[0]:g} K/s: cost in K^2 min, and starts that were lost\n')
+        head = ['law', *steps, 'lost']
+        print(table(head, [least_costs(first), *(
+            limited(first, laws) for laws in (('mpc', 'sdre'), ('sdre',)))], range(1, len(head))))
+    return int(refused)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The shipped models: what they promise, recomputed on data that no training has seen."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from koopman_ros.control import (
+    at,
+    Controller,
+    InputLimits,
+    SetpointRequest,
+    simulate,
+    Tuning,
+)
+from koopman_ros.learning import fit, roll_out
+from koopman_ros.lifting import load
+from koopman_ros.plants import (
+    box_episodes,
+    Process,
+    random_steps,
+    RandomStepDesign,
+    steady_state,
+)
+from koopman_ros.plants.optimum import cost_along, linear_law, optimum, Task
+from koopman_ros.resources import model_path
+from studies import saddle
+from studies.paper import reactor
+from studies.paper.reactor import SETPOINT, SYSTEM, training_samples
+from studies.shipped_models import (
+    library_system,
+    LIFTS,
+    main,
+    SADDLE,
+    SEED,
+    train_lift,
+    train_lifts,
+)
+
+SAMPLE_PERIOD = 0.25
+# What is known to be reachable on this plant, by n_z: of rw, and of the error of a prediction in
+# K, be it over an episode or at rest, where a wrong feed-forward leaves an offset.
+PROMISED_FIT = {3: 1e-6, 4: 1e-7}
+PROMISED_KELVIN = {3: 0.005, 4: 0.002}
+
+
+# by seed
+drawn = cache(training_samples)
+
+
+def shipped(name):
+    return load(model_path(f'reactor_{name}'))
+
+
+@pytest.fixture(scope='module')
+def episodes():
+    """Drive the reactor through 15 minutes of random coolant steps within the models' box."""
+    model = shipped('nz3')
+    design = RandomStepDesign(
+        input_lower=model.inputs.lower, input_upper=model.inputs.upper,
+        state_lower=model.states.lower, state_upper=model.states.upper,
+        hold_time=(0.5, 5.0), sample_period=SAMPLE_PERIOD)
+    return [random_steps(SYSTEM, design, 15.0, seed) for seed in (7001, 7002, 7003, 7004)]
+
+
+def roll_out_error(model, episodes):
+    """Return the root mean square of the prediction error over all episodes, in K."""
+    squares = [np.square(roll_out(model, episode.x[0], episode.u, SAMPLE_PERIOD)
+                         - episode.x) for episode in episodes]
+    return float(np.sqrt(np.mean(squares)))
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_what_the_files_say(n_z):
+    model = shipped(f'nz{n_z}')
+    assert (model.n_x, model.n_u, model.n_z) == (1, 1, n_z)
+    assert model.identity
+    assert model.is_hurwitz
+    assert model.provenance.plant == SYSTEM.name
+    assert model.provenance.metrics.keys() == {'rw', 'rx', 'cond', 'rollout_rmse'}
+    assert len(model.provenance.data_digest) == 64
+    assert (model.states.names, model.states.units) == (SYSTEM.state_names, SYSTEM.state_units)
+    assert (model.inputs.names, model.inputs.units) == (SYSTEM.input_names, SYSTEM.input_units)
+    assert model.time_unit == SYSTEM.time_unit
+    np.testing.assert_array_equal(model.lift(np.zeros(1)), np.zeros(n_z))
+    np.testing.assert_allclose(model.states.center, SYSTEM.nominal_state, rtol=1e-12)
+    np.testing.assert_allclose(model.inputs.center, SYSTEM.nominal_input, rtol=1e-12)
+    np.testing.assert_allclose(
+        model.B * model.states.scale / model.inputs.scale, SYSTEM.B, rtol=1e-12)
+
+
+@pytest.mark.parametrize('name', ['nz3', 'nz4', 'linear'])
+def test_the_box_covers_the_range_of_operation(name):
+    model = shipped(name)
+    assert model.states.lower[0] < 306.0
+    assert model.states.upper[0] > 326.0
+    assert model.states.violation(np.array([314.475443])) == 0.0
+    # set-points of the whole range have a coolant in the training box, up to its warm end
+    assert model.inputs.lower[0] < 283.0
+    assert model.inputs.upper[0] > 300.5
+
+
+def assert_promise(model, episodes):
+    """
+    Hold a lift to all that is promised of it without a controller.
+
+    On fresh samples; to the drift of the true plant at every temperature of its range, where rw
+    and rx, squares of errors relative to the motion, promise on average, which lets the drift err
+    by their root times the largest rate; and over whole episodes.
+    """
+    promised, fresh = PROMISED_FIT[model.n_z], drawn(7001)
+    figures = fit(model, fresh.x, fresh.dxdt, fresh.u)
+    assert max(figures.rw, figures.rx) <= promised
+    assert figures.cond < 10.0
+    # the file promises what fresh data confirm
+    assert model.provenance.metrics['rw'] <= promised
+    assert figures.rw < 10.0 * model.provenance.metrics['rw']
+    x = np.linspace(model.states.lower, model.states.upper, 400)
+    # a lift's drift is what the plant does under the input that its deviations are counted from
+    true = SYSTEM.derivative(x, np.broadcast_to(model.inputs.center, x.shape))
+    learned = model.drift(model.states.to_deviation(x)) * model.states.scale
+    assert np.max(np.abs(learned - true)) <= np.sqrt(promised) * np.max(np.abs(true))
+    assert roll_out_error(model, episodes) <= PROMISED_KELVIN[model.n_z]
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_shipped_lifts_keep_their_promise_on_fresh_data(n_z, episodes):
+    assert_promise(shipped(f'nz{n_z}'), episodes)
+
+
+def test_the_linear_model_is_the_linearisation_and_predicts_far_worse(episodes):
+    model = shipped('linear')
+    np.testing.assert_allclose(
+        model.A, SYSTEM.drift_jacobian(SYSTEM.nominal_state), rtol=1e-12)
+    assert model.provenance.seed is None
+    assert roll_out_error(model, episodes) > 1.0
+
+
+@pytest.fixture(scope='module')
+def retrained():
+    # the best of three is shipped; one is to keep the promise, too, which is of the true plant
+    return train_lifts(starts=1, loops=0)
+
+
+# ten seconds of computing, several times as long beside other programs
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_a_retrained_lift_keeps_what_the_shipped_one_promises(n_z, retrained, episodes):
+    """
+    Judge by the true plant alone: the bits of a training are those of its processor.
+
+    Another one rounds differently, in the simulated data already, and a thousand steps of the
+    minimisation carry that along directions that hardly change the model: with data that differ
+    by 1e-13 rw comes out several times as large or as small.
+    """
+    model, shipped_one = retrained[n_z], shipped(f'nz{n_z}')
+    assert model.is_hurwitz
+    assert_promise(model, episodes)
+    assert model.provenance.metrics['rollout_rmse'] <= PROMISED_KELVIN[n_z]
+    # of a step of 10 K, without an observer
+    assert reactor.feed_forward_offset(model) <= PROMISED_KELVIN[n_z]
+    loop = reactor.close_loop(model)
+    assert loop.failure == ''
+    assert abs(float(loop.states[-1, 0]) - SETPOINT) <= PROMISED_KELVIN[n_z]
+    # it is learned from what the shipped one was learned from
+    for mine, theirs in ((model.states, shipped_one.states), (model.inputs, shipped_one.inputs)):
+        for name in ('center', 'scale', 'lower', 'upper'):
+            np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), rtol=1e-9)
+    assert model.provenance.data_digest == drawn(SEED).digest()
+
+
+# The lifts of the other plants: a task each, for the learned law on the true plant.
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What the lift of a plant promises, from its nominal state unless another is given."""
+
+    fit: float  #: rw and rx on fresh data
+    wanted: dict[str, float]  #: the set-point of the controlled states
+    weights: tuple[float, ...]  #: of squared state errors
+    #: lowest and highest value of each input
+    limits: tuple[tuple[float, ...], tuple[float, ...]]
+    period: float  #: in s
+    samples: int  #: so many of them
+    ratio: float  #: of the cost to the least there is
+    linear_ratio: float  #: what the linear law's is above
+    #: distance from the set-point at the end, of the controlled states
+    offset: float
+    x0: tuple[float, ...] | None = None  #: start
+
+
+PROMISES = {
+    'two_state': Promise(1e-6, {'temperature': 314.475443}, (0.0, 1.0), ((278.15,), (305.15,)),
+                         1.0, 600, 1.002, 3.0, 0.005),
+    # another conversion at another temperature takes another feed
+    'fed_reactor': Promise(1e-7, {'concentration': 0.92, 'temperature': 318.0}, (100.0, 1.0),
+                           ((60.0, 278.15), (150.0, 305.15)), 1.0, 300, 1.002, 20.0, 0.005),
+    # x1 decays as it likes
+    'two_state_example': Promise(1e-8, {'x1': 0.0, 'x2': 0.0}, (1.0, 1.0), ((-50.0,), (50.0,)),
+                                 0.05, 1600, 1.0009, 4.5, 0.0017, (5.0, 5.0)),
+    'two_tanks': Promise(1e-6, {'level_1': 0.12, 'level_2': 0.20}, (1e3, 1e3),
+                         ((0.0, 0.0), (12.0, 12.0)), 0.5, 240, 1.002, 1.2, 1e-4),
+    'quadruple_tank': Promise(1e-5, {'level_1': 0.20, 'level_2': 0.16}, (1e3, 1e3, 0.0, 0.0),
+                              ((0.0, 0.0), (10.0, 10.0)), 1.0, 600, 1.002, 1.2, 1e-4),
+    'pendulum': Promise(1e-4, {'angle': 0.0, 'rate': 0.0}, (1.0, 0.1), ((-15.0,), (15.0,)),
+                        0.02, 300, 1.01, 1.03, 1e-6, (np.pi / 3.0, 0.0))}
+
+
+@cache
+def known(name):
+    """Return fresh data of a plant, its task, the least cost of it and that of the linear law."""
+    promise, system = PROMISES[name], library_system(name)
+    x_ref, u_ref = steady_state(system, promise.wanted)
+    task = Task(system, system.nominal_state if promise.x0 is None else np.array(promise.x0),
+                x_ref, u_ref, np.array(promise.weights), np.ones(system.n_u),
+                promise.period / system.seconds_per_time_unit, promise.samples)
+    lift = LIFTS[name]
+    fresh = box_episodes(system, lift.design, lift.episodes // 6, lift.duration, 7001)
+    return fresh, task, optimum(task).cost, linear_law(task).cost
+
+
+def keeps(name, model):
+    """Hold a lift to what is promised of it, on fresh data and in closed loop."""
+    promise, (fresh, task, least, linear) = PROMISES[name], known(name)
+    system, x_ref = task.system, task.x_ref
+    figures = fit(model, fresh.x, fresh.dxdt, fresh.u)
+    assert max(figures.rw, figures.rx) <= promise.fit
+    assert figures.cond < 10.0
+
+    lower, upper = map(np.array, promise.limits)
+    # the learned law alone, within the margin of its data that is the default
+    settings = Tuning.for_model(
+        model, state_weight=task.Q, input_weight=task.R,
+        limits=InputLimits(lower, upper, np.full(system.n_u, np.inf)),
+        levels=('sdre',), transfer_time=30.0)
+    loop = simulate(
+        Controller(model, settings), Process(system, 0, task.x0, system.nominal_input),
+        [at(0.0, SetpointRequest(0, x_ref))], period=promise.period,
+        duration=promise.period * promise.samples)
+    assert set(loop.levels) == {'sdre'}
+    controlled = [system.state_names.index(state) for state in promise.wanted]
+    assert np.max(np.abs(loop.states[-1] - x_ref)[controlled]) <= promise.offset
+    cost = cost_along(task, loop.states, loop.commands[:-1])
+    # the limits do not matter, so that nothing is below the optimum
+    assert 1.0 - 1e-6 < cost / least < promise.ratio
+    assert linear > promise.linear_ratio * least
+    return cost
+
+
+@pytest.mark.parametrize('name', LIFTS)
+def test_shipped_lifts_of_the_library_keep_their_promise(name):
+    system, model, lift = library_system(name), load(model_path(name)), LIFTS[name]
+    assert (model.n_z, model.identity) == (lift.recipe.n_z, lift.recipe.identity)
+    assert model.provenance.plant == system.name
+    assert model.provenance.metrics['rw'] <= PROMISES[name].fit
+    for box, other in ((model.states, 'state'), (model.inputs, 'input')):
+        assert box.names == getattr(system, f'{other}_names')
+        assert box.units == getattr(system, f'{other}_units')
+        np.testing.assert_allclose(box.center, getattr(system, f'nominal_{other}'), rtol=1e-12)
+        width = np.subtract(getattr(lift.design, f'{other}_upper'),
+                            getattr(lift.design, f'{other}_lower'))
+        np.testing.assert_allclose((box.upper - box.lower) / width, 1.0, rtol=0.05)
+    cost = keeps(name, model)
+    if name == 'two_state_example':
+        # of the exact lift's regulator in continuous time
+        assert cost < 1.001 * 990.1798
+
+
+def test_a_retrained_lift_of_the_library_keeps_what_the_shipped_one_promises():
+    keeps('two_state_example', train_lift('two_state_example', loops=0))
+
+
+def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone(monkeypatch):
+    monkeypatch.setattr(saddle, 'ARRIVAL', 400.0)
+    model = load(model_path(SADDLE))
+    assert (model.n_z, model.provenance.seed) == (2, 0)
+    assert max(model.provenance.metrics[figure] for figure in ('rw', 'rx')) < 1e-6
+    largest, left = saddle.disturbed(
+        saddle.controller(model, ('sdre',), saddle.WIDE), saddle.FOULING, 0)
+    # with the reactor's own equations and both states known it is 3.85 K
+    assert largest < 4.2
+    assert left < 0.05
+
+
+def test_models_that_there_are_not_are_refused(capsys):
+    with pytest.raises(SystemExit):
+        main(['teapot'])
+    assert 'no lift of teapot: choose of reactor, two_state' in capsys.readouterr().err
