@@ -133,7 +133,8 @@ class LoopViewModel:
             if kind == 'estimated' and name not in self._states:
                 deviation = found.get(('deviation', name))
                 spread = f' ± {deviation[0]:.2g}' if deviation else ''
-                estimates.append((readable(name), f'{value:.4g}{spread} {unit.replace("deg", "°")}'))
+                estimates.append(
+                    (readable(name), f'{value:.4g}{spread} {unit.replace("deg", "°")}'))
         self._estimates = tuple(estimates)
 
     def take_plan(self, names: Sequence[str], stamp: float, times: Sequence[float],
