@@ -19,14 +19,13 @@ import re
 import secrets
 import stat
 import sys
-import tempfile
 import threading
 import unicodedata
 
 from argon2 import extract_parameters, PasswordHasher
 from argon2.exceptions import Argon2Error, InvalidHashError
 
-from koopman_ros.panel.sanitize import read_bounded
+from koopman_ros.panel.files import read_bounded, replacing
 
 MAX_FILE = 256 * 1024  # bytes
 MIN_PASSWORD = 8  # characters
@@ -147,19 +146,12 @@ def write_user(path: str | os.PathLike[str], name: str, role: Role, secret: str)
     kept = [line for line in lines if normalised(line.partition(':')[0].strip()) != name]
     content = '\n'.join([*kept, line]) + '\n'
     _parsed(content, path)
-    descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix='.tmp')
-    try:
-        with os.fdopen(descriptor, 'w', encoding='utf-8') as file:
-            file.write(content)
-            file.flush()
-            os.fsync(descriptor)
-            if owner is not None:
-                # an administrator may change the file of the account that runs the panel
-                with contextlib.suppress(PermissionError):
-                    os.fchown(descriptor, owner.st_uid, owner.st_gid)
-        os.replace(temporary, target)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with replacing(target) as file:
+        file.write(content)
+        if owner is not None:
+            # an administrator may change the file of the account that runs the panel
+            with contextlib.suppress(PermissionError):
+                os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
 
 
 def _read(path: str | os.PathLike[str]) -> str:

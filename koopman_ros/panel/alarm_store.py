@@ -10,7 +10,6 @@ import math
 import os
 from pathlib import Path
 import re
-import tempfile
 from typing import Any
 
 from koopman_ros.panel.alarms import (
@@ -18,13 +17,11 @@ from koopman_ros.panel.alarms import (
     Alarms,
     AlarmState,
     Entry,
-    MAX_ALARMS,
-    MAX_KEY,
     MAX_TEXT,
     MAX_WHO,
     Priority,
 )
-from koopman_ros.panel.sanitize import read_bounded, sanitize_text
+from koopman_ros.panel.files import read_bounded, replacing, sanitize_text
 
 VERSION = 1
 _MAX_BYTES = 32 * 2 ** 20
@@ -89,21 +86,14 @@ class AlarmStore:
         content = {'version': VERSION, 'alarms': [asdict(one) for one in self._alarms.all],
                    'journal': [asdict(one) for one in self._alarms.journal(-math.inf)[::-1]]}
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(
-            dir=self._path.parent, prefix=self._path.name, suffix='.part')
-        try:
-            with os.fdopen(descriptor, 'w', encoding='utf-8') as file:
-                file.write(json.dumps(content, indent=2, allow_nan=False, default=_name) + '\n')
-                file.flush()
-                os.fsync(descriptor)
-                saved = _identity(descriptor)
+        with replacing(self._path) as file:
+            file.write(json.dumps(content, indent=2, allow_nan=False, default=_name) + '\n')
+            file.flush()
+            saved = _identity(file.fileno())
             if self._path.exists() and _identity(self._path) != self._own:
                 raise FileExistsError(f'another program has written {self._path} since, and it is '
                                       'not replaced: give each panel its own alarm_file')
-            os.replace(temporary, self._path)
-            self._own = saved
-        finally:
-            Path(temporary).unlink(missing_ok=True)
+        self._own = saved
 
 
 def _name(value: Any) -> str:
@@ -129,13 +119,13 @@ def _parsed(text: str) -> tuple[list[Alarm], list[Entry]]:
     found = json.loads(text)
     if found.get('version') != VERSION:
         raise ValueError(f'its version is {found.get("version")!r}, must be {VERSION}')
-    return ([_alarm(**one) for one in found['alarms'][:MAX_ALARMS]],
+    return ([_alarm(**one) for one in found['alarms']],
             sorted((_entry(**one) for one in found['journal']), key=lambda entry: entry.time))
 
 
 def _alarm(key: str, text: str, priority: str, state: str, since: float,
            shelved_until: float | None, acknowledged_by: str) -> Alarm:
-    return Alarm(sanitize_text(key, MAX_KEY), sanitize_text(text, MAX_TEXT), Priority[priority],
+    return Alarm(sanitize_text(key, MAX_TEXT), sanitize_text(text, MAX_TEXT), Priority[priority],
                  AlarmState[state], _finite(since),
                  None if shelved_until is None else _finite(shelved_until),
                  sanitize_text(acknowledged_by, MAX_WHO))
@@ -144,7 +134,7 @@ def _alarm(key: str, text: str, priority: str, state: str, since: float,
 def _entry(time: float, key: str, priority: str, text: str, what: str, who: str) -> Entry:
     if what not in _EVENTS:
         raise ValueError(f'{what!r} must be one of {", ".join(_EVENTS)}')
-    return Entry(_finite(time), sanitize_text(key, MAX_KEY), Priority[priority],
+    return Entry(_finite(time), sanitize_text(key, MAX_TEXT), Priority[priority],
                  sanitize_text(text, MAX_TEXT), what, sanitize_text(who, MAX_WHO))
 
 

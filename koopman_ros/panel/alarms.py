@@ -7,19 +7,15 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
-import hashlib
 import math
 import threading
 
-from koopman_ros.panel.sanitize import sanitize_text
+from koopman_ros.panel.files import sanitize_text
 
 SHORTEST_SHELVING = 60.0  # s
 LONGEST_SHELVING = 8 * 3600.0  # s
-MAX_ALARMS = 500
-MAX_KEY = 200  # characters
-MAX_TEXT = 500
+MAX_TEXT = 500  # characters
 MAX_WHO = 64
-OVERFLOW = 'alarms'  #: key of the alarm about too many alarms
 _FOUND_AGAIN = 10.0  # s after a restart until the conditions are reported again
 
 
@@ -118,8 +114,7 @@ class Alarms:
 
     An alarm is raised after its condition was active for `delay_on`, and returns after the
     condition was inactive for `delay_off`. Changes of the priority have the same delays; a higher
-    priority needs a new acknowledgement. More than :data:`MAX_ALARMS` drop the least urgent, and
-    raise the alarm :data:`OVERFLOW`. All times are wall times in s.
+    priority needs a new acknowledgement. All times are wall times in s.
 
     >>> alarms = Alarms(delay_on=1.0)
     >>> alarms.report('level', True, Priority.HIGH, 'level above 2 m', 100.0)
@@ -148,22 +143,21 @@ class Alarms:
         """
         Report whether a condition is active, at any rate.
 
-        :param key: of the condition; the end of a long one is replaced by a digest.
+        :param key: of the condition.
         :param now: if it jumps back, delays and shelving keep their remaining time.
         """
-        key, text = _short(key), sanitize_text(text, MAX_TEXT)
         with self._lock:
             self._advance(now)
-            if key == OVERFLOW:
-                return
             record = self._records.get(key)
             if record is None:
-                if not active or not self._make_room(priority, now):
+                if not active:
                     return
                 record = self._records[key] = _Record(key, priority)
             if active:
-                record.text = text
-            self._take(record, priority.value if active else 0, now)
+                record.text = sanitize_text(text, MAX_TEXT)
+            record.report(priority.value if active else 0, now)
+            self._settle(record, now)
+            self._tidy(record)
 
     def advance(self, now: float) -> None:
         """Let delays and shelving run out; to be called a few times per second."""
@@ -268,7 +262,6 @@ class Alarms:
     def _act(self, key: str, what: str, now: float, act: Callable[[_Record], str],
              shelved: bool = False) -> str:
         """Act on an active alarm, or also on a shelved one."""
-        key = _short(key)
         with self._lock:
             self._advance(now)
             record = self._records.get(key)
@@ -294,16 +287,8 @@ class Alarms:
                 ended, record.shelved_until = record.shelved_until, None
                 self._note(ended, record, 'unshelved')
             self._tidy(record)
-        overflow = self._records.get(OVERFLOW)
-        if overflow is not None and len(self._records) <= MAX_ALARMS:
-            self._take(overflow, 0, now)
         while self._journal and self._journal[0].time < now - self._day:
             self._journal.popleft()
-
-    def _take(self, record: _Record, rank: int, now: float) -> None:
-        record.report(rank, now)
-        self._settle(record, now)
-        self._tidy(record)
 
     def _due(self, record: _Record) -> float:
         """Return when the shown rank follows the reported one."""
@@ -341,31 +326,7 @@ class Alarms:
         if record.idle:
             self._records.pop(record.key, None)
 
-    def _make_room(self, priority: Priority, now: float) -> bool:
-        """Return whether there is room for a new alarm, or make room."""
-        if len(self._records) - (OVERFLOW in self._records) < MAX_ALARMS:
-            return True
-        overflow = self._records.setdefault(OVERFLOW, _Record(OVERFLOW, Priority.HIGH))
-        overflow.text = f'more than {MAX_ALARMS} alarms at once: less urgent ones are hidden'
-        self._take(overflow, Priority.HIGH.value, now)
-        least = min((record for record in self._records.values() if record is not overflow),
-                    key=lambda record: (max(record.shown, record.reported), record.since))
-        if max(least.shown, least.reported) >= priority.value:
-            return False
-        del self._records[least.key]
-        self._running.discard(least.key)
-        return True
-
     def _note(self, time: float, record: _Record, what: str, who: str = '') -> None:
         self.noted += 1
         self._journal.append(Entry(time, record.key, record.priority, record.text, what,
                                    sanitize_text(who, MAX_WHO)))
-
-
-def _short(key: str) -> str:
-    """Return a printable key of bounded length; a key that it returned is unchanged."""
-    shown = sanitize_text(key, MAX_KEY)
-    if shown == key:
-        return key
-    digest = hashlib.blake2s(key.encode(errors='surrogatepass'), digest_size=8).hexdigest()
-    return f'{sanitize_text(key, MAX_KEY - 1 - len(digest))}#{digest}'

@@ -22,7 +22,7 @@ from koopman_ros.panel.training_report import (
     read_comparison,
     read_report,
     report_base,
-    report_state,
+    report_time,
 )
 from koopman_ros.parameters.wire import CONTROLLER_EVENTS, Wiring
 
@@ -135,8 +135,8 @@ class LearningWatch:
             base = report_base(name)
             if base is None:
                 continue
-            found = (base, dict(trained), report_state(base))
+            written = report_time(base)
             # a trainer that has not trained yet has no report
-            if found != last and (trained or any(any(one) for one in found[2])):
+            if last != (base, trained, written) and (trained or written):
                 self.learning.report = read_report(base, trained)
-            last = found
+            last = (base, trained, written)

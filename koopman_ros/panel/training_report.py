@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import contextlib
 from dataclasses import dataclass, field
 import json
 import os
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from koopman_ros.panel.sanitize import read_bounded, sanitize_text
+from koopman_ros.panel.files import read_bounded, sanitize_text
 from koopman_ros.units import unit_label
 
 MAX_TEXT = 1_000_000  # bytes of a page or of figures
@@ -86,16 +87,14 @@ def report_base(model_file: str) -> Path | None:
     return None
 
 
-def report_state(base: Path) -> tuple[tuple[int, int], ...]:
-    """Return a value that changes with the files of a report."""
-    found = []
+def report_time(base: Path) -> int:
+    """Return the time of writing of a report in ns, 0 for none."""
+    # the figures are written before text and picture
+    times = [0]
     for ending in ('.json', '.md', '.png'):
-        try:
-            about = os.stat(f'{base}{ending}')
-            found.append((about.st_mtime_ns, about.st_size))
-        except OSError:
-            found.append((0, 0))
-    return tuple(found)
+        with contextlib.suppress(OSError):
+            times.append(os.stat(f'{base}{ending}').st_mtime_ns)
+    return max(times)
 
 
 def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -> Report:

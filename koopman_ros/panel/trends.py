@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array
-from koopman_ros.panel.sanitize import sanitize_text
+from koopman_ros.panel.files import sanitize_text
 
 MAX_BUCKETS = 10_000
 MAX_MARKS = 2_000  #: of each kind: many of one kind leave the others

@@ -13,9 +13,9 @@ from typing import Any
 
 from nicegui import ui
 
+from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout
 from koopman_ros.panel.requests import Answer
-from koopman_ros.panel.sanitize import sanitize_text
 from koopman_ros.panel.snapshot import CONTROLLER, Snapshot, TRAINER
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.table import as_yaml, UNBOUNDED

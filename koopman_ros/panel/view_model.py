@@ -15,6 +15,7 @@ from typing import Any
 
 from koopman_ros.panel.alarms import Alarms, Priority
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
+from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
@@ -38,7 +39,8 @@ from koopman_ros.units import conversion, display_unit, printed
 _SILENT = 3.5  # s without a status, of which there is one per second
 _PERIODS = 5.0  # usual times between two measurements without one
 _BACK = 1.0  # s; a stamp that is earlier by more restarts the time
-_MOST_FOREIGN = 64  # statuses of other nodes that are kept
+_MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
+_MAX_NAME = 200  # characters
 # So many errors within so many seconds are an alarm, however short each of them is.
 _REPEATED, _WITHIN = 5, 60.0
 _SIGNAL = re.compile(r'(?:(estimated|deviation)_)?(\w+) \[(.+)\]')
@@ -239,9 +241,12 @@ class LoopViewModel:
     def take_status(self, name: str, level: int, message: str, values: Mapping[str, str],
                     now: float, plant: str = '') -> None:
         """Take the status of a task; WARN and ERROR raise an alarm."""
-        name, role = self.task(name), self._nodes.get(name.partition(': ')[0])
-        foreign = [task for task in self._statuses if task.partition(':')[0] not in ROLES]
-        if not name or (role is None and name not in foreign and len(foreign) >= _MOST_FOREIGN):
+        role = self._nodes.get(name.partition(': ')[0])
+        name = sanitize_text(self.task(name), _MAX_NAME)
+        # other nodes cannot crowd out the loop's
+        alike = [task for task in self._statuses
+                 if (task.partition(':')[0] in ROLES) is (role is not None)]
+        if not name or (name not in alike and len(alike) >= _MAX_TASKS):
             return
         if role in (CONTROLLER, TRAINER):
             self._last[role] = now

@@ -14,9 +14,9 @@ import zlib
 import pytest
 
 from koopman_ros.lifting import load
+from koopman_ros.panel.files import read_bounded
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, status_card, training_ranges
-from koopman_ros.panel.sanitize import read_bounded
 from koopman_ros.panel.training_report import (
     Learning,
     read_comparison,
