@@ -26,10 +26,10 @@ from koopman_ros.bags import BagReadError
 from koopman_ros.lifting import load
 from koopman_ros.panel.alarm_store import AlarmStore
 from koopman_ros.panel.faceplates import Range
+from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, training_ranges
 from koopman_ros.panel.requests import Action, action_text, Answer, MANUAL, Requests, SETPOINT
-from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.snapshot import (
     CONTROLLER,
     PLANT,
