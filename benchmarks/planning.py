@@ -10,6 +10,7 @@ import tempfile
 from time import perf_counter_ns, thread_time_ns
 from typing import Any, TypeAlias
 
+from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 import numpy as np
 
 from benchmarks.process import Tell
@@ -23,7 +24,6 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.laws.base import Target
-from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 from koopman_ros.control.simulate import after_a_second
 from koopman_ros.estimation import Estimate
 from koopman_ros.plants import Process
@@ -165,7 +165,7 @@ def _sides(case: Case, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
     def own(y: Array, target: Target) -> Array:
         nonlocal memory
         result = law.compute(Estimate(model.states.to_deviation(y), np.zeros(model.n_x)), target,
-                             case.limits, memory, case.period)
+                             memory, case.period, None)
         memory = result.memory
         assert result.u is not None
         return result.u

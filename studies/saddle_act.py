@@ -285,13 +285,15 @@ def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) 
     alone = n_x == 1
     n_y = n_x if informed else 1
     # not when the harness starts, which needs neither
-    from koopman_ros.control.laws.pi import PIParameters
     from koopman_ros.control.laws.receding_horizon import MPCParameters
+
+    from koopman_ros.control.laws.pi import PIParameters
 
     return Controller(model, Tuning.for_model(
         model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,
         controlled=('temperature',), transfer_time=0.0,
-        plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(PI_GAIN, PI_TIME)},
+        plugins={'mpc': MPCParameters(upper=upper),
+                 'pi': PIParameters(np.full(n_x, PI_GAIN), np.full(n_x, PI_TIME))},
         noise=np.array([1e-4, NOISE])[-n_y:],
         wander=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
         **({'setpoint_ramp': np.array([RAMP])} if alone else

@@ -7,9 +7,10 @@ from typing import Any
 
 from koopman_ros.demo.loop import Scenario
 from koopman_ros.lifting import load
-from koopman_ros.parameters.controller import InputParameters, table_of
+from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.resources import model_path
+from koopman_ros.units import to_celsius
 
 SYSTEM, MODEL = 'reactor', 'reactor_nz4'
 TEMPERATURE = 'temperature'
@@ -22,9 +23,10 @@ MANUAL_COOLANT_SETPOINT = 'manual_coolant_setpoint'
 PREDICTED_TEMPERATURE = 'predicted_temperature'
 
 
-def coolant_parameters() -> InputParameters:
-    """Return the default parameters of the coolant."""
-    return table_of(load(model_path(MODEL))).snapshot({}).inputs[COOLANT_TEMPERATURE]
+def coolant_limits() -> tuple[float, float]:
+    """Return the default range of the coolant in °C."""
+    limits = table_of(load(model_path(MODEL))).snapshot({}).tuning.limits
+    return to_celsius(float(limits.lower[0])), to_celsius(float(limits.upper[0]))
 
 
 def constant(name: str) -> float:

@@ -140,7 +140,7 @@ def _operate(operator: Operator, second_bag: Path, new_model: Path) -> list[tupl
 def _draw(path: Path, history: Run, phases: list[tuple[str, float]], setpoint: float,
           models: dict[str, tuple[LiftedModel, str]]) -> None:
     """Draw temperature, coolant and error over plant time, phase by phase."""
-    minutes, limits = history.seconds / 60.0, reactor.coolant_parameters()
+    minutes = history.seconds / 60.0
     temperature = history.measured[reactor.TEMPERATURE]
     smooth = np.convolve(temperature - setpoint, np.ones(60) / 60.0, mode='valid')
     with drawing(path, 3, 1, size=(11.0, 9.0), sharex=True,
@@ -157,7 +157,7 @@ def _draw(path: Path, history: Run, phases: list[tuple[str, float]], setpoint: f
         upper.set(ylabel='reactor temperature [°C]', title='The plant drifts, is recorded, and '
                   'its controller learns it anew (disturbance observer off)')
         upper.legend(loc='lower right', ncols=2, fontsize=8)
-        draw_limits(middle, (limits.min, limits.max), 'coolant limits')
+        draw_limits(middle, reactor.coolant_limits(), 'coolant limits')
         middle.step(history.command_seconds / 60.0,
                     history.commanded[reactor.COOLANT_TEMPERATURE] - ZERO_CELSIUS, where='post',
                     color='tab:blue', linewidth=1.0, label='commanded')

@@ -24,7 +24,7 @@ from koopman_ros.demo.loop import run_loop, running_loop, Scenario
 from koopman_ros.demo.results import read_run, Run
 from koopman_ros.lifting import load
 from koopman_ros.lifting.coordinates import Coordinates
-from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import preset_wiring
@@ -33,6 +33,7 @@ from koopman_ros.plants import steady_state
 from koopman_ros.plants.optimum import cost_along, Course, linear_law, optimum, Task
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
 from koopman_ros.resources import model_path
+from koopman_ros.tuning import Tuning
 from koopman_ros.units import conversion, display_unit, shown, unit_label
 
 PLANT = 'reactor'
@@ -93,14 +94,13 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
         run_loop(scenario, bag, logs, table.show)
 
     model = load(model_path(str(preset(name, 'controller')['model'])))
-    tuning = table_of(model, {'system': name}).snapshot({})
+    tuning = table_of(model, {'system': name}).snapshot({}).tuning
     run = read_run(wiring, bag)
     first = round(plan.step_time / plant.sample_period)
     states, inputs = (np.stack(list(of.values()), axis=1)[first:]
                       for of in (run.measured, run.commanded))
     task = Task(system, states[0], *steady_state(system, setpoints),
-                np.array([tuning.states[signal].weight for signal in signals.states]),
-                np.array([tuning.inputs[signal].weight for signal in signals.inputs]),
+                tuning.state_weight, tuning.input_weight,
                 plant.sample_period / system.seconds_per_time_unit, len(states) - 1)
     courses = {'linear law': linear_law(task), 'optimum': optimum(task)}
     linear, best = courses.values()
@@ -131,7 +131,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
 
 
 def _draw(path: Path, title: str, run: Run, courses: Mapping[str, Course], signals: Signals,
-          scenario: Scenario, box: Coordinates, tuning: ControllerParameters) -> None:
+          scenario: Scenario, box: Coordinates, tuning: Tuning) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
     count = len(signals.states) + len(signals.inputs)
     learned: dict[str, Any] = {
@@ -163,13 +163,14 @@ def _draw(path: Path, title: str, run: Run, courses: Mapping[str, Course], signa
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
         for j, ((signal, unit), panel) in enumerate(zip(
                 signals.inputs.items(), panels[len(signals.states):], strict=True)):
-            limits = tuning.inputs[signal]
-            draw_limits(panel, (limits.min, limits.max), 'limits')
+            low, high = (float(shown(float(end[j]), unit))
+                         for end in (tuning.limits.lower, tuning.limits.upper))
+            draw_limits(panel, (low, high), 'limits')
             panel.step(run.command_seconds, shown(run.commanded[signal], unit), where='post',
                        **learned)
             for name, course in courses.items():
-                values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=limits.max),
-                                 limits.min, limits.max)
+                values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=high),
+                                 low, high)
                 panel.step(times(values), values, where='post', label=name, **_STYLES[name])
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
         panels[0].set_title(title, fontsize=9)

@@ -199,6 +199,7 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     interval = 0.0 if math.isinf(now.state.interval) else now.state.interval
     overdue = max(_PATIENCE, 3.0 * interval)
     # manual commands are also sent between two measurements
+    tuning = now.controller.tuning
     unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.recovery
                   and now.timing.silence > max(1.0, 2.0 * interval))
     if report.measurement.arrival is Arrival.REPEATED or (
@@ -235,13 +236,13 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
         yield SETPOINT, short
     if not report.measurement.follows:
         yield ACTUATORS, (
-            f'the {now.input} does not follow its command within '
-            f'{_listed(now, now.controller.tuning.tolerance)}: the observer goes by what is measured; check the '
-            'actuator and its limits')
+            f'the {now.input} does not follow its command within {_listed(now, tuning.tolerance)}: '
+            'the observer uses the measured input; check the actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
-            f'the disturbance estimate is at its bound of {_listed(now, now.controller.tuning.max_disturbance)} '
-            f'of {now.input}: the plant is far from its model; retrain')
+            'the disturbance estimate is at its bound of '
+            f'{_listed(now, tuning.max_disturbance)} of {now.input}: the plant is far from its '
+            'model; retrain')
 
 
 def _out_of_reach(now: Situation, target: TargetReport) -> str:

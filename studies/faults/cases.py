@@ -266,7 +266,7 @@ _OPERATORS = (
       for name, does, node, usual in (
           ('actuator-saturated', 'coolant does not get below', 'plant', -20.0),
           ('coolant-limited', 'controller may not command less than', 'controller',
-           reactor.coolant_parameters().min))),
+           reactor.coolant_limits()[0]))),
     _constant('noise', 'noise of 0.1 K, for good',
               partial(changed_for_good, parameters={'temperature.noise': 0.1}), band=0.5,
               offset=0.5),

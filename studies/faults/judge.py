@@ -14,8 +14,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from koopman_ros.replay.run import replay_records
 from koopman_ros.replay.records import parse, RecordError
+from koopman_ros.replay.run import replay_records
 from studies.faults.case import Case, Trace
 
 LONGEST_GAP = 3.0  # samples between two commands, for which a larger step is allowed
@@ -82,11 +82,11 @@ def out_of_range(trace: Trace) -> Iterator[str]:
     if not highest < on.highest:
         yield f'it reached {highest:g} {unit}, and is lost from {on.highest:g} {unit} on'
     for command in trace.commands:
-        for value, (name, tuned) in zip(
-                command.values, on.parameters.inputs.items(), strict=True):
-            if not tuned.min <= value <= tuned.max:
+        for value, name in zip(command.values, on.inputs, strict=True):
+            low, high = on.range(name)
+            if not low <= value <= high:
                 yield (f'the command {name} = {value:g} {input_unit} at {command.seconds:.0f} s '
-                       f'is not within {tuned.min:g} to {tuned.max:g} {input_unit}')
+                       f'is not within {low:g} to {high:g} {input_unit}')
                 return
 
 

@@ -68,7 +68,7 @@ class Plant:
     @cached_property
     def wiring(self) -> Wiring:
         """Where its signals are."""
-        signals = signals_of(load(model_path(self._model)), self.parameters.controlled,
+        signals = signals_of(load(model_path(self._model)), self.parameters.tuning.controlled,
                              self.parameters.states)
         return Wiring(signals, self.parameters.states, self.parameters.inputs)
 
@@ -110,7 +110,11 @@ class Plant:
     @cached_property
     def rate(self) -> float:
         """Fastest change of a command, 1/s."""
-        return max(item.rate_limit for item in self.parameters.inputs.values()) or math.inf
+        return max(self.default(f'{name}.rate_limit') for name in self.inputs) or math.inf
+
+    def range(self, name: str) -> tuple[float, float]:
+        """Return the smallest and the largest command of an input, as its topic has them."""
+        return self.default(f'{name}.min'), self.default(f'{name}.max')
 
     def default(self, parameter: str) -> Any:
         """Return what a parameter of its controllers is when nobody has changed it."""

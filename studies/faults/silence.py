@@ -49,7 +49,7 @@ def without_news(loop: FaultHarness, make: Maker) -> None:
     """Let measurements come without a new stamp: the inputs are held, then go to safe values."""
     altered(loop, make, 150.0)
     _expect_error(loop)
-    safe = [tuned.safe for tuned in loop.on.parameters.inputs.values()]
+    safe = [loop.on.default(f'{name}.safe') for name in loop.on.inputs]
     last = [command.values for command in loop.trace.commands
             if command.seconds <= loop.trace.end][-1]
     loop.expect(max(abs(a - b) for a, b in zip(last, safe, strict=True)) < 1e-6,
@@ -122,7 +122,7 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
 def activated_again(loop: FaultHarness) -> None:
     """Deactivate and activate a controller that commands the lowest inputs by hand."""
     loop.ros.set_bool('controller/set_automatic', False)
-    lowest = tuple(tuned.min for tuned in loop.on.parameters.inputs.values())
+    lowest = tuple(loop.on.range(name)[0] for name in loop.on.inputs)
     loop.by_hand(*lowest)
     loop.wait(lambda: loop.trace.commands[-1].values == lowest, 'the inputs are not commanded')
     with loop.fault():

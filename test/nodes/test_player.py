@@ -108,6 +108,10 @@ def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) ->
             ('reliable', durability)}
 
 
+LATCHED_QOS = DEFAULT_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)
+BEST_EFFORT_QOS = DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT)
+
+
 def write_bag(path: Path, entries: Sequence[tuple[str, Temperature, float]],
               offered: Sequence[Qos] = ()) -> Path:
     """Write temperatures: (topic, message, seconds of receipt)."""

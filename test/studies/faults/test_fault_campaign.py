@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 import pytest
+from studies.faults.cases.processes import second_controller
 
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import parse
@@ -17,7 +18,6 @@ from studies.faults import interceptor
 from studies.faults.__main__ import main
 from studies.faults.case import Case, Command, Status, Trace
 from studies.faults.cases import CASES
-from studies.faults.cases.processes import second_controller
 from studies.faults.endurance import growth, run_endurance
 from studies.faults.harness import run
 from studies.faults.interceptor import Packet
