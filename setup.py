@@ -56,15 +56,19 @@ setup(
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'daqp', 'distributed', 'do-mpc==5.1.2',
-                  'nicegui>=3', 'numba', 'playwright', 'psutil', 'pysindy==2.1.0'],
+        'bench': ['argon2-cffi', 'casadi==3.8.2', 'control', 'daqp', 'distributed',
+                  'do-mpc==5.1.2', 'itsdangerous', 'limits', 'nicegui>=3', 'numba', 'playwright',
+                  'psutil', 'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
+            'argon2-cffi',
             'colcon-common-extensions',
             'control',
             'daqp',
             'distributed',
             'hypothesis',
+            'itsdangerous',
+            'limits',
             'mypy',
             'nicegui>=3',
             'numba',

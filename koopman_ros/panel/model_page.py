@@ -1,190 +1,171 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of the acting model, of recording, experiments and training."""
+"""Page of the active model, and of recording, experiments and training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-import hashlib
+from collections.abc import Mapping
+from functools import partial
 import math
-import time
+from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.frame import attribute, clock, div, Frame, say, show_if, words
-from koopman_ros.panel.learning import Comparison, Report
-from koopman_ros.panel.plant import (
+from koopman_ros.panel.layout import AnswerLine, box, card, label, PageLayout, show_if
+from koopman_ros.panel.model_card import status_card
+from koopman_ros.panel.report_cards import comparison_card, Figures, report_card
+from koopman_ros.panel.snapshot import (
+    CONTROL,
     CONTROLLER,
-    ERROR,
+    EXPERIMENT,
     OK,
-    ParameterView,
+    RECORDING,
     Snapshot,
     TaskStatus,
     TRAINER,
+    TRAINING,
+    WARN,
 )
+from koopman_ros.parameters.description import ParameterDescription
 
-_WORDS = {OK: '', ERROR: '■ ERROR'}
 _DONE = 'done [%]'
-_CONTROL, _TRAINING = 'controller: control', 'trainer: training'
 
 
-def model_page(frame: Frame) -> None:
+def model_page(page: PageLayout) -> None:
     """Build the page."""
-    with frame.body, div('cards loose'):
-        _acting(frame)
-        _recording(frame)
-        _experiment(frame)
-        _training(frame)
-        _report(frame)
-        _comparison(frame)
+    with page.body:
+        _model(page)
+        with box('cards loose'):
+            _recording(page)
+            _experiment(page)
+            _training(page)
+        report_card(page)
+        comparison_card(page)
 
 
-class _Figures:
-    """Figures of a status, a line for each."""
+class _Status:
+    """Message of a status, and a mark if it is a warning or an error."""
 
-    def __init__(self, choose: Callable[[str], bool] = lambda _: True) -> None:
-        self._choose = choose
-        self._head = words('div', '')
-        self._mark = words('span', '', 'abnormal hidden')
-        self._lines = div('pairs')
-        self._shown: dict[str, tuple[ui.label, ui.label]] = {}
+    def __init__(self) -> None:
+        self._message = label('div', '')
+        self._mark = label('span', '', 'abnormal hidden')
 
     def show(self, status: TaskStatus) -> None:
         """Show a status."""
-        self._head.set_text(status.message or 'nothing heard of it')
-        self._mark.set_text(_WORDS.get(status.level, '▲ WARNING'))
+        self._message.set_text(status.message or 'no status received')
+        self._mark.set_text('▲ WARNING' if status.level == WARN else '■ ERROR')
         show_if(self._mark, status.level > OK)
-        self.figures({key: value for key, value in status.values.items() if self._choose(key)})
-
-    def figures(self, found: Mapping[str, str]) -> None:
-        """Show figures alone, but for those that are none."""
-        values = {key: value for key, value in found.items() if value not in ('none', '')}
-        if set(values) != set(self._shown):
-            self._lines.clear()
-            with self._lines:
-                self._shown = {key: (words('div', key, 'quiet'), words('div', ''))
-                               for key in values}
-        for key, value in values.items():
-            self._shown[key][1].set_text(_brief(value))
 
 
-def _brief(value: str) -> str:
-    """Write a number with as many digits as are read."""
-    try:
-        return f'{float(value):.4g}' if '.' in value else value
-    except ValueError:
-        return value
-
-
-def _acting(frame: Frame) -> None:
-    with div('card', tag='section').props('aria-label=Model'):
-        words('h2', 'acting model')
-        name = words('div', '', 'value')
-        figures = _Figures(lambda key: key.startswith('model') or 'outside' in key
-                           or key in ('law', 'gain norm', 'predicted growth per sample'))
-        trained = words('div', '', 'quiet')
-        card = _Figures()
+def _model(page: PageLayout) -> None:
+    with card('active model', 'Model'):
+        name = label('div', '', 'value')
+        status, figures, origin = _Status(), Figures(columns=True), Figures(columns=True)
+        trained = label('div', '', 'quiet')
 
         async def reload() -> None:
-            said.set_text('asked …')
-            say(said, await frame.act('reload', CONTROLLER))
+            answer.set_text('sent …')
+            answer.show(await page.act('reload', CONTROLLER))
 
-        async def take_over(name: str) -> None:
-            now = frame.source.snapshot
-            if await frame.confirm(
-                    f'Let {name} act?', 'Take over', [
-                        f'It replaces {now.status(_CONTROL).values.get("model", "the model")}, '
-                        'if it predicts what was measured lately as well.',
-                        now.status(_TRAINING).message]):
-                said.set_text('asked …')
-                old = now.parameters.get(CONTROLLER, {}).get('model')
-                say(said, await (frame.act('reload', CONTROLLER) if old and old.value == name
-                                 else frame.act('parameters', CONTROLLER, {'model': name}, {
-                                     'model': old.value if old else None})))
+        async def activate(new: str) -> None:
+            now = page.source.snapshot
+            if not await page.confirm(f'Activate model {new}?', 'Activate', [
+                    f'It replaces {now.status(CONTROL).values.get("model", "the active model")} '
+                    'if it predicts the recent measurements as well.',
+                    now.status(TRAINING).message]):
+                return
+            answer.set_text('sent …')
+            old = now.parameter(CONTROLLER, 'model')
+            answer.show(await (
+                page.act('reload', CONTROLLER) if old == new else
+                page.act('parameters', CONTROLLER, {'model': new}, {'model': old})))
 
         def trained_model() -> str:
-            values = frame.source.snapshot.status(_TRAINING).values
+            values = page.source.snapshot.status(TRAINING).values
             return values.get('model_file', '') if values.get('accepted') == 'True' else ''
 
-        with div('row1'):
-            new = frame.control(ui.button('Take over the new one …', on_click=lambda: take_over(
-                trained_model())).props('outline'))
-            back = frame.control(ui.button('', on_click=lambda: take_over(
-                frame.source.snapshot.previous_model)).props('outline'))
-            frame.control(ui.button('Read the file again', on_click=reload).props('outline'))
-        said = frame.answer()
+        with box('row1'):
+            new = page.button('Activate the new model …', lambda: activate(trained_model()))
+            back = page.button('', lambda: activate(page.source.snapshot.previous_model))
+            page.button('Reload model file', reload)
+        answer = AnswerLine()
 
     def show(now: Snapshot) -> None:
-        status = now.status(_CONTROL)
-        card.figures(now.model)
+        control = now.status(CONTROL)
+        name.set_text(control.values.get('model', '–'))
+        status.show(control)
+        figures.show(status_card(control.values))
+        origin.show(now.model)
+        ranges = ', '.join(f'{face.label} {face.text(face.training[0])} to '
+                           f'{face.text(face.training[1])} {face.unit}'
+                           for face in (*now.states, *now.inputs) if face.training)
+        trained.set_text(f'Training range: {ranges or "not known"}')
         show_if(new, bool(trained_model()))
         show_if(back, bool(now.previous_model))
         back.set_text(f'Back to {now.previous_model} …')
-        name.set_text(status.values.get('model', '–'))
-        figures.show(status)
-        trained.set_text('trained: ' + (', '.join(
-            f'{face.label} {face.text(face.training[0])} to {face.text(face.training[1])} '
-            f'{face.unit}' for face in (*now.states, *now.inputs) if face.training)
-            or 'not known here'))
 
-    frame.follow(show)
+    page.follow(show)
 
 
-def _recording(frame: Frame) -> None:
-    with div('card', tag='section').props('aria-label=Recording'):
-        words('h2', 'recording')
-        figures = _Figures(lambda key: not key.startswith('messages on'))
+def _buttons(page: PageLayout, actions: Mapping[str, tuple[Any, ...]]) -> None:
+    """Add buttons for actions of the trainer, and the line of their answers."""
+    async def send(action: tuple[Any, ...]) -> None:
+        answer.show(await page.act(action[0], TRAINER, *action[1:]))
 
-        async def record(on: bool) -> None:
-            say(said, await frame.act('record', 'trainer', on))
-
-        with div('row1'):
-            frame.control(ui.button('Record', on_click=lambda: record(True)).props('outline'))
-            frame.control(ui.button('Stop', on_click=lambda: record(False)).props('outline'))
-        said = frame.answer()
-    frame.follow(lambda now: figures.show(now.status('trainer: recording')))
+    with box('row1'):
+        for text, action in actions.items():
+            page.button(text, partial(send, action))
+    answer = AnswerLine()
 
 
-def _experiment(frame: Frame) -> None:
-    with div('card', tag='section').props('aria-label=Experiment'):
-        words('h2', 'experiment')
-        figures = _Figures()
-        plan = div('')
-
-        async def start() -> None:
-            lines = bounds(frame.source.snapshot.parameters.get(TRAINER, {}))
-            if await frame.confirm(
-                    'Start the experiment?', 'Start the experiment',
-                    ['It steps the plant at random, between these bounds:', *lines]):
-                say(said, await frame.act('experiment', 'trainer', True))
-
-        async def stop() -> None:
-            say(said, await frame.act('experiment', 'trainer', False))
-
-        with div('row1'):
-            frame.control(ui.button('Start …', on_click=start).props('outline'))
-            frame.control(ui.button('End', on_click=stop).props('outline'))
-        said = frame.answer()
-    shown: list[list[str]] = [[]]
+def _recording(page: PageLayout) -> None:
+    with card('recording', 'Recording'):
+        status, figures = _Status(), Figures()
+        _buttons(page, {'Record': ('record', True), 'Stop': ('record', False)})
 
     def show(now: Snapshot) -> None:
-        figures.show(now.status('trainer: experiment'))
-        lines = bounds(now.parameters.get(TRAINER, {}))
-        if lines != shown[0]:
-            shown[0] = lines
-            plan.clear()
-            with plan:
-                for line in lines:
-                    words('div', line, 'quiet')
+        found = now.status(RECORDING)
+        status.show(found)
+        figures.show({key.capitalize(): value for key, value in found.values.items()
+                      if not key.startswith('messages on') and value not in found.message})
 
-    frame.follow(show)
+    page.follow(show)
 
 
-def bounds(parameters: Mapping[str, ParameterView]) -> list[str]:
-    """Return what an experiment does and does not do, in lines."""
+def _experiment(page: PageLayout) -> None:
+    with card('experiment', 'Experiment'):
+        status, figures = _Status(), Figures()
+        limits = label('div', '', 'lines quiet')
+
+        async def start() -> None:
+            lines = experiment_limits(page.source.snapshot.parameters.get(TRAINER, {}))
+            if await page.confirm(
+                    'Start the experiment?', 'Start the experiment',
+                    ['The experiment applies random steps within these limits:', *lines]):
+                answer.show(await page.act('experiment', TRAINER, True))
+
+        async def stop() -> None:
+            answer.show(await page.act('experiment', TRAINER, False))
+
+        with box('row1'):
+            page.button('Start …', start)
+            page.button('End', stop)
+        answer = AnswerLine()
+
+    def show(now: Snapshot) -> None:
+        found = now.status(EXPERIMENT)
+        status.show(found)
+        figures.show({key.capitalize(): value for key, value in found.values.items()})
+        limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
+
+    page.follow(show)
+
+
+def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[str]:
+    """Return the steps and limits of an experiment, in lines."""
     if 'experiment_on' not in parameters:
-        return ['the bounds are not known: the trainer is not there']
+        return ['Trainer not running: no limits available']
 
     def text(name: str) -> str:
         return f'{parameters[name].text} {parameters[name].unit}'.rstrip()
@@ -192,144 +173,36 @@ def bounds(parameters: Mapping[str, ParameterView]) -> list[str]:
     on = parameters['experiment_on'].text
     lines = [f'steps: {on}, for {text("experiment_length")}, each '
              f'{text("experiment_shortest_hold")} to {text("experiment_longest_hold")}']
-    signals = dict.fromkeys(name.rpartition('.')[0] for name in parameters
-                            if name.endswith('.experiment_min'))
-    for signal in signals:
-        what = 'steps within' if f'{signal}.safe' in parameters else 'is ended outside'
+    for name in parameters:
+        signal, _, last = name.rpartition('.')
+        if last != 'experiment_min':
+            continue
         if on == 'setpoint' and f'{signal}.setpoint_min' in parameters:
             lines.append(f'{signal}: set-points {text(f"{signal}.setpoint_min")} to '
                          f'{text(f"{signal}.setpoint_max")}')
-        lines.append(f'{signal}: {what} {text(f"{signal}.experiment_min")} to '
-                     f'{text(f"{signal}.experiment_max")}')
+        what = 'steps within' if f'{signal}.safe' in parameters else 'aborts outside'
+        lines.append(f'{signal}: {what} {text(name)} to {text(f"{signal}.experiment_max")}')
     return lines
 
 
-def _training(frame: Frame) -> None:
-    with div('card', tag='section').props('aria-label=Training'):
-        words('h2', 'training')
+def _training(page: PageLayout) -> None:
+    with card('training', 'Training'):
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
             'aria-label="Progress of the training" color=grey-8')
-        share = words('div', '', 'value')
-        figures = _Figures(lambda key: key != _DONE)
-
-        async def train() -> None:
-            say(said, await frame.act('train', 'trainer'))
-
-        async def cancel() -> None:
-            say(said, await frame.act('cancel', 'trainer'))
-
-        with div('row1'):
-            frame.control(ui.button('Train', on_click=train).props('outline'))
-            frame.control(ui.button('Cancel', on_click=cancel).props('outline'))
-        said = frame.answer()
+        share = label('div', '', 'value')
+        status, figures = _Status(), Figures()
+        _buttons(page, {'Train': ('train',), 'Cancel': ('cancel',)})
 
     def show(now: Snapshot) -> None:
-        status = now.status(_TRAINING)
+        found = now.status(TRAINING)
         try:
-            done = float(status.values.get(_DONE, 'nan'))
+            done = float(found.values.get(_DONE, 'nan'))
         except ValueError:
             done = math.nan
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)
         share.set_text('' if math.isnan(done) else f'{done:.0f} %')
-        figures.show(status)
+        status.show(found)
+        figures.show({key.replace('_', ' ').capitalize(): value
+                      for key, value in found.values.items() if key != _DONE})
 
-    frame.follow(show)
-
-
-class _Leaflet:
-    """Sentences, figures, a picture and a whole page of what was found, all of it as text."""
-
-    def __init__(self, name: str, about: str) -> None:
-        self._name = name
-        self._lines = div('')
-        self._figures = _Figures()
-        self._picture = attribute(ui.element('img').classes('picture hidden'), 'alt', about)
-        with ui.expansion('the whole report').classes('hidden').props('dense') as self._whole:
-            self._text = words('div', '', 'report')
-
-    def show(self, found: Report | Comparison) -> None:
-        """Show what was found, in place of what was there."""
-        self._lines.clear()
-        with self._lines:
-            for line in found.lines:
-                words('div', line)
-        self._figures.figures(found.figures)
-        if found.picture:
-            # another address for another picture
-            version = hashlib.sha256(found.picture).hexdigest()[:16]
-            attribute(self._picture, 'src', f'/picture/{self._name}?{version}')
-        show_if(self._picture, bool(found.picture))
-        self._text.set_text(found.text)
-        show_if(self._whole, bool(found.text))
-
-
-def _report(frame: Frame) -> None:
-    with div('card wide hidden', tag='section').props('aria-label=Report') as card:
-        words('h2', 'report of the last training')
-        verdict, when = words('div', '', 'value'), words('div', '', 'quiet')
-        problem = words('div', '')
-        leaflet = _Leaflet('training', 'Data, drift and prediction')
-    shown: list[Report | None] = [None]
-
-    def show(_: Snapshot) -> None:
-        found = frame.source.learning.report
-        if found is shown[0] or found is None:
-            return
-        shown[0] = found
-        show_if(card, True)
-        problem.set_text(found.problem)
-        verdict.set_text('' if found.problem else
-                         f'the new model is {"accepted" if found.accepted else "refused"}')
-        when.set_text('' if found.problem else f'{_day(found.written)}, {found.model_file}')
-        leaflet.show(found)
-
-    frame.follow(show)
-
-
-def _day(seconds: float) -> str:
-    return time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(seconds))
-
-
-def _comparison(frame: Frame) -> None:
-    with div('card wide hidden', tag='section').props('aria-label=Comparison') as card:
-        words('h2', 'comparison on the last hour')
-        words('div', 'What the new model would have commanded at what was measured, beside what '
-              'was commanded; the loop under it would have gone another way.', 'quiet')
-
-        async def compare() -> None:
-            say(said, await frame.act('compare', '', model()))
-
-        async def cancel() -> None:
-            say(said, await frame.act('end comparison'))
-
-        with div('row1'):
-            begin = frame.control(ui.button('Compare on the last hour', on_click=compare).props(
-                'outline'))
-            end = frame.control(ui.button('Cancel', on_click=cancel).props('outline'))
-        said = frame.answer()
-        state = words('div', '').props('role=status')
-        leaflet = _Leaflet('comparison', 'Recorded commands and those of the new model')
-    shown = [Comparison()]
-
-    def model() -> str:
-        report = frame.source.learning.report
-        return (frame.source.snapshot.status(_TRAINING).values.get('model_file', '')
-                or (report.model_file if report else ''))
-
-    def show(now: Snapshot) -> None:
-        found = frame.source.learning.comparison
-        show_if(card, bool(model() or found.model))
-        show_if(begin, not found.running)
-        show_if(end, found.running)
-        if found.running:
-            state.set_text(f'running for {max(now.wall - found.since, 0.0):.0f} s')
-        if found is shown[0]:
-            return
-        shown[0] = found
-        if not found.running:
-            said.set_text('')
-            state.set_text(f'✖ {found.problem}' if found.problem else
-                           f'{found.model}, compared at {clock(found.since)}')
-        leaflet.show(found)
-
-    frame.follow(show)
+    page.follow(show)

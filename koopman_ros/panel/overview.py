@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page with the faceplates of all signals."""
+"""Page with the faceplates of all signals."""
 
 from __future__ import annotations
 
@@ -12,93 +12,94 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
-from koopman_ros.panel.frame import alarm_rows, attribute, div, Frame, say, show_if, words
-from koopman_ros.panel.plant import Face, InputFace, number, Snapshot, StateFace
+from koopman_ros.panel.alarm_page import alarm_rows
+from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, number, StateFaceplate
+from koopman_ros.panel.layout import (
+    AnswerLine,
+    attribute,
+    box,
+    card,
+    label,
+    PageLayout,
+    place,
+    show_if,
+)
 from koopman_ros.panel.requests import Answer
+from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, Snapshot
 from koopman_ros.panel.trend_page import TrendChart
 
 _STRIP = 3  # alarms that are shown here
 
 
-def overview(frame: Frame) -> None:
+def overview(page: PageLayout) -> None:
     """Build the page."""
-    now = frame.source.snapshot
-    with frame.body:
-        _strip(frame)
-        with div('cards'):
+    now = page.source.snapshot
+    with page.body:
+        _alarm_strip(page)
+        with box('cards'):
             for at, state in enumerate(now.states):
-                _state_card(frame, at, state)
+                _state_card(page, at, state)
             for at, own in enumerate(now.inputs):
-                _input_card(frame, at, own)
-            _controller_card(frame)
-        chart = TrendChart(frame, 180, zoom=False)
-        frame.follow(lambda _: chart.renew())
+                _input_card(page, at, own)
+            _controller_card(page)
+        chart = TrendChart(page, 180, zoom=False)
+        page.follow(lambda _: chart.update())
 
 
-def _strip(frame: Frame) -> None:
-    rows = alarm_rows(frame, 'Alarms', none='No alarms')
-    others = words('div', '', 'quiet hidden')
+def _alarm_strip(page: PageLayout) -> None:
+    rows = alarm_rows(page, 'Alarms', none='No alarms')
+    others = label('div', '', 'quiet hidden')
 
     def show(now: Snapshot) -> None:
         rows.show(now.standing[:_STRIP])
         others.set_text(f'and {len(now.standing) - _STRIP} more')
         show_if(others, len(now.standing) > _STRIP)
 
-    frame.follow(show)
+    page.follow(show)
 
 
 class _Bar:
-    """A number between the ends of its scale, with ranges and marks."""
+    """A number on its scale, with ranges and a mark."""
 
-    def __init__(self, frame: Frame) -> None:
-        self._frame = frame
-        with div('bar').props('aria-hidden=true'):
-            self._training = div('train')
-            self._fill = div('fill')
-            self._limits = [div('limit'), div('limit')]
-            self._tick = div('tick')
-        with div('scale'):
-            self._low, self._between, self._high = (words('span', '') for _ in range(3))
+    def __init__(self) -> None:
+        with box('bar').props('aria-hidden=true'):
+            self._training, self._fill = box('train'), box('fill')
+            self._limits = [box('limit'), box('limit')]
+            self._tick = box('tick')
+        with box('scale'):
+            self._low, self._between, self._high = (label('span', '') for _ in range(3))
 
-    def show(self, face: Face, value: float, mark: float) -> None:
-        def show_at(element: Element, number: float | None) -> None:
-            place(element, **({} if number is None or not math.isfinite(number) else {
-                'left': face.share(number)}))
+    def show(self, face: Faceplate, value: float, mark: float) -> None:
+        def show_at(element: Element, value: float) -> None:
+            place(element, **({'left': face.share(value)} if math.isfinite(value) else {}))
 
-        place = self._frame.place
-        training, limits = face.training, face.limits
-        place(self._training, **({} if training is None else {
-            'left': face.share(training[0]), 'right': 1.0 - face.share(training[1])}))
+        place(self._training, **({} if face.training is None else {
+            'left': face.share(face.training[0]), 'right': 1.0 - face.share(face.training[1])}))
         place(self._fill, width=face.share(value))
         show_at(self._tick, mark)
-        for at, limit in enumerate(self._limits):
-            show_at(limit, None if limits is None else limits[at])
-        low, high = (face.text(end) for end in face.span)
+        for element, limit in zip(self._limits, face.limits or (math.nan, math.nan), strict=True):
+            show_at(element, limit)
+        low, high = map(face.text, face.span)
         self._low.set_text(low)
         self._high.set_text(high)
-        self._between.set_text('' if training is None else (
-            f'trained {face.text(training[0])} to {face.text(training[1])}'))
+        self._between.set_text('' if face.training is None else (
+            f'trained {face.text(face.training[0])} to {face.text(face.training[1])}'))
 
 
-def _card(face: Face) -> Any:
-    return attribute(attribute(div('card', tag='section'), 'aria-label', face.label),
-                     'data-signal', face.name)
+class _Faceplate:
+    """Name of a signal, its abnormal condition, its number with unit, and its bar."""
 
+    def __init__(self, face: Faceplate, unit: str) -> None:
+        with box('row1 between'):
+            label('h2', face.label)
+            self._abnormal = label('span', '', 'abnormal hidden')
+        with box('row1'):
+            self._number = label('span', '', 'big')
+            label('span', unit, 'unit')
+        self._bar = _Bar()
+        self._active = label('div', '', 'quiet')
 
-class _Plate:
-    """Name of a signal, what is out of order, its number with unit, and its bar."""
-
-    def __init__(self, frame: Frame, face: Face, unit: str) -> None:
-        with div('row1 between'):
-            words('h2', face.label)
-            self._abnormal = words('span', '', 'abnormal hidden')
-        with div('row1'):
-            self._number = words('span', '', 'big')
-            words('span', unit, 'unit')
-        self._bar = _Bar(frame)
-        self._active = words('div', '', 'quiet')
-
-    def show(self, face: Face, value: float, mark: float) -> None:
+    def show(self, face: Faceplate, value: float, mark: float) -> None:
         self._abnormal.set_text(f'▲ {face.abnormal}')
         show_if(self._abnormal, bool(face.abnormal))
         self._number.set_text(face.text(value))
@@ -107,110 +108,110 @@ class _Plate:
 
 
 class _Entry:
-    """A number that is asked for: typed, stepped by the arrow keys, or by a slider."""
+    """Entry of a number: typed, stepped by the arrow keys, or by a slider."""
 
-    def __init__(self, frame: Frame, title: str, face: Face,
+    def __init__(self, page: PageLayout, title: str, face: Faceplate,
                  send: Callable[[float], Any], present: Callable[[], float]) -> None:
         self._send, self._present = send, present
         step = 10.0 ** -face.decimals
-        low, high = face.span
-        self._low, self._high = round(low, face.decimals), round(high, face.decimals)
-        with div('ask'):
-            self.field = frame.control(ui.number(
+        self._low, self._high = (round(end, face.decimals) for end in face.span)
+        with box('ask'):
+            self._field = page.control(ui.number(
                 title, step=step, format=f'%.{face.decimals}f', on_change=self._typed).props(
                     'outlined dense'))
-            self.button = frame.control(ui.button('Set', on_click=self.submit).props('unelevated'))
-        self.slider = frame.control(attribute(ui.slider(
+            page.control(ui.button('Set', on_click=self._submit).props('unelevated'))
+        self._slider = page.control(attribute(ui.slider(
             min=self._low, max=self._high, step=step, on_change=self._slid).props('color=grey-8'),
             'aria-label', f'{title}, slider'))
-        self.said = frame.answer()
-        self.field.on('keydown.enter', self.submit)
-        self.field.on('keydown.escape', self.reset)
+        self._answer = AnswerLine()
+        self._field.on('keydown.enter', self._submit)
+        self._field.on('keydown.escape', self._reset)
         self._started = False
 
     def start(self, value: float) -> None:
-        """Show the present value, once it is known."""
+        """Show the present value when it is known."""
         if not self._started and math.isfinite(value):
             self._started = True
-            self.reset()
+            self._reset()
 
-    def reset(self) -> None:
-        """Take back what was typed."""
+    def _reset(self) -> None:
         value = self._present()
         if math.isfinite(value):
-            self.field.set_value(value)
-            self.slider.set_value(value)
-        self.said.set_text('')
+            self._field.set_value(value)
+            self._slider.set_value(value)
+        self._answer.set_text('')
 
     def _slid(self, event: Any) -> None:
-        # the slider keeps within its ends what was typed beyond them
-        typed = self.field.value
+        # the slider keeps within its ends a value that was typed beyond them
+        typed = self._field.value
         beyond = typed is not None and not self._low <= typed <= self._high
         if self._started and event.value != typed and not beyond:
-            self.field.set_value(event.value)
+            self._field.set_value(event.value)
 
     def _typed(self, event: Any) -> None:
-        if self._started and event.value is not None and event.value != self.slider.value:
-            self.slider.set_value(event.value)
+        if self._started and event.value is not None and event.value != self._slider.value:
+            self._slider.set_value(event.value)
 
-    async def submit(self) -> None:
-        """Send what is in the field."""
-        value = self.field.value
+    async def _submit(self) -> None:
+        value = self._field.value
         if value is None:
-            say(self.said, Answer(False, 'write a number'))
+            self._answer.show(Answer(False, 'enter a number'))
             return
-        self.said.set_text('sent …')
-        say(self.said, await self._send(float(value)))
+        self._answer.set_text('sent …')
+        self._answer.show(await self._send(float(value)))
 
 
-def _state_card(frame: Frame, at: int, face: StateFace) -> None:
+def _signal_card(face: Faceplate) -> Element:
+    return attribute(attribute(box('card', tag='section'), 'aria-label', face.label),
+                     'data-signal', face.name)
+
+
+def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
     def present() -> float:
-        return frame.source.snapshot.states[at].setpoint
+        return page.source.snapshot.states[at].setpoint
 
     async def send(value: float) -> Answer:
-        return await frame.act('setpoint', face.name, value, present())
+        return await page.act('setpoint', face.name, value, present())
 
-    with _card(face):
-        plate = _Plate(frame, face, face.unit)
+    with _signal_card(face):
+        plate = _Faceplate(face, face.unit)
         if face.controlled:
-            with div('row1 between'):
-                words('span', 'set-point')
-                setpoint = words('span', '', 'value')
-            asked = words('div', '', 'quiet')
-            entry = _Entry(frame, f'Set-point of {face.label}, {face.unit}', face, send, present)
-        predicted = words('div', '', 'quiet')
+            with box('row1 between'):
+                label('span', 'set-point')
+                setpoint = label('span', '', 'value')
+            target = label('div', '', 'quiet')
+            entry = _Entry(page, f'Set-point of {face.label}, {face.unit}', face, send, present)
+        predicted = label('div', '', 'quiet')
 
     def show(now: Snapshot) -> None:
         own = now.states[at]
         plate.show(own, own.measured, own.setpoint)
         if face.controlled:
             setpoint.set_text(f'{own.text(own.setpoint)} {own.unit}')
-            ramps = math.isfinite(own.asked) and own.text(own.asked) != own.text(own.setpoint)
-            asked.set_text(f'asked for {own.text(own.asked)} {own.unit}' if ramps else '')
+            ramps = math.isfinite(own.target) and own.text(own.target) != own.text(own.setpoint)
+            target.set_text(f'target {own.text(own.target)} {own.unit} (ramping)' if ramps else '')
             entry.start(own.setpoint)
-        expected = f'{number(own.predicted, own.decimals + 1)} {own.unit}'
-        predicted.set_text(
-            f'the model expected {expected}' if math.isfinite(own.predicted) else '')
+        predicted.set_text(f'model prediction {number(own.predicted, own.decimals + 1)} {own.unit}'
+                           if math.isfinite(own.predicted) else '')
 
-    frame.follow(show)
+    page.follow(show)
 
 
-def _input_card(frame: Frame, at: int, face: InputFace) -> None:
+def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
     def present() -> float:
-        return frame.source.snapshot.inputs[at].command
+        return page.source.snapshot.inputs[at].command
 
     async def send(value: float) -> Answer:
-        return await frame.act('manual', face.name, value, present())
+        return await page.act('manual', face.name, value, present())
 
-    with _card(face):
-        plate = _Plate(frame, face, f'{face.unit} command')
-        with div('row1 between'):
-            words('span', 'acting')
-            applied = words('span', '', 'value')
-        beside = words('div', '', 'quiet')
-        by_hand = div('')
-        with by_hand:
-            entry = _Entry(frame, f'{face.label} by hand, {face.unit}', face, send, present)
+    with _signal_card(face):
+        plate = _Faceplate(face, f'{face.unit} command')
+        with box('row1 between'):
+            label('span', 'applied')
+            applied = label('span', '', 'value')
+        details = label('div', '', 'quiet')
+        with box('') as manual:
+            entry = _Entry(page, f'Manual command: {face.label}, {face.unit}', face, send, present)
 
     def show(now: Snapshot) -> None:
         own = now.inputs[at]
@@ -222,45 +223,41 @@ def _input_card(frame: Frame, at: int, face: InputFace) -> None:
         change = round(own.disturbance, own.decimals + 1) + 0.0
         disturbance = f' · disturbance {change:+.{own.decimals + 1}f} {own.own_unit}' if (
             math.isfinite(change)) else ''
-        beside.set_text(limits + disturbance)
-        show_if(by_hand, now.mode == 'manual')
+        details.set_text(limits + disturbance)
+        show_if(manual, now.mode == 'manual')
         entry.start(own.command)
 
-    frame.follow(show)
+    page.follow(show)
 
 
-def _controller_card(frame: Frame) -> None:
-    with div('card', tag='section').props('aria-label=Controller'):
-        words('h2', 'controller')
-        mode = words('div', '', 'big')
-        level = words('div', '', 'value')
-        fallback = words('div', '▲ not the best law', 'abnormal hidden')
-        reason, sentence = words('div', ''), words('div', '', 'quiet')
-        estimates = words('div', '')
-        said: ui.label
+def _controller_card(page: PageLayout) -> None:
+    with card('controller', 'Controller'):
+        mode, level = label('div', '', 'big'), label('div', '', 'value')
+        fallback = label('div', '▲ FALLBACK CONTROL ACTIVE', 'abnormal hidden')
+        reason, message = label('div', ''), label('div', '', 'quiet')
+        estimates = label('div', '')
 
         async def switch() -> None:
-            manual = frame.source.snapshot.mode == 'manual'
-            if not manual and not await frame.confirm(
+            manual = page.source.snapshot.mode == 'manual'
+            if manual or await page.confirm(
                     'Switch to manual mode?', 'Switch to manual mode',
-                    ['The controller then holds its last command until you give another one. '
-                     'Nothing brings the plant to its set-point meanwhile.']):
-                return
-            say(said, await frame.act('automatic', 'controller', manual, not manual))
+                    ['The controller holds its last command until you enter another one. '
+                     'In manual mode the set-point is not controlled.']):
+                answer.show(await page.act('automatic', CONTROLLER, manual, not manual))
 
-        button = frame.control(ui.button('', on_click=switch).props('outline'))
-        said = frame.answer()
+        button = page.button('', switch)
+        answer = AnswerLine()
 
     def show(now: Snapshot) -> None:
         mode.set_text(now.mode or '–')
-        level.set_text(now.level)
+        level.set_text(now.level if now.level != now.mode else '')
         show_if(fallback, now.fallback and bool(now.level))
         reason.set_text(now.reason)
-        said_of_it = now.status('controller: control').message
-        sentence.set_text('' if said_of_it == now.mode else said_of_it)
+        found = now.status(CONTROL).message
+        message.set_text('' if found == now.mode else found)
         estimates.set_text(' · '.join(f'{name} {text} (estimated)' for name, text
                                       in now.estimates))
         button.set_text('Switch to automatic mode' if now.mode == 'manual'
                         else 'Switch to manual mode …')
 
-    frame.follow(show)
+    page.follow(show)

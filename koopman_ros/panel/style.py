@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How the pages look: grey, with colour for what is abnormal alone; their watch on the panel."""
+"""Style sheet of the pages, with colour for abnormal conditions alone, and their watchdog."""
 
 CSS = """
 :root { --ground: #d9d9d6; --card: #e9e9e6; --line: #a9a9a5; --text: #1d1d1b; --quiet: #4d4d4a;
@@ -23,7 +23,8 @@ a { color: var(--text); }
 .tabs a.here { background: var(--ground); font-weight: 600; border: 1px solid var(--line);
   border-bottom: none; }
 .page { padding: 12px 16px; display: flex; flex-direction: column; gap: 12px; }
-.cards { display: grid; gap: 12px; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); }
+.cards { display: grid; gap: 12px;
+  grid-template-columns: repeat(auto-fit, minmax(min(320px, 100%), 1fr)); }
 .loose { align-items: start; }
 .card { background: var(--card); border: 1px solid var(--line); padding: 12px 14px;
   display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: anywhere; }
@@ -60,8 +61,10 @@ a { color: var(--text); }
 .alarm .what { flex: 1 1 240px; min-width: 0; overflow-wrap: anywhere; }
 .banner { background: var(--high); color: #fff; font-weight: 700; padding: 10px 16px; }
 #lost { position: sticky; top: 0; z-index: 9000; }
-table.plain { border-collapse: collapse; width: 100%; }
-.pairs { display: grid; grid-template-columns: minmax(0, 2fr) minmax(0, 3fr); gap: 2px 12px; }
+.pairs { display: grid; gap: 2px 32px; }
+.columns { grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); }
+.pair { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 12px; }
+.lines { white-space: pre-line; }
 .middle { align-items: center; }
 .parameter { display: grid; width: 100%; gap: 2px 12px; align-items: center; padding: 6px 0;
   border-top: 1px solid var(--line); grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); }
@@ -70,7 +73,6 @@ table.plain { border-collapse: collapse; width: 100%; }
 .q-dialog .card { background: var(--card); max-width: 560px; }
 .nicegui-echart { width: 100%; }
 .card .picture { display: block; max-width: 100%; height: auto; background: #fff; }
-.wide { grid-column: 1 / -1; }
 .report { white-space: pre-wrap; overflow-wrap: anywhere; font-family: monospace;
   font-size: .85rem; }
 .journal { font-variant-numeric: tabular-nums; }
@@ -85,7 +87,7 @@ table.plain { border-collapse: collapse; width: 100%; }
 }
 """
 
-# Says since when nothing has come from the panel, by the clock of the browser alone.
+# Shows since when the panel is silent, by the clock of the browser alone.
 WATCH = """
 <script>
 addEventListener('DOMContentLoaded', () => {
@@ -98,22 +100,9 @@ addEventListener('DOMContentLoaded', () => {
     if (beat && beat.dataset.beat !== seen) { seen = beat.dataset.beat; last = Date.now(); }
     const lost = Date.now() - last > 4000;
     bar.classList.toggle('hidden', !lost);
-    if (lost) bar.textContent = '\\u26a0 Connection lost: nothing from the panel since '
-      + new Date(last).toLocaleTimeString() + '. What is shown is old.';
+    if (lost) bar.textContent = '\\u26a0 Connection lost: no message from the panel since '
+      + new Date(last).toLocaleTimeString() + '. The values are old.';
   }, 500);
 });
 </script>
 """
-
-LOGIN = """<!doctype html><html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>Log in</title>
-<link rel="icon" href="data:,">
-<style>body{{background:#d9d9d6;color:#1d1d1b;font:18px system-ui,sans-serif;margin:0}}
-form{{background:#e9e9e6;border:1px solid #a9a9a5;max-width:340px;margin:12vh auto 0;padding:20px}}
-label{{display:block;margin:12px 0 4px}}input,button{{font:inherit;width:100%;padding:10px;
-box-sizing:border-box}}button{{margin-top:18px}}p{{color:#a40000;font-weight:600}}
-</style></head><body><form method="post" action="/login"><h1>{title}</h1>{said}
-<label for="name">Name</label><input id="name" name="name" autocomplete="username" autofocus
-required><label for="password">Password</label><input id="password" name="password"
-type="password" autocomplete="current-password" required><button>Log in</button></form>
-</body></html>"""

@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page with the parameters of controller and trainer."""
+"""Page of the parameters of controller and trainer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 import json
 import re
 from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.frame import attribute, div, Frame, say, words
-from koopman_ros.panel.plant import CONTROLLER, ParameterView, Snapshot, TRAINER
+from koopman_ros.panel.files import sanitize_text
+from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout
 from koopman_ros.panel.requests import Answer
-from koopman_ros.panel.texts import plain
+from koopman_ros.panel.snapshot import CONTROLLER, Snapshot, TRAINER
+from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.table import as_yaml, UNBOUNDED
 from koopman_ros.units import ZERO_CELSIUS
 
@@ -26,126 +26,126 @@ _NAME = re.compile(r'[A-Za-z_][\w.]*', re.ASCII)
 _MAX_UNIT = 60  # characters
 
 
-def tuning_page(frame: Frame) -> None:
+def tuning_page(page: PageLayout) -> None:
     """Build the page."""
-    with frame.body:
+    with page.body:
         for node in (CONTROLLER, TRAINER):
-            _node(frame, node)
+            _node(page, node)
 
 
-def _node(frame: Frame, node: str) -> None:
-    with attribute(div('card', tag='section'), 'aria-label', f'Parameters of the {node}'):
-        with div('row1 between'):
-            words('h2', node)
+def _node(page: PageLayout, node: str) -> None:
+    with attribute(box('card', tag='section'), 'aria-label', f'Parameters of the {node}'):
+        with box('row1 between'):
+            label('h2', node)
             ui.button('Export YAML', on_click=lambda: ui.download.content(
-                exported(node, frame.source.snapshot.parameters.get(node, {})),
+                exported(node, page.source.snapshot.parameters.get(node, {})),
                 f'{node}.yaml')).props('outline')
-        place = div('')
-    fields: dict[str, _Row] = {}
+        rows = box('')
+    shown: dict[str, _Row] = {}
 
     def show(now: Snapshot) -> None:
         found = now.parameters.get(node, {})
-        if set(found) != set(fields) or (not found and not place.default_slot.children):
-            fields.clear()
-            place.clear()
-            with place:
-                _groups(frame, node, found, fields)
-        for name, row in fields.items():
+        if set(found) != set(shown) or not rows.default_slot.children:
+            shown.clear()
+            rows.clear()
+            with rows:
+                shown.update(_groups(page, node, found))
+        for name, row in shown.items():
             row.show(found[name])
 
-    frame.follow(show)
+    page.follow(show)
 
 
-def _groups(frame: Frame, node: str, found: Mapping[str, ParameterView],
-            fields: dict[str, _Row]) -> None:
+def _groups(page: PageLayout, node: str, found: Mapping[str, ParameterDescription]
+            ) -> dict[str, _Row]:
+    """Build a group of rows for each signal, and one for all others."""
     if not found:
-        words('div', f'the {node} is not there: nothing is known of its parameters', 'quiet')
-    groups: dict[str, list[ParameterView]] = {}
-    for name, view in found.items():
-        groups.setdefault(name.rpartition('.')[0] or _GENERAL, []).append(view)
-    for group, views in sorted(groups.items(), key=lambda item: item[0] != _GENERAL):
+        label('div', f'{node.capitalize()} not running: no parameters available', 'quiet')
+    groups: dict[str, list[ParameterDescription]] = {}
+    for name, one in found.items():
+        groups.setdefault(name.rpartition('.')[0] or _GENERAL, []).append(one)
+    rows = {}
+    for group, members in sorted(groups.items(), key=lambda item: item[0] != _GENERAL):
         with ui.expansion(group.replace('_', ' ')).props('dense switch-toggle-side'):
-            # what is fixed comes last
-            for view in sorted(views, key=lambda view: view.read_only):
-                fields[view.name] = _Row(frame, node, view)
+            for one in sorted(members, key=lambda one: one.read_only):
+                rows[one.name] = _Row(page, node, one)
+    return rows
 
 
 class _Row:
-    """A parameter."""
+    """A parameter with its entry."""
 
-    def __init__(self, frame: Frame, node: str, view: ParameterView) -> None:
-        self._frame, self._node, self._view = frame, node, view
+    def __init__(self, page: PageLayout, node: str, parameter: ParameterDescription) -> None:
+        self._page, self._node, self._parameter = page, node, parameter
         self._text = ''
-        short = view.name.rpartition('.')[2]
-        unit = f' [{view.unit}]' if view.unit else ''
-        with attribute(div('parameter'), 'data-parameter', view.name):
-            with div(''):
-                words('div', f'{short}{unit}', '')
-                notes = [view.meaning, _range(view), 'fixed at start' if view.read_only else '']
-                words('div', '; '.join(filter(None, notes)), 'quiet')
-            with div(''):
-                title = f'{view.name}{unit}'
-                if view.read_only:
-                    self._field: Any = attribute(words('div', ''), 'aria-label', title)
-                    return
-                with div('ask'):
-                    self._field = frame.control(attribute(
+        unit = f' [{parameter.unit}]' if parameter.unit else ''
+        notes = [parameter.meaning, _range(parameter),
+                 'fixed at start' if parameter.read_only else '']
+        with attribute(box('parameter'), 'data-parameter', parameter.name):
+            with box(''):
+                label('div', f'{parameter.name.rpartition(".")[2]}{unit}')
+                label('div', '; '.join(filter(None, notes)), 'quiet')
+            title = f'{parameter.name}{unit}'
+            if parameter.read_only:
+                self._field: Any = attribute(label('div', ''), 'aria-label', title)
+                return
+            with box(''):
+                with box('ask'):
+                    self._field = page.control(attribute(
                         ui.input().props('outlined dense'), 'aria-label', title))
-                    frame.control(attribute(
-                        ui.button('Set', on_click=self._submit).props('outline'),
-                        'aria-label', f'Set {view.name}'))
-                self._said = frame.answer()
+                    attribute(page.button('Set', self._submit), 'aria-label',
+                              f'Set {parameter.name}')
+                self._answer = AnswerLine()
                 self._field.on('keydown.enter', self._submit)
-                self._field.on('keydown.escape', partial(self._reset))
+                self._field.on('keydown.escape', self._reset)
 
-    def show(self, view: ParameterView) -> None:
-        """Show a value that is another one."""
-        if self._text and view == self._view:
+    def show(self, parameter: ParameterDescription) -> None:
+        """Show a changed value."""
+        if self._text and parameter == self._parameter:
             return
-        self._view = view
-        if view.read_only:
-            self._field.set_text(view.text)
+        self._parameter = parameter
+        if parameter.read_only:
+            self._field.set_text(parameter.text)
         elif self._field.value in ('', self._text, None):
             # what is being typed stays
-            self._field.set_value(view.text)
-        self._text = view.text
+            self._field.set_value(parameter.text)
+        self._text = parameter.text
 
     def _reset(self) -> None:
-        self._field.set_value(self._view.text)
-        self._said.set_text('')
+        self._field.set_value(self._parameter.text)
+        self._answer.set_text('')
 
     async def _submit(self) -> None:
+        name = self._parameter.name
         try:
-            value = self._view.read(str(self._field.value))
+            value = self._parameter.parse(str(self._field.value))
         except ValueError as error:
-            say(self._said, Answer(False, str(error)))
+            self._answer.show(Answer(False, str(error)))
             return
-        self._said.set_text('sent …')
-        answer = await self._frame.act(
-            'parameters', self._node, {self._view.name: value}, {
-                self._view.name: self._view.value})
+        self._answer.set_text('sent …')
+        answer = await self._page.act('parameters', self._node, {name: value},
+                                      {name: self._parameter.value})
         if answer.accepted:
-            # the node tells of it later: what is typed until then stays, the value of before, too
-            self._text = replace(self._view, value=value).text
-        say(self._said, answer)
+            # the new value stays in the field until the node publishes it
+            self._text = replace(self._parameter, value=value).text
+        self._answer.show(answer)
 
 
-def _range(view: ParameterView) -> str:
-    """Return the range in words, but for ends that stand for none."""
-    if view.upper < UNBOUNDED:
-        return view.range
-    if view.lower <= -ZERO_CELSIUS:
+def _range(parameter: ParameterDescription) -> str:
+    """Return the range in words, without the ends that stand for no bound."""
+    if parameter.upper < UNBOUNDED:
+        return parameter.range
+    if parameter.lower <= -ZERO_CELSIUS:
         return ''
-    word = 'above' if view.range.startswith('(') else 'at least'
-    return f'{word} {view.lower:g} {view.unit}'.rstrip()
+    word = 'above' if parameter.range.startswith('(') else 'at least'
+    return f'{word} {parameter.lower:g} {parameter.unit}'.rstrip()
 
 
-def exported(node: str, found: Mapping[str, ParameterView]) -> str:
-    """Return parameters as a file that a node can be started with."""
+def exported(node: str, found: Mapping[str, ParameterDescription]) -> str:
+    """Return the parameter file of a node."""
     lines = [f'{node}:', '  ros__parameters:']
-    for name, view in found.items():
-        unit = f'  # [{plain(view.unit, _MAX_UNIT)}]' if view.unit else ''
-        # a node may have any names
+    for name, one in found.items():
+        unit = f'  # [{sanitize_text(one.unit, _MAX_UNIT)}]' if one.unit else ''
         key = name if _NAME.fullmatch(name) else json.dumps(name)
-        lines.append(f'    {key}: {as_yaml(view.value)}{unit}')
+        lines.append(f'    {key}: {as_yaml(one.value)}{unit}')
     return '\n'.join(lines) + '\n'

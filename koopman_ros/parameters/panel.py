@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the panel, which shows a loop in a browser."""
+"""Parameters of the panel node."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,67 +25,68 @@ from koopman_ros.units import conversion, display_unit
 
 
 def _shown_unit() -> Any:
-    return parameter('', 'unit in which the pages show it; empty for {shown}', read_only=True)
+    return parameter('', 'unit of this signal on the pages; empty for the unit of its parameters',
+                     read_only=True)
 
 
 @dataclass(frozen=True)
 class ShownState(StatePlaces):
-    """Where a state is on the wire, and how it is shown."""
+    """Topics of a state, and its unit on the pages."""
 
     shown_unit: str = _shown_unit()
 
 
 @dataclass(frozen=True)
 class ShownInput(InputPlaces):
-    """The same of an input."""
+    """Topics of an input, and its unit on the pages."""
 
     shown_unit: str = _shown_unit()
 
 
 @dataclass(frozen=True)
 class PanelParameters:
-    """Snapshot of the panel's parameters."""
+    """Parameters of the panel."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'plant that is shipped, whose signals and topics are the defaults here; '
-        'any other name for none', read_only=True)
+        DEFAULT_SYSTEM, 'name of a bundled plant, whose signals and topics become the defaults; '
+        'any other name: no defaults', read_only=True)
     model: str = parameter(
-        '', 'model whose signals are shown where nothing else names them: a shipped one by name, '
-        'or the path of a .safetensors model file', read_only=True)
+        '', 'model whose signals are shown if no other parameter names them: a bundled one by '
+        'name, or the path of a .safetensors file', read_only=True)
     states_measured: tuple[str, ...] = parameter(
         ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
         'model', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'inputs with their units, likewise', read_only=True)
-    controlled: tuple[str, ...] = parameter(
-        ('',), 'measured signals that have a set-point; an empty name for all', read_only=True)
-    controller: str = parameter(
-        'controller', 'name of the controller node, whose services are called', read_only=True)
-    trainer: str = parameter(
-        'trainer', 'name of the trainer node, likewise', read_only=True)
-    title: str = parameter(
-        '', 'what is written above each page; empty for the name of the plant', read_only=True)
-    host: str = parameter(
-        '127.0.0.1', 'address that the pages are served on; any but one of this machine alone '
-        'needs users', read_only=True)
-    port: int = parameter(
-        8080, 'port that the pages are served on; 0 takes a free one', '', 0, 65535,
+        ('',), 'inputs with their units, e.g. pump [V]; an empty name for those of the model',
         read_only=True)
+    controlled: tuple[str, ...] = parameter(
+        ('',), 'measured signals with a set-point; an empty name for all', read_only=True)
+    controller: str = parameter(
+        'controller', 'name of the controller node', read_only=True)
+    trainer: str = parameter(
+        'trainer', 'name of the trainer node', read_only=True)
+    title: str = parameter(
+        '', 'title of all pages; empty for the name of the plant', read_only=True)
+    host: str = parameter(
+        '127.0.0.1', 'address of the web server; one that other machines reach needs users',
+        read_only=True)
+    port: int = parameter(
+        8080, 'port of the web server; 0 for any free port', '', 0, 65535, read_only=True)
     users: str = parameter(
-        '', 'file of those who may log in, with hashed passwords and roles; empty for none: then '
-        'whoever uses this machine is the operator', read_only=True)
+        '', 'file of users with their roles and hashed passwords; empty: every user of this '
+        'machine is the operator', read_only=True)
     tls_certificate: str = parameter(
-        '', 'certificate, as a PEM file; empty serves without encryption', read_only=True)
+        '', 'TLS certificate, as a PEM file; empty for no encryption', read_only=True)
     tls_key: str = parameter(
         '', 'private key of the certificate, as a PEM file', read_only=True)
     trusted_proxy: tuple[str, ...] = parameter(
-        ('',), 'addresses or networks of proxies before the panel, whose X-Forwarded-For and '
-        'X-Forwarded-Proto are believed; an empty name for none; needs users', read_only=True)
+        ('',), 'addresses or networks of reverse proxies, whose X-Forwarded-For and '
+        'X-Forwarded-Proto are trusted; an empty name for none; needs users', read_only=True)
     alarm_file: str = parameter(
-        '', 'file in which alarms, their shelving and the list of the day outlast the panel; '
-        'empty for none', read_only=True)
+        '', 'file that keeps alarms, shelving and the last 24 hours over a restart; empty for '
+        'none', read_only=True)
     span: float = parameter(
-        28800.0, 'how much of the past the trends keep', 's', 600.0, 604800.0, read_only=True)
+        28800.0, 'length of the trends', 's', 600.0, 604800.0, read_only=True)
     states: Mapping[str, ShownState] = per_signal(ShownState)
     inputs: Mapping[str, ShownInput] = per_signal(ShownInput)
 
@@ -97,7 +98,7 @@ class PanelParameters:
 
 
 def panel_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Signals:
-    """Return the signals that parameters name, those of a plant that is shipped, or of a model."""
+    """Return the signals of the parameters, of a bundled plant, or of a model."""
     return trainer_signals(present, {**preset(system_of(given), 'panel'), **given})
 
 
@@ -107,9 +108,9 @@ def panel_table(present: LiftedModel | None = None,
     """
     Return the parameters of a panel.
 
-    :param present: the model that parameters name, or None where they name none.
-    :param given: what is known of the values already, of which system and signals count.
-    :raises ConfigurationError: where nothing says what the signals are.
+    :param present: model of the parameters, or None.
+    :param given: known values, of which system and signals are used.
+    :raises ConfigurationError: if the signals are unknown.
     """
     system = system_of(given)
     signals = panel_signals(present, given)

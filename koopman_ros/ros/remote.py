@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Services and parameters of another node, asked without waiting."""
+"""Services and parameters of another node, called without waiting."""
 
 from collections.abc import Callable, Mapping
 import math
@@ -20,65 +20,61 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
-from koopman_ros.panel.plant import ParameterView
+from koopman_ros.parameters.description import ParameterDescription
 
-_PATIENCE = 30.0  # s until an answer counts as lost
-_CHOICES = 'one of '  # what the range of a choice begins with
-_OWN = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
+_TIMEOUT = 30.0  # s until a response counts as lost
+_CHOICES = 'one of '  # at the beginning of the range of a choice
+_OF_RCLPY = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
 
 
 class RemoteNode:
     """
     Another node of a fixed name, which may come and go.
 
-    :param on_parameters: called with all parameters whenever they are other ones.
+    :param services: types of the services that are called, beside those of parameters, by name.
+    :param on_parameters: called with all parameters when they have changed.
     """
 
-    def __init__(self, node: Node, name: str,
-                 on_parameters: Callable[[Mapping[str, ParameterView]], None]) -> None:
-        self._node, self.name, self._on_parameters = node, name, on_parameters
-        self._full = node.resolve_service_name(name)
-        self._clients: dict[str, Client] = {}
-        self._waiting: list[tuple[float, Future, Callable[[Any], None]]] = []
+    def __init__(self, node: Node, name: str, services: Mapping[str, Any],
+                 on_parameters: Callable[[Mapping[str, ParameterDescription]], None]) -> None:
+        self._full, self._on_parameters = node.resolve_service_name(name), on_parameters
+        kinds = {'list_parameters': ListParameters, 'describe_parameters': DescribeParameters,
+                 'get_parameters': GetParameters,
+                 'set_parameters_atomically': SetParametersAtomically, **services}
+        self._clients: dict[str, Client] = {
+            service: node.create_client(kind, f'{name}/{service}')
+            for service, kind in kinds.items()}
+        self._waiting: dict[Future, tuple[float, Callable[[Any], None]]] = {}
         self._stale, self._reading = True, False
-        self._known: Mapping[str, ParameterView] = {}
-        for kind, service in ((ListParameters, 'list_parameters'),
-                              (DescribeParameters, 'describe_parameters'),
-                              (GetParameters, 'get_parameters'),
-                              (SetParametersAtomically, 'set_parameters_atomically')):
-            self.offer(kind, service)
+        self._known = False
 
-    def offer(self, kind: Any, service: str) -> None:
-        """Prepare calls of a service."""
-        self._clients[service] = self._node.create_client(kind, f'{self.name}/{service}')
-
-    def call(self, service: str, request: Any, answered: Callable[[Any], None]) -> None:
-        """Call a service; `answered` is given the response, or None where none comes."""
+    def call(self, service: str, request: Any, on_response: Callable[[Any], None]) -> None:
+        """Call a service; `on_response` is called with its response, or with None for none."""
         client = self._clients[service]
         if not client.service_is_ready():
-            answered(None)
+            on_response(None)
             return
         future = client.call_async(request)
-        self._waiting.append((time.monotonic() + _PATIENCE, future, answered))
-        future.add_done_callback(self._on_answer)
+        self._waiting[future] = (time.monotonic() + _TIMEOUT, on_response)
+        future.add_done_callback(self._on_done)
 
-    def set_parameters(self, values: Mapping[str, Any], answered: Callable[[Any], None]) -> None:
-        """Set parameters, all or none."""
+    def set_parameters(self, values: Mapping[str, Any],
+                       on_response: Callable[[Any], None]) -> None:
+        """Set all of some parameters, or none."""
         self.call('set_parameters_atomically', SetParametersAtomically.Request(parameters=[
             Parameter(name, value=list(value) if isinstance(value, tuple) else value
-                      ).to_parameter_msg() for name, value in values.items()]), answered)
+                      ).to_parameter_msg() for name, value in values.items()]), on_response)
 
     def on_event(self, event: ParameterEvent) -> None:
-        """Take an event of parameters of any node."""
+        """Take a parameter event of any node."""
         if event.node == self._full:
             self._stale = True
 
-    def look(self) -> None:
-        """Read the parameters again where they changed; to be called once in a while."""
+    def update(self) -> None:
+        """Read the parameters again if they changed; to be called periodically."""
         now = time.monotonic()
-        for entry in [one for one in self._waiting if now > one[0]]:
-            self._waiting.remove(entry)
-            entry[2](None)
+        for future in [one for one, (deadline, _) in self._waiting.items() if now > deadline]:
+            self._waiting.pop(future)[1](None)
         if not self._clients['get_parameters'].service_is_ready():
             self._stale = True
             if self._known:
@@ -87,53 +83,48 @@ class RemoteNode:
             self._stale, self._reading = False, True
             self.call('list_parameters', ListParameters.Request(), self._on_listed)
 
-    def _on_answer(self, future: Future) -> None:
-        for entry in [one for one in self._waiting if one[1] is future]:
-            self._waiting.remove(entry)
-            entry[2](None if future.exception() else future.result())
+    def _on_done(self, future: Future) -> None:
+        if found := self._waiting.pop(future, None):
+            found[1](None if future.exception() else future.result())
 
-    def _on_listed(self, response: Any) -> None:
-        if response is None:
-            self._again()
+    def _on_listed(self, listed: Any) -> None:
+        if listed is None:
+            self._read_again()
             return
-        names = [name for name in response.result.names if not name.startswith(_OWN)]
+        names = [name for name in listed.result.names if not name.startswith(_OF_RCLPY)]
 
-        def described(descriptions: Any) -> None:
-            if descriptions is None:
-                self._again()
-                return
-
-            def got(values: Any) -> None:
-                self._reading = False
-                if values is None or len(values.values) != len(names):
-                    self._stale = True
+        def on_described(described: Any) -> None:
+            def on_values(got: Any) -> None:
+                if described is None or got is None or len(got.values) != len(names):
+                    self._read_again()
                     return
-                self._take({view.name: view for view in map(
-                    _view, descriptions.descriptors, values.values)})
+                self._reading = False
+                self._take({one.name: one for one in map(
+                    _description, described.descriptors, got.values)})
 
-            self.call('get_parameters', GetParameters.Request(names=names), got)
+            self.call('get_parameters', GetParameters.Request(names=names), on_values)
 
-        self.call('describe_parameters', DescribeParameters.Request(names=names), described)
+        self.call('describe_parameters', DescribeParameters.Request(names=names), on_described)
 
-    def _again(self) -> None:
+    def _read_again(self) -> None:
         self._stale, self._reading = True, False
 
-    def _take(self, found: Mapping[str, ParameterView]) -> None:
-        self._known = found
+    def _take(self, found: Mapping[str, ParameterDescription]) -> None:
+        self._known = bool(found)
         self._on_parameters(found)
 
 
-def _view(about: ParameterDescriptor, value: Any) -> ParameterView:
+def _description(about: ParameterDescriptor, value: Any) -> ParameterDescription:
     meaning, unit = about.description, ''
     if meaning.endswith(']') and ' [' in meaning:
         meaning, _, unit = meaning[:-1].rpartition(' [')
-    given = parameter_value_to_python(value)
-    if not isinstance(given, (bool, int, float, str)) and given is not None:
-        given = tuple(given)
+    found = parameter_value_to_python(value)
+    if not isinstance(found, (bool, int, float, str)) and found is not None:
+        found = tuple(found)
     lower, upper = -math.inf, math.inf
     for limits in (*about.floating_point_range, *about.integer_range):
         lower, upper = float(limits.from_value), float(limits.to_value)
     words = about.additional_constraints
-    return ParameterView(
-        about.name, given, unit, meaning, words, lower, upper, about.read_only,
+    return ParameterDescription(
+        about.name, found, unit, meaning, words, lower, upper, about.read_only,
         tuple(words.removeprefix(_CHOICES).split(', ')) if words.startswith(_CHOICES) else ())

@@ -1,47 +1,52 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of a training and of a replay: read with care, and shown as text and picture alone."""
+"""The files of a training and of a replay, and the words for a model."""
 
+from collections.abc import Callable
 import json
 import os
 from pathlib import Path
 import struct
+import time
 import zlib
 
 import pytest
 
-from koopman_ros.panel import learning
-from koopman_ros.panel.learning import (
+from koopman_ros.lifting import load
+from koopman_ros.panel.files import read_bounded
+from koopman_ros.panel.learning_watch import LearningWatch
+from koopman_ros.panel.model_card import model_card, status_card, training_ranges
+from koopman_ros.panel.training_report import (
     Learning,
-    read_bounded,
     read_comparison,
-    read_picture,
     read_report,
     Report,
     report_base,
-    report_state,
 )
+from koopman_ros.parameters.panel import panel_signals, panel_table
+from koopman_ros.parameters.wire import Wiring
+from koopman_ros.resources import model_path
 
 MARKUP = '<script>alert(1)</script>'
 FIGURES = {
     'accepted': True, 'reasons': [], 'warnings': [MARKUP], 'model_file': 'new.safetensors',
-    'measurements_read': 400, 'measurements_used': 398, 'condition': 12.34567,
-    'heldout_error': {'temperature': 0.10234}, 'heldout_error_of_linear_model': {
-        'temperature': None}, 'heldout_error_of_present_lift': None,
-    'units': {'temperature': 'K'}, 'closed_loops_failed': 1, 'closed_loops': 128}
-TOLD = {'accepted': 'True', 'measurements_read': '400', 'measurements_used': '398',
-        'model_file': 'new.safetensors', 'done [%]': '100'}
+    'model_class': 'polynomial', 'measurements_read': 400, 'measurements_used': 398,
+    'condition': 12.34567, 'heldout_error': {'temperature': 0.10234, 'level': 0.5},
+    'heldout_error_of_linear_model': {'temperature': None},
+    'heldout_error_of_present_lift': None, 'units': {'temperature': 'K', 'level': 'm'},
+    'closed_loops_failed': 1, 'closed_loops': 128}
+TRAINED = {'accepted': 'True', 'measurements_read': '400', 'measurements_used': '398',
+           'model_file': 'new.safetensors', 'done [%]': '100'}
 
 
-def png(width: int = 2, height: int = 1) -> bytes:
-    """Return a grey picture, as the format's own specification has it."""
+def png() -> bytes:
+    """Return a grey picture by the specification of the format."""
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack('>I', len(data)) + kind + data + struct.pack(
             '>I', zlib.crc32(kind + data))
 
-    return (b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', struct.pack('>IIBBBBB', width, height, 8, 0, 0,
-                                                             0, 0))
+    return (b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', struct.pack('>IIBBBBB', 2, 1, 8, 0, 0, 0, 0))
             + chunk(b'IDAT', zlib.compress(b'\0\x80\x80')) + chunk(b'IEND', b''))
 
 
@@ -53,81 +58,72 @@ def base(tmp_path: Path) -> Path:
     return tmp_path / 'new'
 
 
-def test_a_report_is_read_with_its_figures_in_units(base: Path) -> None:
-    found = read_report(base, TOLD)
+def test_a_report_has_its_figures_in_words_and_units(base: Path) -> None:
+    found = read_report(base, TRAINED)
     assert (found.problem, found.accepted, found.model_file) == ('', True, 'new.safetensors')
-    assert found.lines == (f'Beware: {MARKUP}',)
+    assert found.lines == (f'Warning: {MARKUP}',)
     assert found.figures == {
-        'error on held-out records': '0.1023 K', 'that of the best linear model': 'infinite K',
-        'closed loops that failed': '1', 'closed loops that failed, of': '128',
-        'condition number': '12.35', 'measurements used': '398', 'measurements used, of': '400'}
+        'Model class': 'polynomial', 'Error on held-out records: temperature': '0.1023 K',
+        'Error on held-out records: level': '0.5 m',
+        'Error of the best linear model': 'infinite K', 'Closed loops tested': '128',
+        'Closed loops failed': '1', 'Condition number': '12.35', 'Measurements read': '400',
+        'Measurements used': '398'}
     assert found.text == f'# Retraining {MARKUP}'
     assert found.picture == png()
 
 
-def test_a_report_of_another_training_is_not_shown_for_this_one(base: Path) -> None:
-    found = read_report(base, {**TOLD, 'measurements_used': '399'})
-    assert found == Report(
-        f'the panel cannot read the report here: {base}.json is of another training')
+@pytest.mark.parametrize(('trained', 'exists', 'word'), [
+    ({**TRAINED, 'measurements_used': '399'}, True, 'another training'),
+    (TRAINED, False, 'another machine')])
+def test_a_report_of_another_training_or_machine_is_a_problem(
+        base: Path, trained: dict[str, str], exists: bool, word: str) -> None:
+    if not exists:
+        Path(f'{base}.json').unlink()
+    found = read_report(base, trained)
+    assert word in found.problem
+    assert (found.accepted, found.text, found.picture) == (False, '', b'')
 
 
 @pytest.mark.parametrize('text', [
     '[]', '{', '[' * 100_000, '\xff', '{"bags": 1}', '{"bags": [{"recorded_model": []}]}'])
-def test_figures_that_are_none_are_a_problem_and_no_more(tmp_path: Path, text: str) -> None:
+def test_malformed_figures_are_a_problem_and_no_more(tmp_path: Path, text: str) -> None:
     for name in ('new.json', 'summary.json'):
         (tmp_path / name).write_text(text, encoding='latin-1')
     assert text[:2] == '{"' or 'cannot read' in read_report(tmp_path / 'new').problem
     found = read_comparison(tmp_path, 'new', 1.0, 'one\n\ntwo: wrong\n')
-    assert found.problem == 'the replay failed: one two: wrong'
-
-
-def test_a_report_that_is_elsewhere(tmp_path: Path) -> None:
-    found = read_report(tmp_path / 'new')
-    assert found.problem.startswith(
-        'the panel cannot read the report here, perhaps it is on another machine: ')
+    assert found.problem.endswith('one two: wrong')
 
 
 @pytest.mark.parametrize('data', [
-    b'', png()[:-1], b'GIF89a' + png(), png(100_000, 100_000), png(0, 1),
-    b'<svg xmlns="http://www.w3.org/2000/svg"/>'])
-def test_what_is_no_whole_picture_of_bounded_size_is_none(tmp_path: Path, data: bytes) -> None:
-    (tmp_path / 'a.png').write_bytes(data)
-    assert read_picture(tmp_path / 'a.png') == b''
+    b'', png()[:-1], b'GIF89a' + png(), b'<svg xmlns="http://www.w3.org/2000/svg"/>'])
+def test_only_a_whole_png_is_a_picture(base: Path, data: bytes) -> None:
+    Path(f'{base}.png').write_bytes(data)
+    assert read_report(base).picture == b''
 
 
 def test_pipes_folders_and_large_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
-    with pytest.raises(ValueError, match='no regular file'):
-        read_bounded(tmp_path / 'pipe', 10)
-    with pytest.raises((OSError, ValueError)):
-        read_bounded(tmp_path, 10)
     (tmp_path / 'large').write_bytes(bytes(11))
-    with pytest.raises(ValueError, match='has 11 bytes, at most 10 are read'):
-        read_bounded(tmp_path / 'large', 10)
-    assert read_picture(tmp_path / 'pipe') == b''
+    for name, words in (('pipe', 'not a regular file'), ('.', 'not a regular file'),
+                        ('large', 'more than 10 bytes')):
+        with pytest.raises(ValueError, match=words):
+            read_bounded(tmp_path / name, 10)
 
 
 @pytest.mark.parametrize(('model', 'name'), [
     ('/a/new.safetensors', '/a/new'), ('/a/new.refused.safetensors', '/a/new'),
     ('reactor_nz4', None), ('', None)])
-def test_files_lie_beside_the_model(model: str, name: str | None) -> None:
+def test_a_report_is_beside_its_model(model: str, name: str | None) -> None:
     assert report_base(model) == (None if name is None else Path(name))
 
 
-def test_a_report_that_is_written_again_is_seen(base: Path) -> None:
-    before = report_state(base)
-    assert report_state(base) == before
-    Path(f'{base}.md').unlink()
-    assert report_state(base) != before
-
-
-def test_pictures_go_by_what_they_are_of_and_by_nothing_else() -> None:
+def test_pictures_have_two_names() -> None:
     own = Learning(report=Report(picture=b'one'))
     assert [own.picture(name) for name in ('training', 'comparison', '../x', '/etc/passwd')] == [
         b'one', b'', b'', b'']
 
 
-def test_a_replay_tells_both_models_figures(tmp_path: Path) -> None:
+def test_a_comparison_has_the_figures_of_both_models(tmp_path: Path) -> None:
     both = {'compared': 10, 'beyond_tolerance': 3, 'largest_difference': -1.23456,
             'largest_at_s': 7.0}
     (tmp_path / 'summary.json').write_text(json.dumps({'bags': [{
@@ -135,9 +131,51 @@ def test_a_replay_tells_both_models_figures(tmp_path: Path) -> None:
         'recorded_model': {**both, 'beyond_tolerance': 0}}]}))
     (tmp_path / 'replay.png').write_bytes(png())
     found = read_comparison(tmp_path, 'new', 1.0, '')
-    assert (found.problem, found.lines) == ('', ('the recorded commands are reproduced',))
+    assert (found.problem, len(found.lines), found.picture) == ('', 1, png())
     assert found.figures == {
-        'measurements': '12', 'commands compared': '10', 'that differ by more': '3',
-        'largest difference': '-1.235', 'at [s]': '7', 'acting model: commands that differ': '0'}
-    assert found.picture == png()
-    assert learning.MAX_PICTURE < 2 ** 25
+        'Measurements': '12', 'Commands compared': '10', 'Commands that differ': '3',
+        'Largest difference': '-1.235', 'Time of it [s]': '7',
+        'Commands of the active model that differ': '0'}
+
+
+def test_a_report_is_followed(base: Path) -> None:
+    given = {'system': 'reactor'}
+    values = {name: row.default for name, row in panel_table(None, given).rows.items()}
+    settings = panel_table(None, given).snapshot(values)
+    watch = LearningWatch('reactor', Wiring(
+        panel_signals(None, given), settings.states, settings.inputs), '/', str)
+    try:
+        assert 'train one' in watch.compare('reactor_nz4').text
+        model = f'{base}.safetensors'
+        Path(f'{base}.json').write_text(json.dumps({**FIGURES, 'model_file': model}))
+        watch.training({**TRAINED, 'model_file': model}, '')
+        wait(lambda: watch.learning.report and watch.learning.report.accepted)
+        assert 'record first' in watch.compare('reactor_nz4').text
+        Path(f'{base}.json').write_text(json.dumps({**FIGURES, 'model_file': 'other'}))
+        wait(lambda: watch.learning.report and 'another training' in watch.learning.report.problem)
+    finally:
+        watch.complete()
+
+
+def wait(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_model_is_described_in_words() -> None:
+    model = load(model_path('two_tanks'))
+    found = model_card(model)
+    assert found['Model class'] == 'free lift, n_z = 2'
+    assert found['Learned from'] == 'two tanks'
+    assert {'Condition number', 'Held-out roll-out error (RMS), level 1 [m]'} <= set(found)
+    assert not any('_' in name for name in found)
+    assert training_ranges(model)['level_1'] == (model.states.lower[0], model.states.upper[0])
+    assert status_card({
+        'model': 'x', 'model file time': '2026-11-25T15:10:08.000+00:00', 'law': 'none',
+        'distance outside training box [half widths]': '0.5', 'gain norm': 'nan',
+        'coolant outside training box [half widths]': '0'}) == {
+        'File written': '2026-11-25 15:10:08',
+        'State outside the training range [half widths]': '0.5',
+        'Coolant outside the training range [half widths]': '0'}

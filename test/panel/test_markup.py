@@ -15,7 +15,7 @@ import yaml
 
 from koopman_ros import panel
 from koopman_ros.panel.alarm_page import alarm_page
-from koopman_ros.panel.frame import attribute, Frame, Visitor
+from koopman_ros.panel.layout import attribute, PageLayout, Visitor
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.overview import overview
 from koopman_ros.panel.trend_page import trend_page
@@ -54,10 +54,9 @@ def keys_and_texts(value: Any) -> Iterator[tuple[str, Any]]:
 def test_hostile_texts_of_all_sources_stay_texts(
         client: Client, path: str, may_act: bool) -> None:
     source = HostileSource()
-    frame = Frame(source, Visitor(TEXTS[0], lambda: may_act), path)
-    PAGES[path](frame)
-    for update in frame._updates:
-        update(source.snapshot)
+    layout = PageLayout(source, Visitor(TEXTS[0], lambda: may_act), path)
+    PAGES[path](layout)
+    layout.update()
     shown = 0
     for element in client.elements.values():
         assert CODE not in element.tag
@@ -81,7 +80,7 @@ def test_hostile_texts_of_all_sources_stay_texts(
 
 
 def test_what_charts_show_at_the_cursor_is_drawn_not_markup(client: Client) -> None:
-    trend_page(Frame(HostileSource(), Visitor('anna', lambda: True), '/trends'))
+    trend_page(PageLayout(HostileSource(), Visitor('anna', lambda: True), '/trends'))
     (chart,) = (own for own in client.elements.values() if isinstance(own, ui.echart))
     assert chart.options['tooltip']['renderMode'] == 'richText'
 
@@ -107,19 +106,18 @@ def test_exported_parameters_are_yaml_of_the_same_names_whatever_these_are() -> 
 
 # Calls that make of a text more than a text; their arguments are written out in the program.
 _MAKERS = {'props', 'classes', 'style', 'html', 'markdown', 'run_javascript', 'add_head_html',
-           'add_body_html', 'add_css', 'element', 'div', 'tag', 'default_props',
+           'add_body_html', 'add_css', 'element', 'box', 'tag', 'default_props',
            'default_classes', 'default_style', 'notify', 'add_slot', 'run_method',
            'on_js', 'sanitize', 'navigate'}
 #: what passes on an argument that is checked where these are called, or makes it of numbers
 _PASSED_ON = {
-    ('frame.py', 'ui.element(tag).classes(classes)'), ('frame.py', 'ui.element(tag)'),
-    ('frame.py', '_Words(tag, text).classes(classes)'),
-    ('frame.py', 'ui.add_css(CSS)'), ('frame.py', 'ui.add_head_html(WATCH)'),
-    ('frame.py', "element.classes(**{'remove' if shown else 'add': 'hidden'})"),
-    ('frame.py', "element.style(replace='; '.join((f'{side}: {100.0 * share:.1f}%' for side, "
-     "share in found)) or 'display: none')"),
+    ('layout.py', 'ui.element(tag).classes(classes)'), ('layout.py', 'ui.element(tag)'),
+    ('layout.py', '_Label(tag, text).classes(classes)'),
+    ('layout.py', 'ui.add_css(CSS)'), ('layout.py', 'ui.add_head_html(WATCH)'),
+    ('layout.py', "element.classes(**{'remove' if shown else 'add': 'hidden'})"),
+    ('layout.py', "element.style(replace=style or 'display: none')"),
     # the name of a priority
-    ('frame.py', 'priority.classes(replace=word)'),
+    ('alarm_page.py', 'priority.classes(replace=word)'),
 }
 
 
@@ -138,11 +136,11 @@ def test_props_classes_styles_and_markup_are_written_out_in_the_program() -> Non
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(
                 node.func, 'id', '')
             given = [*node.args, *(keyword.value for keyword in node.keywords)]
-            if name in ('words', '_Words'):
+            if name in ('label', '_Label') and len(given) > 1:
                 # tag and classes; between them is the text
                 given = [*given[:1], *given[2:]]
             elif name not in _MAKERS:
                 continue
             if not all(map(literal, given)):
                 found.add((path.name, ast.unparse(node)))
-    assert found - {('frame.py', '_Words(tag, text)')} == _PASSED_ON
+    assert found - {('layout.py', '_Label(tag, text)')} == _PASSED_ON

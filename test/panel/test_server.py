@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pages as a server: strangers, proxies, several panels, and pages of other users."""
+"""The web server: strangers, proxies, several panels, and pages of other users."""
 
 from collections.abc import Callable, Iterator
 import contextlib
@@ -9,6 +9,7 @@ from email.message import Message
 import http.client
 import json
 import logging
+import math
 import os
 from pathlib import Path
 import re
@@ -19,22 +20,23 @@ from typing import NamedTuple
 from urllib.parse import urlencode
 
 from nicegui import Client
-from playwright.sync_api import expect
+from playwright.sync_api import expect, Page
 import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from koopman_ros.panel.access import Cost, hashed, Role, write_user
+from koopman_ros.panel import trend_page
 from koopman_ros.panel.connections import Listener, Seldom
 from koopman_ros.panel.server import PanelServer
-from support.browser import opened_browser
-from support.hostile import HostileSource, TEXTS
+from koopman_ros.panel.trend_page import zoomed
+from support.browser import opened_browser, Pages
+from support.hostile import HostileSource, NOW, TEXTS
+from support.users import PASSWORDS, write_users
 
 # NiceGUI looks through all objects of the process for its server, also those of torch where
 # another test has imported it.
 pytestmark = pytest.mark.filterwarnings('ignore:.torch.distributed.reduce_op. is:FutureWarning')
 
-PASSWORDS = {'anna': 'correct horse', 'otto': 'battery staple', 'olga': 'staple battery'}
 HOST = 'panel.example'
 PROXY, OTHER = '127.0.0.1', '127.0.0.9'
 TIMEOUT = 30.0
@@ -50,12 +52,9 @@ class Site:
     """A panel with users, in a thread of this process: it can be there only once."""
 
     def __init__(self, folder: Path) -> None:
-        users = folder / 'users'
-        for name, password in PASSWORDS.items():
-            role = Role.VIEWER if name == 'otto' else Role.OPERATOR
-            write_user(users, name, role, hashed(password, Cost(2, 8, 1)))
         self.source = HostileSource()
-        self.server = PanelServer(self.source, '127.0.0.1', 0, str(users), '', '', [PROXY])
+        self.server = PanelServer(self.source, '127.0.0.1', 0, str(write_users(folder / 'users')),
+                                  '', '', [PROXY])
         self.server.start()
         self.url = self.server.address
         self.port = int(self.url.rpartition(':')[2])
@@ -82,6 +81,12 @@ class Site:
 
 
 @pytest.fixture(scope='module')
+def browser() -> Iterator[Pages]:
+    with opened_browser() as own:
+        yield own
+
+
+@pytest.fixture(scope='module')
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     own = Site(tmp_path_factory.mktemp('server'))
     yield own
@@ -101,7 +106,7 @@ def test_users_log_in_through_a_proxy_with_tls(site: Site) -> None:
     answer = site.log_in('anna', source=PROXY, **forwarded('10.1.0.1'))
     assert answer.status == 303
     cookie, *rules = answer.headers['set-cookie'].split('; ')
-    assert {'Secure', 'HttpOnly', 'SameSite=strict'} <= set(rules)
+    assert {'secure', 'httponly', 'samesite=strict'} <= set(rules)
     answer = site.ask('GET', '/', source=PROXY, host=HOST, Cookie=cookie,
                       X_Forwarded_Proto='https')
     assert answer.status == 200
@@ -110,7 +115,7 @@ def test_users_log_in_through_a_proxy_with_tls(site: Site) -> None:
         assert told is True
     # without TLS at the proxy there is no such rule for the cookie
     answer = site.log_in('anna', source=PROXY, **forwarded('10.1.0.1', 'http'))
-    assert 'Secure' not in answer.headers['set-cookie']
+    assert 'secure' not in answer.headers['set-cookie']
 
 
 def test_headers_of_a_proxy_are_believed_from_its_address_alone(site: Site) -> None:
@@ -121,7 +126,7 @@ def test_headers_of_a_proxy_are_believed_from_its_address_alone(site: Site) -> N
         **forwarded('10.1.0.2'), 'Origin': 'https://elsewhere'}).status == 403
 
 
-def test_wrong_log_ins_through_a_proxy_keep_out_their_own_address_alone(site: Site) -> None:
+def test_wrong_log_ins_through_a_proxy_delay_their_own_address_alone(site: Site) -> None:
     def wrong(client: str) -> list[int]:
         return [site.log_in('olga', 'wrong', source=PROXY, **forwarded(client)).status
                 for _ in range(6)]
@@ -133,11 +138,6 @@ def test_wrong_log_ins_through_a_proxy_keep_out_their_own_address_alone(site: Si
     assert site.log_in('olga').status == 303
 
 
-def test_a_proxy_needs_users() -> None:
-    with pytest.raises(ValueError, match='trusted_proxy needs users'):
-        PanelServer(HostileSource(), '127.0.0.1', 0, '', '', '', [PROXY])
-
-
 # Several panels.
 
 
@@ -145,10 +145,22 @@ def test_the_cookie_is_that_of_this_panel(site: Site) -> None:
     name = site.cookie('anna').partition('=')[0]
     assert re.fullmatch(rf'koopman_panel_{site.port}_[0-9a-f]{{8}}', name)
     token = site.cookie('anna').partition('=')[2]
-    # the browser sends those of other panels of this host, too
+    # the browser sends those of other panels of this host as well
     other = f'koopman_panel_{site.port + 1}_00000000=x; koopman_panel=y'
     assert site.ask('GET', '/', Cookie=f'{other}; {name}={token}').status == 200
-    assert site.ask('GET', '/', Cookie=f'{other}; koopman_panel_1={token}').status == 303
+    for cookie in (f'{other}; koopman_panel_1={token}', f'{name}={token}x', f'{name}=x{token}',
+                   f'{name}=eyJpZCI6ICJ4In0=.x.y', f'{name}='):
+        assert site.ask('GET', '/', Cookie=cookie).status == 303
+
+
+def test_a_log_out_ends_the_session_and_not_those_of_other_browsers(site: Site) -> None:
+    own, other = site.cookie('anna'), site.cookie('anna')
+    answer = site.ask('GET', '/logout', Cookie=own)
+    assert answer.status == 303
+    assert 'expires=Thu, 01 Jan 1970' in answer.headers['set-cookie']
+    # the cookie is still signed, but its session has ended
+    assert site.ask('GET', '/', Cookie=own).status == 303
+    assert site.ask('GET', '/', Cookie=other).status == 200
 
 
 # Pages of other users.
@@ -338,15 +350,20 @@ def test_a_log_has_so_many_lines_in_a_period(caplog: pytest.LogCaptureFixture) -
         'line 0', 'line 1', 'line 2 (further lines are left out for up to 3600 s)']
 
 
-# All pages, in a browser.
+# In a browser.
 
 
-def test_no_text_from_outside_runs_in_the_browser(site: Site) -> None:
-    with opened_browser() as browser, browser.page(f'{site.url}/login') as page:
-        page.get_by_label('Name').fill('anna')
-        page.get_by_label('Password').fill(PASSWORDS['anna'])
-        page.keyboard.press('Enter')
-        page.wait_for_url(f'{site.url}/')
+def log_in(page: Page, site: Site) -> None:
+    page.goto(f'{site.url}/login')
+    page.get_by_label('Name').fill('anna')
+    page.get_by_label('Password').fill(PASSWORDS['anna'])
+    page.keyboard.press('Enter')
+    page.wait_for_url(f'{site.url}/')
+
+
+def test_no_text_from_outside_runs_in_the_browser(site: Site, browser: Pages) -> None:
+    with browser.page('about:blank') as page:
+        log_in(page, site)
         for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
             page.goto(f'{site.url}{path}')
             page.wait_for_selector('#beat[data-beat]')
@@ -354,13 +371,66 @@ def test_no_text_from_outside_runs_in_the_browser(site: Site) -> None:
                 'groups => groups.forEach(group => group.click())')
             expect(page.locator('header')).to_contain_text(TEXTS[4])
             for chart in page.locator('.nicegui-echart').all():
-                # what is at the cursor
                 chart.hover(position={'x': 300.0, 'y': 90.0})
             if path == '/model':
-                page.get_by_role('button', name='Take over the new one …').click()
+                page.get_by_role('button', name='Activate the new model …').click()
                 expect(page.get_by_role('dialog')).to_contain_text(TEXTS[4])
                 page.get_by_role('button', name='Cancel').last.click()
                 page.get_by_role('button', name='Train').click()
                 expect(page.get_by_text(f'refused: {TEXTS[0]}').first).to_be_visible()
             assert page.evaluate('window.CAUGHT') is None, path
         browser.forgive()
+
+
+DATA = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    return getElement(parseInt(chart.id.slice(1))).chart.getOption().series[0].data;
+}"""
+ZOOM = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    getElement(parseInt(chart.id.slice(1))).chart.dispatchAction(
+        {type: 'dataZoom', start: 40, end: 60});
+}"""
+
+
+def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
+        site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trend_page, '_BUCKETS', 20)
+    for k in range(36_000):
+        site.source.view.trends.add('level', NOW + 0.1 * k, {
+            12_345: 70.0, 23_456: -30.0}.get(k, math.sin(0.01 * k)))
+    with browser.page('about:blank') as page:
+        log_in(page, site)
+        page.goto(f'{site.url}/trends')
+        page.wait_for_selector('#beat[data-beat]')
+        page.get_by_role('button', name='1 h', exact=True).click()
+
+        def drawn(share: float) -> list[float]:
+            return [value for time, value in page.evaluate(DATA)
+                    if abs(time / 1e3 - NOW - 1800.0) < 1800.0 * share]
+
+        until(lambda: len(drawn(1.0)) > 50)
+        whole = drawn(1.0)
+        assert len(whole) < 100
+        assert (max(whole), min(whole)) == (70.0, -30.0)
+        assert len(drawn(0.2)) < 20
+        page.evaluate(ZOOM)
+        until(lambda: len(drawn(0.2)) > 30)
+        browser.forgive()
+
+
+@pytest.mark.parametrize(('event', 'window'), [
+    ({'start': 25.0, 'end': 50}, (0.25, 0.5)), ({'batch': [{'start': 0, 'end': 100}]}, (0.0, 1.0)),
+    ({'start': 50.0, 'end': 25.0}, None), ({'start': -1, 'end': 5}, None), ({}, None),
+    ({'start': 'nan', 'end': 5}, None), ({'batch': 1}, None), (None, None), ([], None)])
+def test_the_zoom_of_a_browser_is_checked(
+        event: object, window: tuple[float, float] | None) -> None:
+    assert zoomed(event) == window
+
+
+def test_without_chromium_a_test_says_how_to_install_it(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv('PATH', str(tmp_path))
+    with pytest.raises(pytest.fail.Exception, match='sudo apt-get install chromium'), (
+            opened_browser()):
+        pass

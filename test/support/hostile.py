@@ -7,9 +7,11 @@ from concurrent.futures import Future
 import math
 
 from koopman_ros.panel.alarms import Priority
-from koopman_ros.panel.learning import Comparison, Learning, Report
-from koopman_ros.panel.plant import CONTROLLER, ERROR, ParameterView, PlantView, TRAINER
 from koopman_ros.panel.requests import Action, Answer
+from koopman_ros.panel.snapshot import CONTROLLER, ERROR, TRAINER
+from koopman_ros.panel.training_report import Comparison, Learning, Report
+from koopman_ros.panel.view_model import LoopViewModel
+from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.wire import Signals
 
 NOW = 1_790_000_000.0  # s of Unix time
@@ -29,24 +31,25 @@ class HostileSource:
     def __init__(self) -> None:
         unit = TEXTS[0]
         signals = Signals({'level': unit, 'height': TEXTS[4]}, {'pump': TEXTS[10]}, ('level',))
-        own = self.view = PlantView(signals, signals.units, 3600.0, NOW)
-        own.trained({'level': (0.0, 1.0), 'pump': (0.0, 10.0)}, {TEXT: TEXT, 'kind': TEXT})
+        own = self.view = LoopViewModel(signals, signals.units, 3600.0, NOW)
+        own.take_model({'level': (0.0, 1.0), 'pump': (0.0, 10.0)}, {TEXT: TEXT, 'kind': TEXT})
         for second in range(20):
             at = NOW - 20.0 + second
-            own.hear('measured', {'level': 0.5 + second / 50.0, 'height': 1.0}, at, at)
-            own.hear('commands', {'pump': 2.0 + second}, at, at)
-        own.record('measurement', {'mode': TEXT, 'level': TEXT}, NOW)
-        own.record('mode', {'mode': TEXT}, NOW)
-        own.record('model', {'model': {'name': f'{TEXT}.safetensors', 'digest': TEXT}}, NOW)
-        own.record('parameters', {'parameters': list(TEXTS)}, NOW)
-        own.internals({f'estimated_other [{TEXT}]': 1.0})
-        task = {TEXT: TEXT, 'model': TEXT, 'model_file': TEXT, 'accepted': 'True', 'reason': TEXT,
+            own.take_signals('measured', {'level': 0.5 + second / 50.0, 'height': 1.0}, at, at)
+            own.take_signals('commands', {'pump': 2.0 + second}, at, at)
+        own.take_record('measurement', {'mode': TEXT, 'level': TEXT}, NOW)
+        own.take_record('mode', {'mode': TEXT}, NOW)
+        own.take_record('model', {'model': {'name': f'{TEXT}.safetensors', 'digest': TEXT}}, NOW)
+        own.take_record('parameters', {'parameters': list(TEXTS)}, NOW)
+        own.take_internals({f'estimated_other [{TEXT}]': 1.0})
+        task = {TEXT: TEXT, 'model': TEXT, 'law': TEXT, 'model_file': TEXT, 'accepted': 'True',
+                f'{TEXT} outside training box [half widths]': TEXT, 'reason': TEXT,
                 'done [%]': TEXT}
         for name in ('controller: control', 'trainer: training', 'trainer: recording',
                      'trainer: experiment', *TEXTS):
-            own.status(name, ERROR, TEXT, task, NOW, plant=TEXT)
-        parameters = {name: ParameterView(name, value, TEXT, TEXT, TEXT, -math.inf, math.inf,
-                                          read_only, TEXTS)
+            own.take_status(name, ERROR, TEXT, task, NOW, plant=TEXT)
+        parameters = {name: ParameterDescription(
+            name, value, TEXT, TEXT, TEXT, -math.inf, math.inf, read_only, TEXTS)
                       for name, value, read_only in (
                           *((text, 1.0, False) for text in TEXTS),
                           *((f'group {text}.{text}', TEXT, True) for text in TEXTS),
@@ -56,7 +59,7 @@ class HostileSource:
                           (f'{TEXTS[0]}.experiment_min', TEXT, True),
                           (f'{TEXTS[0]}.experiment_max', TEXT, True))}
         for node in (CONTROLLER, TRAINER):
-            own.parameters(node, parameters)
+            own.take_parameters(node, parameters)
         for text in TEXTS:
             own.alarms.report(text, True, Priority.HIGH, text, NOW)
             own.alarms.report(f'shelved {text}', True, Priority.LOW, text, NOW)
@@ -64,8 +67,8 @@ class HostileSource:
         own.alarms.acknowledge(TEXTS[0], TEXT, NOW + 2.0)
         own.alarms.shelve(f'shelved {TEXTS[0]}', 600.0, TEXT, NOW + 2.0)
         self.learning = Learning(
-            Report('', NOW, True, TEXT, TEXTS, {TEXT: TEXT}, TEXT, _PICTURE),
-            Comparison(TEXT, NOW, False, '', TEXTS, {TEXT: TEXT}, TEXT, _PICTURE))
+            Report('', TEXTS, {TEXT: TEXT}, TEXT, _PICTURE, NOW, True, TEXT),
+            Comparison('', TEXTS, {TEXT: TEXT}, TEXT, _PICTURE, TEXT, NOW))
         self.title = TEXT
         self.snapshot = own.snapshot(NOW + 2.0)
         self.asked: list[Action] = []

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Alarms that outlast the panel: what is recalled of them, and from which files."""
+"""Alarms that outlast the panel: what is loaded of them, and from which files."""
 
 from collections.abc import Callable
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from koopman_ros.panel.alarm_memory import AlarmMemory
+from koopman_ros.panel.alarm_store import AlarmStore
 from koopman_ros.panel.alarms import Alarms, AlarmState, Priority
 
 NOW = 1_700_000_000.0
@@ -22,7 +22,7 @@ AGAIN = NOW + 100.0
 def file(tmp_path: Path) -> Path:
     """Return a file of one alarm of each kind: acknowledged, not, returned, shelved."""
     path, alarms = tmp_path / 'alarms.json', Alarms()
-    memory = AlarmMemory(alarms, path, NOW)
+    store = AlarmStore(alarms, path, NOW)
     for key in ('seen', 'new', 'over', 'shelved'):
         alarms.report(key, True, Priority.HIGH, f'text of {key}', NOW)
     alarms.advance(NOW + 1.0)
@@ -30,18 +30,18 @@ def file(tmp_path: Path) -> Path:
     alarms.shelve('shelved', 600.0, 'anna', NOW + 3.0)
     alarms.report('over', False, Priority.HIGH, '', NOW + 4.0)
     alarms.advance(NOW + 9.0)
-    memory.close()
+    store.close()
     return path
 
 
-def recalled(path: Path) -> Alarms:
+def loaded(path: Path) -> Alarms:
     alarms = Alarms()
-    assert not AlarmMemory(alarms, path, AGAIN).complaint
+    assert not AlarmStore(alarms, path, AGAIN).complaint
     return alarms
 
 
-def test_states_shelving_and_the_list_of_the_day_are_recalled(file: Path) -> None:
-    alarms = recalled(file)
+def test_states_shelving_and_the_list_of_the_day_are_loaded(file: Path) -> None:
+    alarms = loaded(file)
     assert {alarm.key: (alarm.state, alarm.text, alarm.acknowledged_by)
             for alarm in alarms.standing} == {
         'seen': (AlarmState.ACKNOWLEDGED, 'text of seen', 'anna'),
@@ -56,7 +56,7 @@ def test_states_shelving_and_the_list_of_the_day_are_recalled(file: Path) -> Non
 
 
 def test_what_is_there_again_is_no_news_and_what_is_not_returns(file: Path) -> None:
-    alarms = recalled(file)
+    alarms = loaded(file)
     # nodes take a while until they are heard
     alarms.advance(AGAIN + 8.0)
     for key in ('seen', 'shelved'):
@@ -72,16 +72,16 @@ def test_what_is_there_again_is_no_news_and_what_is_not_returns(file: Path) -> N
 
 def test_it_is_written_every_few_seconds_where_something_changed(tmp_path: Path) -> None:
     path, alarms = tmp_path / 'alarms.json', Alarms(delay_on=0.0)
-    memory = AlarmMemory(alarms, path, NOW)
+    store = AlarmStore(alarms, path, NOW)
     assert json.loads(path.read_text())['alarms'] == []
     for second, keys, kept in ((0.0, 'a', 1), (1.0, 'ab', 1), (5.0, 'ab', 2)):
         for key in keys:
             alarms.report(key, True, Priority.LOW, '', NOW + second)
-        memory.keep(NOW + second)
+        store.save(NOW + second)
         assert len(json.loads(path.read_text())['alarms']) == kept
     path.unlink()
-    memory.keep(NOW + 60.0)
-    memory.close()
+    store.save(NOW + 60.0)
+    store.close()
     assert not path.exists(), 'nothing had changed'
 
 
@@ -101,9 +101,9 @@ def test_a_damaged_file_is_moved_aside_and_said(
     text = change(file.read_text())
     file.write_bytes(text.encode(errors='surrogateescape'))
     alarms = Alarms()
-    memory = AlarmMemory(alarms, file, AGAIN)
-    assert memory.complaint.endswith(f'it is kept as {file}.damaged')
-    assert words in memory.complaint
+    store = AlarmStore(alarms, file, AGAIN)
+    assert store.complaint.endswith(f'it is kept as {file}.damaged')
+    assert words in store.complaint
     assert Path(f'{file}.damaged').read_bytes() == text.encode(errors='surrogateescape')
     assert not alarms.all
     assert json.loads(file.read_text())['journal'] == []
@@ -112,7 +112,7 @@ def test_a_damaged_file_is_moved_aside_and_said(
 def test_damaged_files_are_all_kept(file: Path) -> None:
     for ending in ('.damaged', '.damaged2', '.damaged3'):
         file.write_text('{"version": 1, "alarms": [' + ending)
-        assert str(AlarmMemory(Alarms(), file, AGAIN).complaint).endswith(f'{file}{ending}')
+        assert str(AlarmStore(Alarms(), file, AGAIN).complaint).endswith(f'{file}{ending}')
     assert Path(f'{file}.damaged').read_text().endswith('.damaged')
 
 
@@ -126,7 +126,7 @@ def test_a_file_of_something_else_is_refused_and_stays(tmp_path: Path, content: 
     path.chmod(0o640)
     before = os.stat(path)
     with pytest.raises(ValueError, match='is no file of alarms, and is not replaced'):
-        AlarmMemory(Alarms(), path, NOW)
+        AlarmStore(Alarms(), path, NOW)
     assert path.read_bytes() == content
     assert (os.stat(path).st_ino, os.stat(path).st_mode) == (before.st_ino, before.st_mode)
     assert [one.name for one in tmp_path.iterdir()] == ['other']
@@ -141,28 +141,28 @@ def test_what_is_no_file_is_refused_and_stays(tmp_path: Path, kind: str) -> None
         path.mkdir()
     else:
         path.symlink_to('/dev/zero')
-    with pytest.raises(ValueError, match='is no regular file'):
-        AlarmMemory(Alarms(), path, NOW)
+    with pytest.raises(ValueError, match='is not a regular file'):
+        AlarmStore(Alarms(), path, NOW)
     assert [one.name for one in tmp_path.iterdir()] == [kind]
 
 
 def test_an_empty_file_becomes_one_of_alarms_and_a_link_stays_one(tmp_path: Path) -> None:
     (tmp_path / 'target').touch()
     (tmp_path / 'link').symlink_to(tmp_path / 'target')
-    AlarmMemory(Alarms(), tmp_path / 'link', NOW)
+    AlarmStore(Alarms(), tmp_path / 'link', NOW)
     assert (tmp_path / 'link').is_symlink()
     assert json.loads((tmp_path / 'target').read_text())['alarms'] == []
 
 
 def test_a_file_that_another_program_has_put_there_since_is_not_replaced(file: Path) -> None:
     alarms = Alarms(delay_on=0.0)
-    memory = AlarmMemory(alarms, file, AGAIN)
+    store = AlarmStore(alarms, file, AGAIN)
     other = file.with_name('other')
     other.write_text('of another program')
     os.replace(other, file)
     alarms.report('another', True, Priority.LOW, '', AGAIN + 10.0)
     with pytest.raises(FileExistsError, match='another program has written'):
-        memory.keep(AGAIN + 10.0)
+        store.save(AGAIN + 10.0)
     assert file.read_text() == 'of another program'
     assert [one.name for one in file.parent.iterdir()] == [file.name], 'nothing is left beside'
 
@@ -170,12 +170,12 @@ def test_a_file_that_another_program_has_put_there_since_is_not_replaced(file: P
 def test_a_file_beside_with_the_name_of_a_part_stays(file: Path) -> None:
     part = file.with_name(file.name + '.part')
     part.write_text('of another program')
-    AlarmMemory(Alarms(), file, AGAIN).close()
+    AlarmStore(Alarms(), file, AGAIN).close()
     assert part.read_text() == 'of another program'
 
 
 def test_markup_and_control_characters_are_shown_as_text(file: Path) -> None:
     file.write_text(file.read_text().replace('text of new', 'a\\u0000b' + 'c' * 10_000))
-    (alarm,) = (alarm for alarm in recalled(file).standing if alarm.key == 'new')
+    (alarm,) = (alarm for alarm in loaded(file).standing if alarm.key == 'new')
     assert alarm.text.startswith('a�bc')
     assert len(alarm.text) == 500

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The panel's view of a loop: faceplates, silences, alarms, marks, and answers to requests."""
+"""View model of a loop: faceplates, silences, alarms, marks, and answers to requests."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,73 +12,73 @@ from typing import Any
 import pytest
 
 from koopman_ros.panel.alarms import AlarmState, Priority
-from koopman_ros.panel.plant import (
-    CONTROLLER,
-    ERROR,
-    LOST,
-    OK,
-    ParameterView,
-    pen,
-    PLANT,
-    PlantView,
-    REQUESTS,
-    Snapshot,
-    TRAINER,
-    WARN,
-)
+from koopman_ros.panel.faceplates import pen
 from koopman_ros.panel.requests import (
     Action,
     action_text,
     Answer,
     MANUAL,
-    PATIENCE,
     Requests,
     SETPOINT,
+    TIMEOUT,
 )
+from koopman_ros.panel.snapshot import (
+    CONTROL,
+    CONTROLLER,
+    ERROR,
+    LOST,
+    OK,
+    PLANT,
+    REQUESTS,
+    TRAINER,
+    WARN,
+)
+from koopman_ros.panel.view_model import LoopViewModel
+from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.units import display_unit, to_kelvin
 
 REACTOR = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
 TANKS = Signals({'level_1': 'm', 'level_2': 'm'}, {'pump_1': 'V', 'pump_2': 'V'},
                 ('level_1', 'level_2'))
-CONTROL = 'controller: control'
 NOW = 1_790_000_000.0  # s of Unix time
 
 
-def parameter(name: str, value: Any, **details: Any) -> ParameterView:
-    return replace(ParameterView(name, value, '', '', '', -math.inf, math.inf, False), **details)
+def parameter(name: str, value: Any, **details: Any) -> ParameterDescription:
+    plain = ParameterDescription(name, value, '', '', '', -math.inf, math.inf, False)
+    return replace(plain, **details)
 
 
-def view(signals: Signals = REACTOR, **read: str) -> PlantView:
+def view(signals: Signals = REACTOR, **read: str) -> LoopViewModel:
     usual = {name: display_unit(unit) for name, unit in signals.units.items()}
-    return PlantView(signals, {**usual, **read}, 3600.0, NOW)
+    return LoopViewModel(signals, {**usual, **read}, 3600.0, NOW)
 
 
-def measure(own: PlantView, celsius: float, seconds: float, wall: float | None = None) -> None:
-    own.hear('measured', {'temperature': to_kelvin(celsius)}, seconds,
+def measure(own: LoopViewModel, celsius: float, seconds: float, wall: float | None = None) -> None:
+    own.take_signals('measured', {'temperature': to_kelvin(celsius)}, seconds,
              NOW + seconds if wall is None else wall)
 
 
-def answered(own: PlantView, level: str = 'sdre', mode: str = 'automatic', wall: float = NOW
+def answered(own: LoopViewModel, level: str = 'sdre', mode: str = 'automatic', wall: float = NOW
              ) -> None:
-    own.record('measurement', {'mode': mode, 'level': level}, wall)
+    own.take_record('measurement', {'mode': mode, 'level': level}, wall)
 
 
 # Faceplates.
 
 
-def test_numbers_are_those_that_people_read() -> None:
+def test_values_are_in_the_units_that_people_read() -> None:
     own = view()
     measure(own, 51.8, 1.0)
-    own.hear('active_setpoints', {'temperature': to_kelvin(45.0)}, 0.5, NOW + 1.0)
-    own.hear('predicted', {'temperature': to_kelvin(51.7)}, 1.0, NOW + 1.0)
-    own.hear('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW + 1.0)
-    own.internals({'disturbance [K]': 0.5, 'estimated_temperature [degC]': 51.0,
+    own.take_signals('active_setpoints', {'temperature': to_kelvin(45.0)}, 0.5, NOW + 1.0)
+    own.take_signals('predicted', {'temperature': to_kelvin(51.7)}, 1.0, NOW + 1.0)
+    own.take_signals('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW + 1.0)
+    own.take_internals({'disturbance [K]': 0.5, 'estimated_temperature [degC]': 51.0,
                    'estimated_concentration [mol/L]': 0.88})
     now = own.snapshot(NOW + 1.0)
     (state,), (given,) = now.states, now.inputs
     assert (state.label, state.unit, state.controlled) == ('temperature', '°C', True)
-    assert [state.measured, state.setpoint, state.asked, state.predicted] == pytest.approx(
+    assert [state.measured, state.setpoint, state.target, state.predicted] == pytest.approx(
         [51.8, 45.0, 45.0, 51.7])
     assert (given.label, given.command, given.disturbance) == (
         'coolant temperature', pytest.approx(20.0), 0.5)
@@ -87,23 +87,23 @@ def test_numbers_are_those_that_people_read() -> None:
     # that of the measured state is none of an unmeasured one
     assert now.estimates == (('concentration', '0.88 mol/L'),)
     # of a filter with how well it is known, and of another model others
-    own.internals({'estimated_latent_1 [1]': 0.25, 'deviation_latent_1 [1]': 0.0123})
+    own.take_internals({'estimated_latent_1 [1]': 0.25, 'deviation_latent_1 [1]': 0.0123})
     assert own.snapshot(NOW + 1.2).estimates == (('latent 1', '0.25 ± 0.012 1'),)
 
 
 def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
     own = view(temperature='degF')
-    own.trained({'temperature': (to_kelvin(40.0), to_kelvin(60.0))}, {})
+    own.take_model({'temperature': (to_kelvin(40.0), to_kelvin(60.0))}, {})
     measure(own, 50.0, 1.0)
-    own.record('setpoint', {'accepted': True, 'signals': ['temperature'],
+    own.take_record('setpoint', {'accepted': True, 'signals': ['temperature'],
                             'value': [to_kelvin(45.0)], 'reason': []}, NOW)
     face = own.snapshot(NOW).states[0]
     assert face.unit == '°F'
-    assert [face.measured, face.asked, *face.training] == pytest.approx(
+    assert [face.measured, face.target, *face.training] == pytest.approx(
         [122.0, 113.0, 104.0, 140.0])
     assert face.abnormal == ''
     bare = view(temperature='degF')
-    bare.parameters('controller', {
+    bare.take_parameters('controller', {
         name: parameter(name, value, unit='degC') for name, value in (
             ('temperature.sensor_min', 0.0), ('temperature.sensor_max', 100.0))})
     low, high = bare.snapshot(NOW).states[0].span
@@ -114,9 +114,9 @@ def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
 
 def test_a_plan_lies_ahead_until_nothing_is_planned() -> None:
     own = view(temperature='degF')
-    own.planned(['temperature [degC]', 'coolant_temperature [degC]'], 100.0, [0.0, 1.0, 3.0],
+    own.take_plan(['temperature [degC]', 'coolant_temperature [degC]'], 100.0, [0.0, 1.0, 3.0],
                 [[50.0, 20.0], [45.0, 21.0], [40.0, 21.0]])
-    own.limits({'at_range_coolant_temperature [-1 lower, 1 upper]': 1.0,
+    own.take_limits({'at_range_coolant_temperature [-1 lower, 1 upper]': 1.0,
                 'at_rate_coolant_temperature [-1 falling, 1 rising]': 1.0,
                 'at_limit_temperature [-1 lower, 1 upper]': -1.0})
     answered(own, 'mpc')
@@ -125,10 +125,10 @@ def test_a_plan_lies_ahead_until_nothing_is_planned() -> None:
     assert [value for _, value in now.states[0].plan] == pytest.approx([122.0, 113.0, 104.0])
     assert now.inputs[0].plan == ((100.0, 20.0), (101.0, 21.0), (103.0, 21.0))
     assert now.states[0].active == 'kept above its lower limit'
-    assert now.inputs[0].active == 'at its upper limit, rising as fast as it may'
+    assert now.inputs[0].active == 'at its upper limit, at its rate limit (rising)'
     # one that is lost on its way leaves the last; limits that are over are
     answered(own, 'mpc')
-    own.limits({'at_rate_coolant_temperature [-1 falling, 1 rising]': 0.0})
+    own.take_limits({'at_rate_coolant_temperature [-1 falling, 1 rising]': 0.0})
     assert (own.snapshot(NOW).inputs[0].active, len(own.snapshot(NOW).inputs[0].plan)) == ('', 3)
     answered(own, 'sdre')
     assert own.snapshot(NOW).states[0].plan == own.snapshot(NOW).inputs[0].plan == ()
@@ -138,16 +138,16 @@ def test_a_plan_lies_ahead_until_nothing_is_planned() -> None:
     (['temperature [degC]'], [[1.0], [1.0, 2.0]]), (['temperature [m]'], [[1.0], [2.0]]),
     (['temperature [degC]', 'coolant_temperature [degC]'], [[1.0], [2.0]]),
     (['temperature'], [[1.0], [2.0]]), (['level [m]'], [[1.0], [2.0]])])
-def test_what_is_no_plan_of_these_signals_is_passed_over(
+def test_a_malformed_plan_is_ignored(
         names: list[str], rows: list[list[float]]) -> None:
     own = view()
-    own.planned(names, 100.0, [0.0, 1.0], rows)
+    own.take_plan(names, 100.0, [0.0, 1.0], rows)
     assert own.snapshot(NOW).states[0].plan == own.snapshot(NOW).inputs[0].plan == ()
 
 
 def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
     own = view(coolant_temperature='degC')
-    own.parameters('controller', {name: parameter(
+    own.take_parameters('controller', {name: parameter(
         name, value, unit='degC', lower=-273.15, upper=1e9) for name, value in (
         ('temperature.min', -273.15), ('temperature.max', 60.0),
         ('coolant_temperature.min', 5.0), ('coolant_temperature.max', 40.0))})
@@ -163,36 +163,37 @@ def test_the_first_of_the_levels_is_no_fallback() -> None:
     for levels, fallback in ((('mpc', 'sdre'), True), (('sdre', 'linear'), False), (None, False)):
         own = view()
         if levels:
-            own.parameters('controller', {'levels': parameter('levels', levels)})
-        own.record('measurement', {'mode': 'automatic', 'level': 'sdre'}, NOW)
+            own.take_parameters('controller', {'levels': parameter('levels', levels)})
+        own.take_record('measurement', {'mode': 'automatic', 'level': 'sdre'}, NOW)
         assert own.snapshot(NOW).fallback is fallback
 
 
 def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
     own = view()
-    own.parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})
+    own.take_parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})
     state = {'mode': {'name': 'AUTOMATIC'}}
 
     def model(event: str, name: str, digest: str) -> str:
-        own.record(event, {'model': {'name': name, 'digest': digest}, 'state': state}, NOW)
+        own.take_record(event, {'model': {'name': name, 'digest': digest}, 'state': state}, NOW)
         return own.snapshot(NOW).previous_model
 
     assert model('snapshot', 'runs/new.safetensors', 'a') == ''
     # the same file once more
     assert model('model', 'runs/new.safetensors', 'a') == ''
     assert model('model', 'runs/new.safetensors', 'b') == 'runs/new.previous.safetensors'
-    own.parameters('controller', {'model': parameter('model', 'runs/new.previous.safetensors')})
+    own.take_parameters('controller', {
+        'model': parameter('model', 'runs/new.previous.safetensors')})
     assert own.snapshot(NOW).previous_model == 'runs/new.safetensors'
 
 
 def test_bars_hold_ranges_and_values() -> None:
     own = view()
-    own.trained({'temperature': (to_kelvin(32.0), to_kelvin(54.0)),
+    own.take_model({'temperature': (to_kelvin(32.0), to_kelvin(54.0)),
                  'coolant_temperature': (to_kelvin(8.0), to_kelvin(28.0))}, {})
-    own.parameters(CONTROLLER, {name: parameter(name, value) for name, value in {
+    own.take_parameters(CONTROLLER, {name: parameter(name, value) for name, value in {
         'coolant_temperature.min': 5.0, 'coolant_temperature.max': 32.0}.items()})
     measure(own, 43.0, 1.0)
-    own.hear('commands', {'coolant_temperature': to_kelvin(32.0)}, 1.0, NOW + 1.0)
+    own.take_signals('commands', {'coolant_temperature': to_kelvin(32.0)}, 1.0, NOW + 1.0)
     now = own.snapshot(NOW + 1.0)
     (state,), (given,) = now.states, now.inputs
     assert state.training == pytest.approx((32.0, 54.0))
@@ -209,16 +210,16 @@ def test_bars_hold_ranges_and_values() -> None:
     assert state.abnormal == 'above the trained range'
 
 
-def test_a_set_point_that_is_asked_for_is_shown_beside_the_one_that_is_tracked() -> None:
+def test_the_target_of_a_ramp_is_shown() -> None:
     own = view(TANKS)
     for name, value in (('level_1', 0.10), ('level_2', 0.15)):
-        own.hear('active_setpoints', {name: value}, 1.0, NOW)
-    own.record('setpoint', {'value': [0.2], 'signals': ['level_2'], 'accepted': True,
+        own.take_signals('active_setpoints', {name: value}, 1.0, NOW)
+    own.take_record('setpoint', {'value': [0.2], 'signals': ['level_2'], 'accepted': True,
                             'reason': []}, NOW)
-    own.record('setpoint', {'value': [9.9], 'signals': ['level_1'], 'accepted': False,
+    own.take_record('setpoint', {'value': [9.9], 'signals': ['level_1'], 'accepted': False,
                             'reason': ['setpoint_outside']}, NOW)
     first, second = own.snapshot(NOW).states
-    assert (first.setpoint, first.asked, second.setpoint, second.asked) == (0.1, 0.1, 0.15, 0.2)
+    assert (first.setpoint, first.target, second.setpoint, second.target) == (0.1, 0.1, 0.15, 0.2)
 
 
 def test_a_snapshot_stays_what_it_was() -> None:
@@ -227,8 +228,8 @@ def test_a_snapshot_stays_what_it_was() -> None:
     before = own.snapshot(NOW)
     held = repr(before)
     measure(own, 60.0, 2.0)
-    own.status(CONTROL, ERROR, 'broken', {'a': 'b'}, NOW)
-    own.parameters(CONTROLLER, {'a': parameter('a', 1.0)})
+    own.take_status(CONTROL, ERROR, 'broken', {'a': 'b'}, NOW)
+    own.take_parameters(CONTROLLER, {'a': parameter('a', 1.0)})
     assert repr(before) == held
     with pytest.raises(TypeError):
         before.statuses['x'] = before.status('x')  # type: ignore[index]
@@ -237,15 +238,15 @@ def test_a_snapshot_stays_what_it_was() -> None:
 # Levels, silences, alarms and marks.
 
 
-def test_fallback_is_said_with_its_reason() -> None:
+def test_a_fallback_has_its_reason() -> None:
     own = view()
     answered(own)
-    own.status(CONTROL, OK, 'automatic', {'reason': 'none'}, NOW)
+    own.take_status(CONTROL, OK, 'automatic', {'reason': 'none'}, NOW)
     now = own.snapshot(NOW)
     assert (now.mode, now.level, now.fallback, now.reason) == (
         'automatic', 'learned law', False, '')
     answered(own, 'hold')
-    own.status(CONTROL, ERROR, 'held: check', {'reason': 'the sensor is frozen'}, NOW)
+    own.take_status(CONTROL, ERROR, 'held: check', {'reason': 'the sensor is frozen'}, NOW)
     now = own.snapshot(NOW)
     assert (now.level, now.fallback, now.reason) == ('hold', True, 'the sensor is frozen')
     answered(own, 'manual', 'manual')
@@ -258,24 +259,24 @@ def test_fallback_is_said_with_its_reason() -> None:
     {'value': [{}], 'accepted': True, 'signals': ['nobody']}, {'model': []}, {'state': 3}])
 @pytest.mark.parametrize('event', [
     'measurement', 'setpoint', 'manual_command', 'mode', 'model', 'snapshot', 'unheard-of'])
-def test_records_that_are_none_change_nothing(event: str, fields: Mapping[str, Any]) -> None:
+def test_malformed_records_change_nothing(event: str, fields: Mapping[str, Any]) -> None:
     own = view()
     answered(own)
-    own.record(event, fields, NOW)
+    own.take_record(event, fields, NOW)
     assert own.snapshot(NOW).level == 'learned law'
 
 
-def test_who_is_not_heard_is_named_with_the_time() -> None:
+def test_a_silence_has_its_node_and_time() -> None:
     own = view()
     assert own.snapshot(NOW + 1.0).silences == ()
     silences = own.snapshot(NOW + 10.0).silences
-    assert [(one.source, one.since, one.ever) for one in silences] == [
+    assert [(one.role, one.since, one.ever) for one in silences] == [
         (CONTROLLER, NOW, False), (PLANT, NOW, False)]
     for second in range(1, 20):
         measure(own, 50.0, float(second))
-        own.status(CONTROL, OK, 'automatic', {}, NOW + second)
+        own.take_status(CONTROL, OK, 'automatic', {}, NOW + second)
     assert own.snapshot(NOW + 20.0).silences == ()
-    (silence,) = (one for one in own.snapshot(NOW + 30.0).silences if one.source == PLANT)
+    (silence,) = (one for one in own.snapshot(NOW + 30.0).silences if one.role == PLANT)
     assert (silence.since, silence.ever) == (NOW + 19.0, True)
 
 
@@ -283,17 +284,17 @@ def test_a_slow_plant_is_not_silent_between_its_measurements() -> None:
     own = view()
     for minute in range(1, 5):
         measure(own, 50.0, 60.0 * minute)
-    assert PLANT not in [one.source for one in own.snapshot(NOW + 240.0 + 59.0).silences]
-    assert PLANT in [one.source for one in own.snapshot(NOW + 240.0 + 400.0).silences]
+    assert PLANT not in [one.role for one in own.snapshot(NOW + 240.0 + 59.0).silences]
+    assert PLANT in [one.role for one in own.snapshot(NOW + 240.0 + 400.0).silences]
 
 
 def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     own = view()
     measure(own, 50.0, 1.0, NOW)
     for second in range(4):
-        own.status(CONTROL, WARN, 'extrapolates', {}, NOW + second)
-        own.status('trainer: recording', WARN, 'disk is filling', {}, NOW + second)
-        own.status('other', ERROR, 'is down', {}, NOW + second)
+        own.take_status(CONTROL, WARN, 'extrapolates', {}, NOW + second)
+        own.take_status('trainer: recording', WARN, 'disk is filling', {}, NOW + second)
+        own.take_status('other', ERROR, 'is down', {}, NOW + second)
         own.advance(NOW + second)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 3.0).standing] == [
         ('other', Priority.HIGH), (CONTROL, Priority.MEDIUM), ('trainer: recording', Priority.LOW)]
@@ -309,21 +310,22 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     assert own.snapshot(NOW + 20.0).mode == ''
 
 
-def test_only_the_nodes_of_the_own_loop_are_taken_for_it() -> None:
-    own = PlantView(REACTOR, {name: display_unit(unit) for name, unit in REACTOR.units.items()},
-                    3600.0, NOW, {'line_1/plant': PLANT, 'line_1/controller': CONTROLLER,
-                                  'line_1/trainer': TRAINER})
+def test_nodes_of_another_loop_are_ignored() -> None:
+    read = {name: display_unit(unit) for name, unit in REACTOR.units.items()}
+    own = LoopViewModel(REACTOR, read, 3600.0, NOW, {
+        f'line_1/{role}': role for role in (PLANT, CONTROLLER, TRAINER)})
     measure(own, 50.0, 1.0, NOW)
     answered(own)
-    own.hear('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
-    own.status('line_1/controller: control', OK, 'automatic', {'reason': 'none'}, NOW)
-    own.status('line_1/trainer: training', OK, 'idle', {'model_file': 'a'}, NOW)
+    own.take_signals('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
+    own.take_status('line_1/controller: control', OK, 'automatic', {'reason': 'none'}, NOW)
+    own.take_status('line_1/trainer: training', OK, 'idle', {'model_file': 'a'}, NOW)
     for second in range(1, 10):
         for node in ('controller: control', 'trainer: training', 'plant: simulation'):
-            own.status(f'line_2/{node}', ERROR, 'of the other line', {}, NOW + second, 'other')
+            own.take_status(f'line_2/{node}', ERROR, 'of the other line', {}, NOW + second,
+                            'other')
         own.advance(NOW + second)
     now = own.snapshot(NOW + 10.0)
-    assert {one.source for one in now.silences} == {CONTROLLER, PLANT, TRAINER}
+    assert {one.role for one in now.silences} == {CONTROLLER, PLANT, TRAINER}
     assert (now.mode, now.level, now.plant) == ('', '', '')
     assert all('other line' not in alarm.text for alarm in now.standing)
     for name, values in ((CONTROL, {'reason': 'none'}),
@@ -332,7 +334,7 @@ def test_only_the_nodes_of_the_own_loop_are_taken_for_it() -> None:
         assert (status.level, status.message, status.values) == (ERROR, LOST, values)
     assert 'last command' in now.inputs[0].abnormal
     # one that is back is shown again
-    own.status('line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
+    own.take_status('line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
     now = own.snapshot(NOW + 10.0)
     assert (now.mode, now.status(CONTROL).message) == ('automatic', 'automatic')
     assert now.inputs[0].abnormal == ''
@@ -341,9 +343,9 @@ def test_only_the_nodes_of_the_own_loop_are_taken_for_it() -> None:
 def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     own = view()
     for i in range(200):
-        own.status(f'driver_{i}: io', OK, 'ok', {}, NOW)
-    own.status(CONTROL, ERROR, 'held', {}, NOW)
-    own.status('controller: actuators', WARN, 'stuck', {}, NOW)
+        own.take_status(f'driver_{i}: io', OK, 'ok', {}, NOW)
+    own.take_status(CONTROL, ERROR, 'held', {}, NOW)
+    own.take_status('controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     now = own.snapshot(NOW + 2.0)
     assert {alarm.key for alarm in now.standing} == {CONTROL, 'controller: actuators'}
@@ -352,13 +354,13 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
 
 def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     own = view()
-    own.status(CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
-    own.status(REQUESTS, WARN, 'request refused: a', {}, NOW)
-    own.status('controller: actuators', WARN, 'stuck', {}, NOW)
+    own.take_status(CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
+    own.take_status(REQUESTS, WARN, 'request refused: a', {}, NOW)
+    own.take_status('controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
         ('controller: actuators', Priority.MEDIUM), (REQUESTS, Priority.LOW)]
-    own.status(REQUESTS, OK, 'in order', {}, NOW + 3.0)
+    own.take_status(REQUESTS, OK, 'in order', {}, NOW + 3.0)
     own.advance(NOW + 9.0)
     assert [alarm.key for alarm in own.snapshot(NOW + 9.0).standing
             if alarm.state is not AlarmState.RETURNED and 'silence' not in alarm.key] == [
@@ -371,7 +373,7 @@ def test_many_short_errors_are_an_alarm() -> None:
         for k in range(2 * errors):
             now = NOW + seconds * k / 2
             measure(own, 50.0, seconds * k / 2 + 1.0, now)
-            own.status(CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
+            own.take_status(CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
             own.advance(now)
         own.advance(now + 1.5)
         return any('repeated' in alarm.key and alarm.text.endswith('the last: held')
@@ -385,7 +387,7 @@ def test_many_short_errors_are_an_alarm() -> None:
 def test_a_manual_command_is_limited_as_the_controller_does() -> None:
     own = view()
     assert own.limited('coolant_temperature', 60.0) == 60.0
-    own.parameters(CONTROLLER, {
+    own.take_parameters(CONTROLLER, {
         'coolant_temperature.min': parameter('coolant_temperature.min', 5.0),
         'coolant_temperature.max': parameter('coolant_temperature.max', 32.0)})
     assert own.limited('coolant_temperature', 60.0) == 32.0
@@ -397,10 +399,10 @@ def test_a_manual_command_is_limited_as_the_controller_does() -> None:
 
 def test_pens_and_marks_are_in_the_time_of_the_plant() -> None:
     own = view()
-    own.hear('active_setpoints', {'temperature': to_kelvin(45.0)}, 0.0, NOW)
+    own.take_signals('active_setpoints', {'temperature': to_kelvin(45.0)}, 0.0, NOW)
     for second in range(1, 4):
         measure(own, 50.0 + second, float(second))
-    own.record('mode', {'mode': 'manual'}, NOW)
+    own.take_record('mode', {'mode': 'manual'}, NOW)
     found = own.trends.window([pen('measured', 'temperature'),
                                pen('active_setpoints', 'temperature')], 0.0, 10.0)
     times, values = found['temperature']
@@ -420,100 +422,64 @@ def test_time_that_begins_again_begins_the_trends_again() -> None:
     assert own.snapshot(NOW).time == 1.0
 
 
-# Parameters.
+# Parameters and requests.
 
 
 @pytest.mark.parametrize(('value', 'text', 'read'), [
     (1.5, ' 2,5 ', 2.5), (3, '4', 4), (True, 'False', False), ('a', 'b', 'b'),
     (('a',), '[b, c]', ('b', 'c')), ((0.0,), '1, 2.5', (1.0, 2.5))])
-def test_texts_are_read_as_values_of_their_type(value: Any, text: str, read: Any) -> None:
-    found = parameter('p', value).read(text)
+def test_texts_are_parsed_as_values_of_their_type(value: Any, text: str, read: Any) -> None:
+    found = parameter('p', value).parse(text)
     assert found == read
     assert type(found) is type(read)
 
 
 @pytest.mark.parametrize(('given', 'text', 'words'), [
-    (parameter('p', 1.0), 'x', "'x' is not a number"),
-    (parameter('p', 1), '1.5', "'1.5' is not a whole number"),
-    (parameter('p', True), 'on', 'write true or false'),
-    (parameter('p', 1.0, range='[0, 2] m', lower=0.0, upper=2.0), '3', r'must be \[0, 2\] m'),
-    (parameter('p', 1.0), 'nan', 'must be a finite number'),
-    (parameter('p', (1.0,)), 'a', 'write numbers with commas between them'),
-    (parameter('p', 'a', choices=('a', 'b'), range='one of a, b'), 'c', 'must be one of a, b')])
-def test_what_cannot_be_is_refused_before_it_is_sent(
-        given: ParameterView, text: str, words: str) -> None:
+    (parameter('p', 1.0), 'x', 'not a number'), (parameter('p', 1), '1.5', 'whole number'),
+    (parameter('p', True), 'on', 'true or false'), (parameter('p', 1.0), 'nan', 'finite'),
+    (parameter('p', 1.0, range='[0, 2] m', lower=0.0, upper=2.0), '3', r'\[0, 2\] m'),
+    (parameter('p', (1.0,)), 'a', 'numbers'),
+    (parameter('p', 'a', choices=('a', 'b'), range='one of a, b'), 'c', 'one of a, b')])
+def test_wrong_texts_are_refused(
+        given: ParameterDescription, text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        given.read(text)
+        given.parse(text)
 
 
-# Requests.
-
-
-def asked(value: float = 318.15, words: str = '') -> tuple[Requests, list[Answer]]:
-    requests = Requests({SETPOINT: ('temperature',), MANUAL: ('coolant_temperature',)},
-                        lambda *_: words)
-    answers: list[Answer] = []
-    requests.add(SETPOINT, 'temperature', value, 0.0, answers.append)
-    return requests, answers
-
-
-def setpoint(value: float, accepted: bool = True, *codes: str) -> dict[str, Any]:
+def record(value: float, accepted: bool = True, *codes: str) -> dict[str, Any]:
     return {'value': [value], 'accepted': accepted, 'reason': list(codes)}
 
 
-def test_a_record_answers_the_request_of_its_value() -> None:
-    requests, answers = asked()
-    requests.record(SETPOINT, setpoint(300.0), 0.1)
-    requests.record(MANUAL, setpoint(318.15), 0.1)
-    requests.record('measurement', {}, 0.1)
-    assert not answers
-    requests.record(SETPOINT, setpoint(318.15), 0.2)
-    requests.record(SETPOINT, setpoint(318.15), 0.3)
-    assert answers == [Answer(True, 'accepted')]
+@pytest.mark.parametrize(('words', 'events', 'answers'), [
+    ('', [(SETPOINT, record(300.0)), (MANUAL, record(318.15)), ('measurement', {})], []),
+    ('', [(SETPOINT, record(318.15)), (SETPOINT, record(318.15))], ['accepted']),
+    ('outside 32 to 54 degC', [(SETPOINT, record(318.15, False, 'setpoint_outside'))],
+     ['refused: outside 32 to 54 degC']),
+    # the sentence of a code follows with the status, or never
+    ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')), 'automatic'], []),
+    ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')),
+          'request refused: it cannot be held'], ['refused: it cannot be held']),
+    ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')), 2.0],
+     ['refused: setpoint not held']),
+    ('', [TIMEOUT], []), ('', [TIMEOUT + 0.1], ['refused: the controller did not answer'])])
+def test_records_and_statuses_answer_requests(
+        words: str, events: list[Any], answers: list[str]) -> None:
+    requests = Requests({SETPOINT: ('temperature',), MANUAL: ('coolant_temperature',)},
+                        lambda *_: words)
+    found: list[Answer] = []
+    requests.add(SETPOINT, 'temperature', 318.15, 0.0, found.append)
+    for event in events:
+        if isinstance(event, tuple):
+            requests.take_record(event[0], event[1], 0.1)
+        elif isinstance(event, str):
+            requests.take_status(event)
+        else:
+            requests.advance(event)
+    assert [str(answer).partition(' within')[0] for answer in found] == answers
 
 
-def test_a_refusal_is_said_in_words() -> None:
-    requests, answers = asked(words='outside 32 to 54 degC')
-    requests.record(SETPOINT, setpoint(318.15, False, 'setpoint_outside'), 0.1)
-    assert [str(answer) for answer in answers] == ['refused: outside 32 to 54 degC']
-
-
-def test_a_refusal_whose_words_are_not_known_waits_for_the_status() -> None:
-    requests, answers = asked()
-    requests.record(SETPOINT, setpoint(318.15, False, 'setpoint_not_held'), 0.1)
-    requests.status('automatic')
-    assert not answers
-    requests.status('request refused: it cannot be held')
-    assert answers == [Answer(False, 'it cannot be held')]
-
-
-def test_a_refusal_without_words_names_its_codes_in_time() -> None:
-    requests, answers = asked()
-    requests.record(SETPOINT, setpoint(318.15, False, 'setpoint_not_held'), 0.1)
-    requests.advance(0.2)
-    assert not answers
-    requests.advance(10.0)
-    assert answers == [Answer(False, 'setpoint not held')]
-
-
-def test_a_controller_that_does_not_answer_is_said_so() -> None:
-    requests, answers = asked()
-    requests.advance(PATIENCE)
-    assert not answers
-    requests.advance(PATIENCE + 0.1)
-    assert answers[0].text.startswith('the controller did not answer within 3 s')
-    assert not answers[0].accepted
-
-
-def test_an_action_is_a_line_of_json_without_a_number_that_is_none() -> None:
+def test_an_action_is_a_line_of_json() -> None:
     action = Action('<script>', 'setpoint', 'temperature', 45.0, math.nan)
     assert json.loads(action_text(action, Answer(False, 'outside'), 12.3456)) == {
         'stamp': 12.346, 'who': '<script>', 'what': 'setpoint temperature', 'old': 'nan',
         'new': 45.0, 'accepted': False, 'answer': 'outside'}
-
-
-def test_what_is_shown_first_has_no_numbers_yet() -> None:
-    now: Snapshot = view(TANKS).snapshot(NOW)
-    assert [face.text(face.measured) for face in now.states] == ['–', '–']
-    assert [face.abnormal for face in now.states] == ['no measurement', 'no measurement']
-    assert (now.mode, now.level, now.standing) == ('', '', ())

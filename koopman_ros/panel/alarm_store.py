@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""File in which alarms and their journal outlast the panel."""
+
+from dataclasses import asdict
+from enum import Enum
+import json
+import math
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+from koopman_ros.panel.alarms import (
+    Alarm,
+    Alarms,
+    AlarmState,
+    Entry,
+    MAX_TEXT,
+    MAX_WHO,
+    Priority,
+)
+from koopman_ros.panel.files import read_bounded, replacing, sanitize_text
+
+VERSION = 1
+_MAX_BYTES = 32 * 2 ** 20
+_INTERVAL = 5.0  # s between two writes
+_BEGIN = re.compile(rb'\{\s*"version":\s*\d+,\s*"alarms":\s*\[')  # of a file of alarms
+_EVENTS = ('raised', 'returned', 'acknowledged', 'shelved', 'unshelved')
+_Identity = tuple[int, int, int, int]  # device, inode, time of writing in ns, bytes
+
+
+class AlarmStore:
+    """
+    Loads alarms from a file, and saves their changes.
+
+    A file that no panel wrote is never replaced, neither at the start nor later.
+
+    :param path: of the file, which may be missing or empty.
+    :param now: wall time.
+    :ivar complaint: why the content of a file was not loaded, or empty; the file was moved aside.
+    :raises ValueError: for a file that is no file of alarms.
+    :raises OSError: for a file that cannot be read, or a folder that cannot be written.
+    """
+
+    def __init__(self, alarms: Alarms, path: Path, now: float) -> None:
+        # a link stays one
+        self._alarms, self._path = alarms, Path(os.path.realpath(path))
+        self._saved, self._due = alarms.noted, now
+        self._own: _Identity | None = None  # of the file as it was saved or loaded
+        self.complaint = ''
+        if self._path.exists():
+            content, _ = read_bounded(self._path, _MAX_BYTES)
+            if content.strip():
+                self._load(content, now)
+            self._own = _identity(self._path)
+        self._save()
+
+    def _load(self, content: bytes, now: float) -> None:
+        if not _BEGIN.match(content):
+            raise ValueError(f'{self._path} is no file of alarms, and is not replaced')
+        try:
+            self._alarms.restore(*_parsed(content.decode()), now)
+        except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError,
+                RecursionError) as error:
+            aside = _unused(self._path)
+            # fails if there is one by now
+            os.link(self._path, aside)
+            self.complaint = (f'the alarms of {self._path} are not loaded, as the file is damaged '
+                              f'({error}): it is kept as {aside}')
+
+    def save(self, now: float) -> None:
+        """Save changes, every few seconds; to be called more often."""
+        if now >= self._due and self._alarms.noted != self._saved:
+            self._due = now + _INTERVAL
+            self._save()
+
+    def close(self) -> None:
+        """Save the last changes."""
+        if self._alarms.noted != self._saved:
+            self._save()
+
+    def _save(self) -> None:
+        self._saved = self._alarms.noted
+        content = {'version': VERSION, 'alarms': [asdict(one) for one in self._alarms.all],
+                   'journal': [asdict(one) for one in self._alarms.journal(-math.inf)[::-1]]}
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(self._path) as file:
+            file.write(json.dumps(content, indent=2, allow_nan=False, default=_name) + '\n')
+            file.flush()
+            saved = _identity(file.fileno())
+            if self._path.exists() and _identity(self._path) != self._own:
+                raise FileExistsError(f'another program has written {self._path} since, and it is '
+                                      'not replaced: give each panel its own alarm_file')
+        self._own = saved
+
+
+def _name(value: Any) -> str:
+    if isinstance(value, Enum):
+        return value.name
+    raise TypeError(f'{value!r} is not saved')
+
+
+def _identity(of: Path | int) -> _Identity:
+    found = os.stat(of)
+    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def _unused(path: Path) -> Path:
+    """Return a name beside a file that no other file has."""
+    number, found = 1, path.with_name(f'{path.name}.damaged')
+    while os.path.lexists(found):
+        number, found = number + 1, path.with_name(f'{path.name}.damaged{number + 1}')
+    return found
+
+
+def _parsed(text: str) -> tuple[list[Alarm], list[Entry]]:
+    found = json.loads(text)
+    if found.get('version') != VERSION:
+        raise ValueError(f'its version is {found.get("version")!r}, must be {VERSION}')
+    return ([_alarm(**one) for one in found['alarms']],
+            sorted((_entry(**one) for one in found['journal']), key=lambda entry: entry.time))
+
+
+def _alarm(key: str, text: str, priority: str, state: str, since: float,
+           shelved_until: float | None, acknowledged_by: str) -> Alarm:
+    return Alarm(sanitize_text(key, MAX_TEXT), sanitize_text(text, MAX_TEXT), Priority[priority],
+                 AlarmState[state], _finite(since),
+                 None if shelved_until is None else _finite(shelved_until),
+                 sanitize_text(acknowledged_by, MAX_WHO))
+
+
+def _entry(time: float, key: str, priority: str, text: str, what: str, who: str) -> Entry:
+    if what not in _EVENTS:
+        raise ValueError(f'{what!r} must be one of {", ".join(_EVENTS)}')
+    return Entry(_finite(time), sanitize_text(key, MAX_TEXT), Priority[priority],
+                 sanitize_text(text, MAX_TEXT), what, sanitize_text(who, MAX_WHO))
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f'times must be finite, got {value}')
+    return float(value)

@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Faceplates of signals: the values of one signal in the unit in which people read it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+
+from koopman_ros.units import conversion, printed
+
+Range = tuple[float, float]
+
+
+def readable(name: str) -> str:
+    """Return the name of a signal in words."""
+    return name.replace('_', ' ')
+
+
+def number(value: float, decimals: int) -> str:
+    """Write a number, or a dash for none."""
+    return f'{value:.{decimals}f}' if math.isfinite(value) else '–'
+
+
+def pen(kind: str, name: str) -> str:
+    """Return the name of the pen of a signal."""
+    suffix = {'active_setpoints': ' set-point', 'predicted': ' predicted', 'planned': ' planned',
+              'commands': ' command'}.get(kind, '')
+    return f'{name}{suffix}'
+
+
+@dataclass(frozen=True)
+class Faceplate:
+    """Values of a signal in the unit in which people read it; NaN for unknown ones."""
+
+    name: str
+    unit: str  #: as it is printed
+    span: Range  #: of its bar
+    decimals: int  #: of its numbers
+    training: Range | None  #: training range of the active model
+    abnormal: str  #: abnormal condition in words, or empty
+    limits: Range | None  #: of the command, or of a state in the MPC
+    active: str  #: active limits of the plan in words, or empty
+    plan: Sequence[tuple[float, float]]  #: times and values ahead; empty without a plan
+
+    @property
+    def label(self) -> str:
+        """The name in words."""
+        return readable(self.name)
+
+    def text(self, value: float) -> str:
+        """Write a value without the unit."""
+        return number(value, self.decimals)
+
+    def share(self, value: float) -> float:
+        """Return the place of a value on the bar, from 0 to 1."""
+        low, high = self.span
+        return min(max((value - low) / (high - low), 0.0), 1.0) if math.isfinite(value) else 0.0
+
+
+@dataclass(frozen=True)
+class StateFaceplate(Faceplate):
+    """A measured state."""
+
+    controlled: bool  #: whether it has a set-point
+    measured: float
+    setpoint: float  #: active set-point
+    target: float  #: requested set-point, to which the active one moves
+    predicted: float  #: the model's prediction of the measurement
+
+
+@dataclass(frozen=True)
+class InputFaceplate(Faceplate):
+    """An input."""
+
+    command: float
+    applied: float  #: measured behind the actuator
+    manual: float  #: last accepted manual command
+    disturbance: float  #: as a change of the input, in the signal's own unit
+    own_unit: str  #: of the disturbance
+
+
+@dataclass
+class SignalValues:
+    """Last values of a signal by the kind of their topic, in the unit in which people read it."""
+
+    name: str
+    unit: str
+    read: str  #: unit in which people read it
+    values: dict[str, float] = field(default_factory=dict)
+    training: Range | None = None
+    active: str = ''
+    plan: tuple[tuple[float, float], ...] = ()
+
+    def shown(self, value: float) -> float:
+        """Return a value in the unit in which people read it."""
+        return float(conversion(self.unit, self.read)(float(value)))
+
+    def get(self, kind: str, default: float = math.nan) -> float:
+        """Return the last value of a kind."""
+        return self.values.get(kind, default)
+
+    def state(self, controlled: bool, limits: Range | None, sensor: Range | None, silent: bool
+              ) -> StateFaceplate:
+        """Return the faceplate of a state with its limits and the range of its sensor."""
+        measured, setpoint = self.get('measured'), self.get('active_setpoints')
+        span = _span([self.training, sensor], [measured, setpoint, *(limits or ())])
+        abnormal = ''
+        if silent or math.isnan(measured):
+            abnormal = 'no measurement'
+        elif self.training and not self.training[0] <= measured <= self.training[1]:
+            side = 'above' if measured > self.training[1] else 'below'
+            abnormal = f'{side} the trained range'
+        return StateFaceplate(
+            self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
+            self.active, self.plan, controlled, measured, setpoint, self.get('target', setpoint),
+            self.get('predicted'))
+
+    def input(self, limits: Range | None, silent: bool) -> InputFaceplate:
+        """Return the faceplate of an input with its limits."""
+        command, applied = self.get('commands'), self.get('applied')
+        span = _span([limits, self.training], [command, applied])
+        slack = 1e-6 * (span[1] - span[0])
+        abnormal = ''
+        if silent and math.isfinite(command):
+            abnormal = 'last command, the controller is silent'
+        elif limits and command >= limits[1] - slack:
+            abnormal = 'at its upper limit'
+        elif limits and command <= limits[0] + slack:
+            abnormal = 'at its lower limit'
+        return InputFaceplate(
+            self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
+            self.active, self.plan, command, applied, self.get('manual'), self.get('disturbance'),
+            self.unit)
+
+
+def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:
+    """Return the range of a bar: the first finite one, a little wider, with all values in it."""
+    known = next((one for one in ranges if one and math.isfinite(one[1] - one[0])), None)
+    finite = [value for value in values if math.isfinite(value)]
+    low, high = known or (min(finite, default=0.0), max(finite, default=1.0))
+    margin = 0.1 * (high - low) or max(1.0, 0.1 * abs(high))
+    return min([low - margin, *finite]), max([high + margin, *finite])
+
+
+def _decimals(span: Range) -> int:
+    """Return the decimals that tell two of some two hundred marks on a bar apart."""
+    return min(max(2 - math.floor(math.log10(span[1] - span[0])), 0), 6)

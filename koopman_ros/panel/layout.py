@@ -1,0 +1,257 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Common page layout: head, tabs, banner, confirmations and answers. All content is escaped."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+import time
+from typing import Any, Protocol, TypeVar
+
+from nicegui import ui
+from nicegui.element import Element
+
+from koopman_ros.panel.alarms import AlarmState
+from koopman_ros.panel.requests import Action, Answer
+from koopman_ros.panel.snapshot import Snapshot
+from koopman_ros.panel.style import CSS, WATCH
+from koopman_ros.panel.training_report import Learning
+from koopman_ros.panel.view_model import LoopViewModel
+
+PERIOD = 0.25  # s between two updates of a page
+_TIMEOUT = 40.0  # s for an answer
+_TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
+         '/tuning': 'Tuning'}
+_TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
+_ADDRESSES = ('href', 'src')
+_Kind = TypeVar('_Kind', bound=Element)
+NOT_ALLOWED = Answer(False, 'view only: log in as operator to make changes')
+
+
+class Source(Protocol):
+    """Interface of the node for the pages."""
+
+    view: LoopViewModel  #: its trends and alarms may be used by any thread
+    snapshot: Snapshot  #: of now
+
+    @property
+    def learning(self) -> Learning:
+        """The last training and comparison."""
+
+    @property
+    def title(self) -> str:
+        """Title of all pages."""
+
+    def ask(self, action: Action) -> Future[Answer]:
+        """Carry out an action of an operator; called from any thread."""
+
+
+@dataclass(frozen=True)
+class Visitor:
+    """User of a page."""
+
+    name: str
+    may_act: Callable[[], bool]  #: whether it is an operator; called before each action
+    may_look: Callable[[], bool] = lambda: True  #: whether it is still logged in
+    named: bool = False  #: whether it can log out
+
+
+def clock(seconds: float) -> str:
+    """Return the time of day of a wall time."""
+    return time.strftime('%H:%M:%S', time.localtime(seconds))
+
+
+class PageLayout:
+    """
+    A page; its content goes into `body`.
+
+    :param path: of the page.
+    """
+
+    def __init__(self, source: Source, visitor: Visitor, path: str) -> None:
+        self.source, self.visitor = source, visitor
+        self.enabled = visitor.may_act()  #: whether the controls can be used
+        self._shown: Snapshot | None = None
+        self._updates: list[Callable[[Snapshot], None]] = []
+        self._beat_at = 0.0
+        ui.add_css(CSS)
+        ui.add_head_html(WATCH)
+        ui.page_title(f'{_TABS[path]} – {source.title}')
+        ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
+        self._head(path)
+        self.body = box('page')
+
+    def _head(self, path: str) -> None:
+        with box('head', tag='header'):
+            title = label('h1', self.source.title)
+            mode, level = label('div', ''), label('div', '', 'quiet')
+            beat = label('div', '', 'right quiet').props('id=beat')
+            label('div', self.visitor.name + ('' if self.enabled else ' (viewer)'), 'quiet')
+            if self.visitor.named:
+                link('Log out', '/logout')
+        with box('tabs', tag='nav').props('aria-label=Pages'):
+            tabs = {target: link(name, target) for target, name in _TABS.items()}
+        tabs[path].classes('here').props('aria-current=page')
+        banner = label('div', '', 'banner hidden').props('role=alert')
+
+        def show(now: Snapshot) -> None:
+            title.set_text(self.source.title)
+            mode.set_text(now.mode.upper() or 'MODE NOT KNOWN')
+            level.set_text(now.level if now.level != now.mode else '')
+            unacknowledged = sum(alarm.state is not AlarmState.ACKNOWLEDGED
+                                 for alarm in now.standing)
+            tabs['/alarms'].set_text(
+                f'Alarms ({unacknowledged})' if unacknowledged else 'Alarms')
+            if now.wall - self._beat_at >= 1.0:
+                self._beat_at = now.wall
+                beat.set_text(clock(now.wall))
+                attribute(beat, 'data-beat', f'{now.wall:.1f}')
+            silent = [f'no message from the {one.role} since {clock(one.since)}' + (
+                '' if one.ever else ', the start of the panel') for one in now.silences]
+            banner.set_text(f'⚠ Connection lost: {"; ".join(silent)}')
+            show_if(banner, bool(silent))
+
+        self.follow(show)
+
+    def follow(self, update: Callable[[Snapshot], None]) -> None:
+        """Call a function with each new snapshot."""
+        self._updates.append(update)
+
+    def run(self) -> None:
+        """Start the updates."""
+        self.update()
+        self._timer = ui.timer(PERIOD, self.update)
+
+    def update(self) -> None:
+        """Show a new snapshot."""
+        now = self.source.snapshot
+        if now is self._shown:
+            return
+        self._shown = now
+        if not self.visitor.may_look():
+            # logged out on another page, or idle for too long
+            self._timer.cancel()
+            ui.navigate.to('/login')
+            return
+        for update in self._updates:
+            update(now)
+
+    # Actions.
+
+    async def act(self, what: str, name: str = '', value: Any = None, old: Any = None) -> Answer:
+        """Carry out an action of the visitor if it is an operator; return the answer."""
+        if not self.visitor.may_act():
+            return NOT_ALLOWED
+        future = self.source.ask(Action(self.visitor.name, what, name, value, old))
+        try:
+            return await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
+        except TimeoutError:
+            return Answer(False, f'no answer within {_TIMEOUT:g} s')
+
+    def control(self, element: Any) -> Any:
+        """Return a control, disabled for a viewer."""
+        if not self.enabled:
+            element.disable()
+        return element
+
+    def button(self, text: str, act: Callable[[], Any]) -> ui.button:
+        """Return a button for operators."""
+        found: ui.button = self.control(ui.button(text, on_click=act).props('outline'))
+        return found
+
+    async def confirm(self, question: str, yes: str, details: Sequence[str] = ()) -> bool:
+        """Return whether the visitor confirms; Escape cancels."""
+        with ui.dialog() as dialog, box('card'):
+            label('div', question, 'value')
+            for line in details:
+                label('div', line)
+            with box('row1'):
+                ui.button('Cancel', on_click=lambda: dialog.submit(False)).props(
+                    'outline autofocus')
+                ui.button(yes, on_click=lambda: dialog.submit(True)).props('unelevated')
+        found = await dialog
+        dialog.delete()
+        return bool(found)
+
+
+class AnswerLine:
+    """Line with the answer to an action, next to its control."""
+
+    def __init__(self) -> None:
+        self._label = label('div', '', 'answer').props('role=status aria-live=polite')
+
+    def set_text(self, text: str) -> None:
+        """Show a text that is no refusal."""
+        self._label.set_text(text)
+        self._label.classes(remove='refused')
+
+    def show(self, answer: Answer) -> None:
+        """Show an answer."""
+        self.set_text(str(answer) if answer.accepted else f'✖ {answer}')
+        if not answer.accepted:
+            self._label.classes('refused')
+
+
+def show_if(element: Element, shown: bool) -> None:
+    """Show or hide an element."""
+    if shown is ('hidden' in element.classes):
+        element.classes(**{'remove' if shown else 'add': 'hidden'})
+
+
+def place(element: Element, **sides: float) -> None:
+    """Place an element by shares of its parent, or hide it if none is given."""
+    style = '; '.join(f'{side}: {100.0 * share:.1f}%' for side, share in sides.items())
+    element.style(replace=style or 'display: none')
+
+
+def attribute(element: _Kind, name: str, text: str) -> _Kind:
+    """
+    Set an attribute of an element to a text, which may come from outside.
+
+    NiceGUI parses a string of props, and evaluates props with a leading ':' as JavaScript: no text
+    from outside may be part of such a string, or of a name.
+
+    :param text: for an address a path of the panel itself.
+    :raises ValueError: for any other attribute, or another address.
+    """
+    own = name in _ADDRESSES and text.startswith('/') and not text.startswith('//')
+    if name not in _TEXTS and not own:
+        raise ValueError(f'{name} = {text!r} cannot be set: give a text to one of '
+                         f'{", ".join(_TEXTS)}, or a path to one of {", ".join(_ADDRESSES)}')
+    element.props[name] = text
+    return element
+
+
+def box(classes: str = '', tag: str = 'div') -> Element:
+    """Return an element for others."""
+    return ui.element(tag).classes(classes)
+
+
+def card(title: str, name: str) -> Element:
+    """Return a card with a title, and its name for a screen reader."""
+    found = attribute(box('card', tag='section'), 'aria-label', name)
+    with found:
+        label('h2', title)
+    return found
+
+
+class _Label(ui.label):
+    """Text in an element of any tag."""
+
+    def __init__(self, tag: str, text: str) -> None:
+        super().__init__(text)
+        self.tag = tag
+
+
+def label(tag: str, text: str, classes: str = '') -> ui.label:
+    """Return text in an element."""
+    return _Label(tag, text).classes(classes)
+
+
+def link(text: str, target: str) -> Any:
+    """Return a link to a page of the panel."""
+    return attribute(_Label('a', text), 'href', target)

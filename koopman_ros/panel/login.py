@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Log-in and log-out: the visitor of a request, and the log-in page."""
+
+import asyncio
+from collections.abc import Mapping
+from html import escape
+import math
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from koopman_ros.panel.access import Role, Users
+from koopman_ros.panel.layout import Source, Visitor
+from koopman_ros.panel.sessions import Session, Sessions, Throttle
+
+_LONGEST_FORM = 8192  # bytes
+_FORM_TIMEOUT = 10.0  # s
+_ID = 'id'  # of the session, in its cookie
+_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>Log in</title>
+<link rel="icon" href="data:,">
+<style>body{{background:#d9d9d6;color:#1d1d1b;font:18px system-ui,sans-serif;margin:0}}
+form{{background:#e9e9e6;border:1px solid #a9a9a5;max-width:340px;margin:12vh auto 0;padding:20px}}
+label{{display:block;margin:12px 0 4px}}input,button{{font:inherit;width:100%;padding:10px;
+box-sizing:border-box}}button{{margin-top:18px}}p{{color:#a40000;font-weight:600}}
+</style></head><body><form method="post" action="/login"><h1>{title}</h1>{message}
+<label for="name">Name</label><input id="name" name="name" autocomplete="username" autofocus
+required><label for="password">Password</label><input id="password" name="password"
+type="password" autocomplete="current-password" required><button>Log in</button></form>
+</body></html>"""
+
+
+class Doorkeeper:
+    """
+    Visitors of the panel by the session of their requests.
+
+    :param users: None if everybody who reaches the panel is the operator.
+    """
+
+    def __init__(self, users: Users | None) -> None:
+        self.users = users
+        self.sessions, self.throttle = Sessions(), Throttle()
+
+    @staticmethod
+    def session_id(scope: Mapping[str, Any]) -> object:
+        """Return the id of the session of a request, None without one."""
+        return scope['session'].get(_ID)
+
+    def session(self, scope: Mapping[str, Any], *, use: bool = True) -> Session | None:
+        """Return the session of a request, None if nobody is logged in."""
+        if self.users is None:
+            return Session('operator', Role.OPERATOR)
+        return self.sessions.find(self.session_id(scope), use=use)
+
+    def visitor(self, scope: Mapping[str, Any]) -> Visitor:
+        """Return the visitor of a page."""
+        session = self.session(scope)
+
+        def may_act() -> bool:
+            found = self.session(scope)
+            return found is not None and found.role is Role.OPERATOR
+
+        return Visitor(session.name if session else 'nobody', may_act,
+                       lambda: self.session(scope, use=False) is not None, self.users is not None)
+
+
+def add_login(app: FastAPI, source: Source, keeper: Doorkeeper) -> None:
+    """Serve the pages by which users log in and out."""
+    def form(message: str = '', status: int = 200) -> HTMLResponse:
+        shown = f'<p role="alert">{escape(message)}</p>' if message else ''
+        return HTMLResponse(_PAGE.format(title=escape(source.title), message=shown), status,
+                            {'cache-control': 'no-store'})
+
+    @app.get('/login', response_model=None)
+    def login_page() -> Response:
+        return RedirectResponse('/', 303) if keeper.users is None else form()
+
+    @app.post('/login', response_model=None)
+    async def log_in(request: Request) -> Response:
+        if keeper.users is None:
+            return RedirectResponse('/', 303)
+        if int(request.headers.get('content-length', _LONGEST_FORM + 1)) > _LONGEST_FORM:
+            return form('name and password are too long', 413)
+        try:
+            given = await asyncio.wait_for(request.form(max_fields=4, max_files=0), _FORM_TIMEOUT)
+        except TimeoutError:
+            return form(f'no name and password within {_FORM_TIMEOUT:g} s', 408)
+        except ClientDisconnect:
+            return form('the connection was closed', 400)
+        name, password = str(given.get('name', '')), str(given.get('password', ''))
+        address = request.client.host if request.client else ''
+        if wait := keeper.throttle.attempt(address, name):
+            return form(f'too many attempts: try again in {math.ceil(wait)} s', 429)
+        role = await run_in_threadpool(keeper.users.verify, name, password)
+        if role is None:
+            return form('name or password is wrong', 401)
+        keeper.throttle.succeeded(address, name)
+        request.session[_ID] = keeper.sessions.open(name, role)
+        return RedirectResponse('/', 303)
+
+    @app.get('/logout', response_model=None)
+    def log_out(request: Request) -> Response:
+        keeper.sessions.close(keeper.session_id(request.scope))
+        request.session.clear()
+        return RedirectResponse('/login', 303)

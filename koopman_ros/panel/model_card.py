@@ -1,0 +1,61 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Words for the active model: origin and figures in its file, and in the controller's status."""
+
+from collections.abc import Mapping
+
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.panel.faceplates import Range, readable
+from koopman_ros.units import unit_label
+
+_METRICS = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
+            'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
+_METRICS_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
+                      'noise': 'Measurement noise'}
+_STATUS = {'model file time': 'File written', 'model training data': 'Training data (digest)',
+           'model reloads': 'Reloads', 'model refused': 'Last file rejected',
+           'model check': 'Check on recent data', 'law': 'Control law',
+           'gain norm': 'Norm of the feedback gain',
+           'predicted growth per sample': 'Predicted growth per sample'}
+_OUTSIDE = ' outside training box [half widths]'
+_UNKNOWN = ('', 'none', 'nan')
+
+
+def training_ranges(model: LiftedModel) -> dict[str, Range]:
+    """Return the training range of each signal, in its unit."""
+    return {name: (low, high) for signals in (model.states, model.inputs)
+            for name, low, high in zip(signals.names, signals.lower.tolist(),
+                                       signals.upper.tolist(), strict=True)}
+
+
+def model_card(model: LiftedModel) -> dict[str, str]:
+    """Return origin and held-out figures of a model, by their names in words."""
+    origin = model.provenance
+    found = {
+        'Model class': model.kind,
+        'Acceptance': origin.acceptance,
+        'Learned from': origin.plant, 'Derivatives': origin.method,
+        'Written by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
+        'Random seed': '' if origin.seed is None else str(origin.seed)}
+    titles = dict(_METRICS)
+    for key, title in _METRICS_OF_STATES.items():
+        for name, unit in zip(model.states.names, model.states.units, strict=True):
+            several = len(model.states.names) > 1
+            titles[f'{key}_{name}' if several else key] = (
+                f'{title}{f", {readable(name)}" if several else ""} '
+                f'[{unit if unit == "K" else unit_label(unit)}]')
+    return found | {titles.get(name, name): f'{figure:.4g}'
+                    for name, figure in origin.metrics.items()}
+
+
+def status_card(values: Mapping[str, str]) -> dict[str, str]:
+    """Return the figures of the model in the controller's status, by their names in words."""
+    found = {title: values.get(key, '') for key, title in _STATUS.items()}
+    found['File written'] = found['File written'][:19].replace('T', ' ')
+    for key, value in values.items():
+        if key.endswith(_OUTSIDE):
+            name = key.removesuffix(_OUTSIDE)
+            subject = 'State' if name == 'distance' else name.capitalize()
+            found[f'{subject} outside the training range [half widths]'] = value
+    return {title: value for title, value in found.items() if value not in _UNKNOWN}

@@ -1,0 +1,359 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""View model of a loop: faceplates, statuses, alarms and trends, without ROS."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+import math
+from pathlib import Path
+import re
+from types import MappingProxyType
+from typing import Any
+
+from koopman_ros.panel.alarms import Alarms, Priority
+from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
+from koopman_ros.panel.files import sanitize_text
+from koopman_ros.panel.snapshot import (
+    CONTROL,
+    CONTROLLER,
+    ERROR,
+    OK,
+    PLANT,
+    REQUESTS,
+    ROLES,
+    Silence,
+    Snapshot,
+    TaskStatus,
+    TRAINER,
+)
+from koopman_ros.panel.trends import Trends
+from koopman_ros.parameters.description import ParameterDescription
+from koopman_ros.parameters.wire import Signals
+from koopman_ros.reasons import level_words
+from koopman_ros.resources import predecessor
+from koopman_ros.units import conversion, display_unit, printed
+
+_SILENT = 3.5  # s without a status, of which there is one per second
+_PERIODS = 5.0  # usual times between two measurements without one
+_BACK = 1.0  # s; a stamp that is earlier by more restarts the time
+_MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
+_MAX_NAME = 200  # characters
+# So many errors within so many seconds are an alarm, however short each of them is.
+_REPEATED, _WITHIN = 5, 60.0
+_SIGNAL = re.compile(r'(?:(estimated|deviation)_)?(\w+) \[(.+)\]')
+_LIMIT = re.compile(r'at_(range|rate|limit)_(\w+) \[')
+_OF_LIMITS: Mapping[tuple[str, float], str] = {
+    ('range', -1.0): 'at its lower limit', ('range', 1.0): 'at its upper limit',
+    ('rate', -1.0): 'at its rate limit (falling)', ('rate', 1.0): 'at its rate limit (rising)',
+    ('limit', -1.0): 'kept above its lower limit', ('limit', 1.0): 'kept below its upper limit'}
+_UNPLANNED = 3  # answers without a plan end the last plan: one message may be lost
+
+
+class LoopViewModel:
+    """
+    State of a loop as far as it was received.
+
+    All methods are called from one thread; :attr:`trends` and :attr:`alarms` from any.
+
+    :param signals: of the plant.
+    :param read: units in which people read them, by name.
+    :param span: s of the past that the trends keep.
+    :param now: wall time, as in all methods.
+    :param nodes: roles of the loop's nodes by their full names without the first slash.
+    """
+
+    def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float,
+                 nodes: Mapping[str, str] = ROLES) -> None:
+        self.signals, self.read = signals, read
+        self.alarms, self.trends = Alarms(), Trends(span)
+        self.plant = ''
+        self._nodes, self._span, self._start = dict(nodes), span, now
+        self._states = {name: SignalValues(name, unit, read[name])
+                        for name, unit in signals.states.items()}
+        self._inputs = {name: SignalValues(name, unit, read[name])
+                        for name, unit in signals.inputs.items()}
+        self._all = {**self._states, **self._inputs}
+        self._time = math.nan
+        self._unplanned = 0
+        self._mode = self._level = ''
+        self._statuses: dict[str, TaskStatus] = {}
+        # wall time and message of the last changes to ERROR, by task
+        self._errors: dict[str, deque[tuple[float, str]]] = {}
+        self._estimates: tuple[tuple[str, str], ...] = ()
+        self._parameters: dict[str, Mapping[str, ParameterDescription]] = {}
+        self._last: dict[str, float] = {}  # wall time of the last message, by role
+        self._period = 0.0
+        self._watched = [CONTROLLER, PLANT]
+        self._marked = now  # time of the last alarm that is a mark in the trends
+        self._about: Mapping[str, str] = MappingProxyType({})
+        self._previous_model = self._digest = ''
+
+    # Messages.
+
+    def take_signals(self, kind: str, values: Mapping[str, float], stamp: float, now: float
+                     ) -> None:
+        """Take values of signals in their own units, by the kind of their topic."""
+        if kind == 'measured':
+            self._take_time(stamp, now)
+        for name, value in values.items():
+            read = self._all[name].values[kind] = self._all[name].shown(value)
+            # a latched set-point has the stamp of its beginning
+            if math.isfinite(read) and kind != 'active_setpoints':
+                self._draw(pen(kind, name), stamp, read)
+        if kind == 'measured' and not math.isnan(self._time):
+            for name in self.signals.controlled:
+                setpoint = self._states[name].get('active_setpoints')
+                if math.isfinite(setpoint):
+                    self._draw(pen('active_setpoints', name), self._time, setpoint)
+
+    def _take_time(self, stamp: float, now: float) -> None:
+        if stamp < self._time - _BACK:
+            # a simulation has restarted
+            self.trends.rewind(stamp)
+        last = self._last.get(PLANT)
+        if last is not None and now > last:
+            self._period = min(0.9 * (self._period or now - last) + 0.1 * (now - last), 600.0)
+        self._last[PLANT], self._time = now, stamp
+
+    def _draw(self, name: str, stamp: float, value: float) -> None:
+        # not before the first measurement, nor from before a restart of the time
+        if not math.isnan(self._time) and stamp >= self._time - self._span:
+            self.trends.add(name, stamp, value)
+
+    def take_internals(self, values: Mapping[str, float]) -> None:
+        """Take the topic `controller_state`: values by name with unit."""
+        for name, own in self._inputs.items():
+            prefix = f'{name} ' if len(self._inputs) > 1 else ''
+            own.values['disturbance'] = values.get(f'{prefix}disturbance [{own.unit}]', math.nan)
+        found = {match.groups()[:2]: (value, match[3]) for key, value in values.items()
+                 if (match := _SIGNAL.fullmatch(key)) and math.isfinite(value)}
+        estimates = []
+        for (kind, name), (value, unit) in found.items():
+            if kind == 'estimated' and name not in self._states:
+                deviation = found.get(('deviation', name))
+                spread = f' ± {deviation[0]:.2g}' if deviation else ''
+                estimates.append(
+                    (readable(name), f'{value:.4g}{spread} {unit.replace("deg", "°")}'))
+        self._estimates = tuple(estimates)
+
+    def take_plan(self, names: Sequence[str], stamp: float, times: Sequence[float],
+                  rows: Sequence[Sequence[float]]) -> None:
+        """
+        Take a plan of the controller; an inconsistent one is ignored.
+
+        :param names: of signals, with units.
+        :param times: since the stamp, in s, with values of all signals in each row.
+        """
+        plans = []
+        try:
+            for name, values in list(zip(names, list(zip(*rows, strict=True)), strict=True)):
+                found = _SIGNAL.fullmatch(name)
+                if found and (own := self._all.get(found[2])):
+                    to_read = conversion(found[3], own.read)
+                    plans.append((own, tuple(
+                        (stamp + after, float(to_read(value)))
+                        for after, value in zip(times, values, strict=True))))
+        except ValueError:
+            return
+        for own, plan in plans:
+            own.plan = plan
+        self._unplanned = 0
+
+    def take_limits(self, values: Mapping[str, float]) -> None:
+        """Take the active limits of the plan, by name."""
+        words: dict[str, list[str]] = {}
+        for key, value in values.items():
+            found = _LIMIT.match(key)
+            if found and (text := _OF_LIMITS.get((found[1], value))):
+                words.setdefault(found[2], []).append(text)
+        for name, own in self._all.items():
+            own.active = ', '.join(words.get(name, ()))
+
+    def take_record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
+        """Take a record of the controller's event log; a malformed one is ignored."""
+        self._last[CONTROLLER] = now
+        try:
+            self._take_event(event, fields)
+        except (AttributeError, KeyError, TypeError, ValueError):
+            return
+
+    def _take_event(self, event: str, fields: Mapping[str, Any]) -> None:
+        match event:
+            case 'measurement' | 'silence':
+                mode, level = str(fields['mode']), str(fields['level'])
+                if self._level and level != self._level:
+                    self._mark('level', f'{level_words(self._level)} → {level_words(level)}')
+                self._mode, self._level = mode, level
+                self._unplanned += 1
+                if self._unplanned == _UNPLANNED:
+                    for own in self._all.values():
+                        own.plan, own.active = (), ''
+            case 'setpoint' if fields['accepted']:
+                names = fields.get('signals') or self.signals.controlled
+                for name, value in zip(names, fields['value'], strict=True):
+                    own = self._states[name]
+                    own.values['target'] = own.shown(value)
+                    self._mark('setpoint', f'{readable(name)} {own.values["target"]:.6g} '
+                                           f'{printed(own.read)}')
+            case 'manual_command' if fields['accepted']:
+                for own, value in zip(self._inputs.values(), fields['value'], strict=True):
+                    own.values['manual'] = own.shown(value)
+                self._mark('manual', 'manual command')
+            case 'mode':
+                self._mode = str(fields['mode'])
+                self._mark('mode', f'{self._mode} mode')
+            case 'model':
+                name, before = str(fields['model']['name']), self._digest
+                self._mark('model', f'model {name}')
+                self._digest = str(fields['model']['digest'])
+                if self._digest != before and name.endswith('.safetensors'):
+                    # the file was read again, after another training has replaced it
+                    self._previous_model = str(predecessor(Path(name)))
+            case 'parameters':
+                self._mark('model' if 'model' in fields else 'parameter',
+                           ', '.join(map(str, fields['parameters'])))
+                if 'model' in fields:
+                    self._digest = str(fields['model']['digest'])
+            case 'start' | 'snapshot':
+                self._mode = str(fields['state']['mode']['name']).lower()
+                self._digest = str(fields['model']['digest'])
+
+    def _mark(self, kind: str, text: str) -> None:
+        if not math.isnan(self._time):
+            self.trends.mark(self._time, kind, text)
+
+    def task(self, name: str) -> str:
+        """
+        Return ``<role>: <task>`` for a status of a node of this loop.
+
+        The name of another node is returned as it is, but '' for a node of another loop: one with
+        the base name of a role in another namespace.
+        """
+        node, _, task = name.partition(': ')
+        role = self._nodes.get(node)
+        if role is not None:
+            return f'{role}: {task}'
+        return '' if node.rsplit('/', 1)[-1] in self._nodes.values() else name
+
+    def take_status(self, name: str, level: int, message: str, values: Mapping[str, str],
+                    now: float, plant: str = '') -> None:
+        """Take the status of a task; WARN and ERROR raise an alarm."""
+        role = self._nodes.get(name.partition(': ')[0])
+        name = sanitize_text(self.task(name), _MAX_NAME)
+        # other nodes cannot crowd out the loop's
+        alike = [task for task in self._statuses
+                 if (task.partition(':')[0] in ROLES) is (role is not None)]
+        if not name or (name not in alike and len(alike) >= _MAX_TASKS):
+            return
+        if role in (CONTROLLER, TRAINER):
+            self._last[role] = now
+            if role not in self._watched:
+                self._watched.append(role)
+        if role in (PLANT, CONTROLLER):
+            self.plant = plant or self.plant
+        before = self._statuses.get(name)
+        self._statuses[name] = TaskStatus(name, level, message, dict(values))
+        if level >= ERROR and (before is None or before.level < ERROR):
+            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append((now, message))
+        # a refused request is shown to its operator
+        priority = Priority.HIGH if level >= ERROR else (
+            Priority.MEDIUM if role == CONTROLLER and name != REQUESTS else Priority.LOW)
+        # a warning that the control task repeats has a task and an alarm of its own
+        repeated = level < ERROR and values.get('condition', 'control') != 'control'
+        self.alarms.report(name, level > OK and not repeated, priority, f'{name}: {message}', now)
+
+    def take_parameters(self, role: str, values: Mapping[str, ParameterDescription]) -> None:
+        """Take all parameters of a node; none if it is gone."""
+        before = self._parameters.get(role, {}).get('model')
+        self._parameters[role] = MappingProxyType(dict(values))
+        if role == CONTROLLER and before and 'model' in values and (
+                values['model'].value != before.value):
+            self._previous_model = str(before.value)
+
+    def take_model(self, ranges: Mapping[str, Range], about: Mapping[str, str]) -> None:
+        """
+        Take the content of the active model's file.
+
+        :param ranges: training ranges, in the units of the signals.
+        :param about: origin and held-out figures, in words.
+        """
+        self._about = MappingProxyType(dict(about))
+        for name, own in self._all.items():
+            bounds = ranges.get(name)
+            own.training = bounds and (own.shown(bounds[0]), own.shown(bounds[1]))
+
+    # Snapshots.
+
+    def advance(self, now: float) -> None:
+        """Raise the alarms of silence and of repeated errors, and let delays run out."""
+        silent = {silence.role for silence in self._silences(now)}
+        for name, errors in self._errors.items():
+            often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
+            self.alarms.report(
+                f'{name}, repeated errors', often, Priority.HIGH, f'{name}: at least {_REPEATED} '
+                f'errors within {_WITHIN:g} s, the last: {errors[-1][1]}', now)
+        for role in self._watched:
+            text = 'no measurement' if role == PLANT else f'no message from the {role}'
+            self.alarms.report(f'silence of {role}', role in silent,
+                               Priority.LOW if role == TRAINER else Priority.HIGH, text, now)
+        self.alarms.advance(now)
+        raised = [entry for entry in self.alarms.journal(self._marked)
+                  if entry.what == 'raised' and entry.time > self._marked]
+        for entry in reversed(raised):
+            self._mark('alarm', entry.text)
+            self._marked = entry.time
+
+    def _silences(self, now: float) -> tuple[Silence, ...]:
+        found = []
+        for role in self._watched:
+            patience = max(_SILENT, _PERIODS * self._period) if role == PLANT else _SILENT
+            last = self._last.get(role, self._start)
+            if now - last > patience:
+                found.append(Silence(role, last, role in self._last))
+        return tuple(found)
+
+    def snapshot(self, now: float) -> Snapshot:
+        """Return the state at this instant."""
+        silences = self._silences(now)
+        no_plant, no_controller = (any(one.role == role for one in silences)
+                                   for role in (PLANT, CONTROLLER))
+        control = self._statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
+        levels = self._parameters.get(CONTROLLER, {}).get('levels')
+        best = str(levels.value[0]) if levels else 'sdre'
+        reason = control.values.get('reason', 'none')
+        return Snapshot(
+            plant=self.plant, wall=now, time=self._time,
+            mode='' if no_controller else self._mode,
+            level='' if no_controller else level_words(self._level),
+            fallback=bool(self._level) and self._level not in (best, 'manual'),
+            reason='' if reason == 'none' or no_controller else reason,
+            states=tuple(own.state(name in self.signals.controlled, self._bounds(own),
+                                   self._bounds(own, 'sensor_'), no_plant)
+                         for name, own in self._states.items()),
+            inputs=tuple(own.input(self._bounds(own), no_controller)
+                         for own in self._inputs.values()),
+            estimates=self._estimates, statuses=MappingProxyType(dict(self._statuses)),
+            standing=self.alarms.standing, shelved=self.alarms.shelved, silences=silences,
+            parameters=MappingProxyType(dict(self._parameters)), model=self._about,
+            previous_model=self._previous_model)
+
+    def limited(self, name: str, value: float) -> float:
+        """Return a manual command within the limits of the controller, as people read it."""
+        low, high = self._bounds(self._inputs[name]) or (-math.inf, math.inf)
+        return min(max(value, low), high)
+
+    def _bounds(self, own: SignalValues, kind: str = '') -> Range | None:
+        """Return the parameters ``min`` and ``max`` of a signal; None without a finite one."""
+        given = self._parameters.get(CONTROLLER, {})
+        lower, upper = (given.get(f'{own.name}.{kind}{end}') for end in ('min', 'max'))
+        if not (lower and upper and isinstance(lower.value, int | float)
+                and isinstance(upper.value, int | float)):
+            return None
+        # a parameter is in the display unit, and unbounded at the end of its range
+        to_read = conversion(display_unit(own.unit), own.read)
+        low = to_read(float(lower.value)) if lower.value > lower.lower else -math.inf
+        high = to_read(float(upper.value)) if upper.value < upper.upper else math.inf
+        return (low, high) if math.isfinite(low) or math.isfinite(high) else None

@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A parameter of another node, as that node describes it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class ParameterDescription:
+    """
+    Value, unit and range of a parameter.
+
+    >>> width = ParameterDescription('width', 1.5, 'm', 'of the door', '[0, 2] m', 0.0, 2.0, False)
+    >>> width.parse('1,75'), width.text
+    (1.75, '1.5')
+    """
+
+    name: str
+    value: Any
+    unit: str
+    meaning: str
+    range: str  #: in words
+    lower: float
+    upper: float
+    read_only: bool
+    choices: tuple[str, ...] = ()
+
+    def parse(self, text: str) -> Any:
+        """
+        Return the value that a text stands for.
+
+        :raises ValueError: for a text of another type or out of range.
+        """
+        text = text.strip()
+        if isinstance(self.value, bool):
+            if text.lower() not in ('true', 'false'):
+                raise ValueError('write true or false')
+            return text.lower() == 'true'
+        if isinstance(self.value, (int, float)):
+            try:
+                found = type(self.value)(text.replace(',', '.'))
+            except ValueError:
+                kind = 'a whole number' if isinstance(self.value, int) else 'a number'
+                raise ValueError(f'{text!r} is not {kind}') from None
+            if not self.lower <= found <= self.upper:
+                raise ValueError(f'must be {self.range or "a finite number"}')
+            return found
+        if isinstance(self.value, tuple):
+            parts = tuple(part.strip() for part in text.strip('[]').split(','))
+            if not self.value or not isinstance(self.value[0], float):
+                return parts
+            try:
+                return tuple(map(float, parts))
+            except ValueError:
+                raise ValueError('write numbers with commas between them') from None
+        if self.choices and text not in self.choices:
+            raise ValueError(f'must be {self.range}')
+        return text
+
+    @property
+    def text(self) -> str:
+        """The value as it is written."""
+        return _text(self.value)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ', '.join(map(_text, value))
+    if isinstance(value, float):
+        return f'{value:.10g}'
+    return str(value).lower() if isinstance(value, bool) else str(value)
