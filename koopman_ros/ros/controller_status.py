@@ -237,7 +237,8 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     if not report.measurement.follows:
         yield ACTUATORS, (
             f'the {now.input} does not follow its command within '
-            f'{_listed(now, tuning.tolerance)}: the observer uses the measured input; check the actuator and its limits')
+            f'{_listed(now, tuning.tolerance)}: the observer uses the measured input; check the '
+            'actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
             'the disturbance estimate is at its bound of '
