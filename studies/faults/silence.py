@@ -73,7 +73,7 @@ def stray(loop: FaultHarness) -> None:
     loop.run_for(2.0 * on.period)
     with loop.fault():
         for end in ('max', 'min'):
-            loop.by_hand(*(getattr(tuned, end) for tuned in on.parameters.inputs.values()))
+            loop.by_hand(*on.each_input(end))
             until = loop.now + 6.0
             while loop.now < until:
                 loop.run_for(on.period)
