@@ -61,7 +61,7 @@ $(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
 	@touch $@
 
 $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
-	$(INSTALL) --editable '.[ros,demo,train,bench,fast]'
+	$(INSTALL) --editable '.[ros,demo,train,bench]'
 	@touch $@
 
 demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, to be run from a browser)

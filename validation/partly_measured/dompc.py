@@ -15,9 +15,9 @@ import casadi
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws.base import Tuning, Weights
-from koopman_ros.control.laws.receding_horizon import RecedingHorizon
+from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
 from koopman_ros.estimation import Estimate, EstimatorTuning, ExtendedKalmanFilter
+from koopman_ros.tuning import Tuning
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case
 
@@ -153,9 +153,13 @@ class WithWindow:
 
 def horizon(case: Case) -> int:
     """Return how many samples the law `mpc` looks ahead."""
-    law = RecedingHorizon(case.truth, Tuning(Weights.physical(case.truth, case.Q, case.R)))
-    interval = case.period / case.system.seconds_per_time_unit
-    return round(float(np.sum(law.lengths(interval))) / interval)
+    model = case.truth
+    tuning = Tuning.for_model(model, state_weight=case.Q, input_weight=case.R)
+    law = RecedingHorizon(
+        model, tuning.for_signals(model, model.states.names), MPCParameters())
+    assert law.planner is not None
+    lengths = law.planner.grid(case.period).lengths
+    return round(float(np.sum(lengths) / lengths[0]))
 
 
 def true_filter(case: Case) -> ExtendedKalmanFilter:
