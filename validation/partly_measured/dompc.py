@@ -16,8 +16,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
-from koopman_ros.estimation import Estimate, EstimatorTuning, ExtendedKalmanFilter
-from koopman_ros.tuning import Tuning
+from koopman_ros.estimation import Estimate, ExtendedKalmanFilter
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case
 
@@ -153,10 +152,7 @@ class WithWindow:
 
 def horizon(case: Case) -> int:
     """Return how many samples the law `mpc` looks ahead."""
-    model = case.truth
-    tuning = Tuning.for_model(model, state_weight=case.Q, input_weight=case.R)
-    law = RecedingHorizon(
-        model, tuning.for_signals(model, model.states.names), MPCParameters())
+    law = RecedingHorizon(case.truth, case.tuning(case.truth), MPCParameters())
     assert law.planner is not None
     lengths = law.planner.grid(case.period).lengths
     return round(float(np.sum(lengths) / lengths[0]))
@@ -165,9 +161,7 @@ def horizon(case: Case) -> int:
 def true_filter(case: Case) -> ExtendedKalmanFilter:
     """Return the filter that a controller of this package has with the true model."""
     model = case.truth
-    return ExtendedKalmanFilter(model, EstimatorTuning(
-        case.outputs, 0.0, np.full(model.n_u, np.inf), case.noise,
-        case.wander / model.inputs.scale, case.initial_error / model.states.scale))
+    return ExtendedKalmanFilter(model, case.outputs, case.tuning(model), None)
 
 
 def _guess(case: Case, y: Array) -> Array:

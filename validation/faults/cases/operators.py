@@ -67,7 +67,7 @@ _BAD: tuple[dict[str, Any], ...] = (
     {f'{_COOLANT}.weight': 0.0}, {f'{_COOLANT}.weight': math.inf}, {f'{_COOLANT}.weight': 'much'},
     {f'{_COOLANT}.min': 60.0}, {f'{_COOLANT}.max': -10.0}, {f'{_COOLANT}.max': math.nan},
     {f'{_COOLANT}.rate_limit': -1.0}, {'temperature.setpoint_ramp': -math.inf}, {'max_gain': 0.0},
-    {'min_riccati_digits': -1.0}, {'measurement_timeout': math.nan},
+    {'max_riccati_residual': -1.0}, {'measurement_timeout': math.nan},
     {'model': ''}, {'model': '/nowhere/lift.safetensors'}, {'model': 3.0})
 
 
@@ -208,7 +208,7 @@ CASES = (
               partial(_without_the_cold, node='plant', usual=-20.0), worst=WINDUP),
     _constant('coolant-limited', f'the controller may not command less than {STUCK_AT:g} degC, '
               '15 min', partial(_without_the_cold, node='controller',
-                                usual=reactor.coolant_parameters().min),
+                                usual=reactor.coolant_limits()[0]),
               worst=WINDUP),
     _constant('noise', 'noise of 0.1 K, for good',
               partial(changed_for_good, parameters={'temperature.noise': 0.1}), band=0.5,
