@@ -75,7 +75,7 @@ class ControllerNode(ManagedNode):
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
         self._signals = signals_of(
-            loaded.model, self._settings.controlled, self._settings.states)
+            loaded.model, self._settings.tuning.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded
         # (n_u,) last command before the node became inactive, which is still in force at the plant
         self._last_command: Array | None = None

@@ -157,7 +157,7 @@ class ControlLoop:
         self.state, self._held_for = outcome.state, cause
         self.timing.commanded()
         if state.command is not None:
-            limits = self.controller.settings.limits
+            limits = self.controller.tuning.limits
             self._settling = cause is None and bool((
                 np.abs(outcome.command - state.command)
                 > _SETTLED * (limits.upper - limits.lower)).any())
@@ -171,7 +171,7 @@ class ControlLoop:
         state, wanted = self.state, self.state.manual_input
         return (state.mode is Mode.MANUAL and wanted is not None and state.command is not None
                 and silence * NANOSECONDS > _WATCH_STEP and not np.array_equal(
-                    self.controller.settings.limits.within(wanted), state.command))
+                    self.controller.tuning.limits.within(wanted), state.command))
 
     def _setpoint_waits(self, silence: float) -> bool:
         """Tell whether a set-point is not reached, and a measurement is overdue."""

@@ -172,7 +172,7 @@ def _control(now: Situation) -> tuple[Level, str]:
         return Level.ERROR, f'{mode.value}: {now.reason}'
     if mode is Mode.AUTOMATIC and report.depth > 0:
         level = Level.ERROR if report.level in _ACTIONS else Level.WARN
-        action = _WAY_BACK.format(now.input) if report.command.way_back else _action(now)
+        action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
         return level, f'{action}: {now.reason}'
     return Level.OK, ''
 
@@ -184,7 +184,7 @@ def _action(now: Situation) -> str:
 
 def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     """Yield every warning with the name of its condition, the most urgent first."""
-    report, states = now.report, now.controller.model.states
+    report, states, tuning = now.report, now.controller.model.states, now.controller.tuning
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         yield CONNECTIONS, now.complaint
@@ -199,7 +199,7 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     interval = 0.0 if math.isinf(now.state.interval) else now.state.interval
     overdue = max(_PATIENCE, 3.0 * interval)
     # manual commands are also sent between two measurements
-    unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.way_back
+    unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.recovery
                   and now.timing.silence > max(1.0, 2.0 * interval))
     if report.measurement.arrival is Arrival.REPEATED or (
             now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
@@ -236,11 +236,11 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     if not report.measurement.follows:
         yield ACTUATORS, (
             f'the {now.input} does not follow its command within '
-            f'{_listed(now, "tolerance")}: the observer goes by what is measured; check the '
+            f'{_listed(now, tuning.tolerance)}: the observer goes by what is measured; check the '
             'actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
-            f'the disturbance estimate is at its bound of {_listed(now, "max_disturbance")} '
+            f'the disturbance estimate is at its bound of {_listed(now, tuning.max_disturbance)} '
             f'of {now.input}: the plant is far from its model; retrain')
 
 
@@ -248,7 +248,7 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     """Say that the inputs do not suffice for the set-point as things are, or return ''."""
     if target.state is None or target.input is None:
         return ''
-    states, limits = now.controller.model.states, now.controller.settings.limits
+    states, limits = now.controller.model.states, now.controller.tuning.limits
     # where every state has a set-point, that is where it leads
     for name, wanted in () if target.state is target.setpoint else zip(
             now.signals.controlled, target.setpoint.tolist(), strict=True):
@@ -258,8 +258,9 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
             return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
                     f'cannot be held within the range of the {now.input}: '
                     f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
-    for (name, unit), wanted, (low, high, _) in zip(
-            now.signals.inputs.items(), target.input.tolist(), limits.each, strict=True):
+    for (name, unit), wanted, low, high in zip(
+            now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
+            limits.upper.tolist(), strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
             return (f'the set-point would need the {stem(name, unit)} at '
@@ -268,9 +269,10 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     return ''
 
 
-def _listed(now: Situation, parameter: str) -> str:
-    return ', '.join(f'{getattr(tuned, parameter):g} {now.signals.inputs[name]}'
-                     for name, tuned in now.parameters.inputs.items())
+def _listed(now: Situation, values: Array) -> str:
+    """Write values (n_u,) with their units."""
+    return ', '.join(f'{value:g} {unit}' for value, unit in zip(
+        values.tolist(), now.signals.inputs.values(), strict=True))
 
 
 def _figures(now: Situation, condition: str) -> dict[str, object]:
@@ -313,7 +315,7 @@ def _figures(now: Situation, condition: str) -> dict[str, object]:
         'missed measurements': now.counts.missed,
         'measurements rejected': now.counts.refused,
         **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
-           if 'mpc' in now.parameters.levels else {}),
+           if 'mpc' in now.parameters.tuning.levels else {}),
         **{f'{what} parts of {name}': count for what, counts in (
             ('late', now.assembler.late), ('missing', now.assembler.missing),
             ('doubled', now.assembler.doubled)) for name, count in counts.items()},

@@ -104,7 +104,7 @@ class OperatorRequests:
 
     def _limited(self, requested: Array) -> str:
         """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
-        within = self._loop.controller.settings.limits.within(requested)
+        within = self._loop.controller.tuning.limits.within(requested)
         return ', '.join(
             f'manual {stem(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
             f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
