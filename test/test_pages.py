@@ -14,7 +14,7 @@ from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
 
-from koopman_ros.control.laws.base import Plan
+from koopman_ros.control.laws import Plan
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import programs, topics
 from koopman_ros.ros.controller_messages import active_limits

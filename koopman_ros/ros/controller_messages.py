@@ -20,7 +20,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from koopman_ros.arrays import along_last, Array
 from koopman_ros.control import events, Report
-from koopman_ros.control.laws.base import Plan
+from koopman_ros.control.laws import Plan
 from koopman_ros.parameters.wire import Signals, Wiring
 from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics

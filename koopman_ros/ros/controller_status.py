@@ -249,8 +249,7 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     if target.state is None or target.input is None:
         return ''
     states, limits = now.controller.model.states, now.controller.tuning.limits
-    # where every state has a set-point, that is where it leads
-    for name, wanted in () if target.state is target.setpoint else zip(
+    for name, wanted in zip(
             now.signals.controlled, target.setpoint.tolist(), strict=True):
         place, unit = states.names.index(name), now.signals.states[name]
         found, width = float(target.state[place]), 2.0 * states.half_widths[place]

@@ -14,7 +14,7 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from koopman_ros.control import Mode, Report
-from koopman_ros.control.laws.base import Plan
+from koopman_ros.control.laws import Plan
 from koopman_ros.control.state import EstimateReport
 from koopman_ros.demo import reactor
 from koopman_ros.estimation import Innovation

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Mode, State
-from koopman_ros.control.laws.base import Plan
+from koopman_ros.control.laws import Plan
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters import model_checks

@@ -58,11 +58,10 @@ class Bench:
 
     def __init__(self, ros: Harness, parameters: Mapping[str, object] | None = None,
                  arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS,
-                 first: float = 1.0, command: tuple[str, ...] | None = None) -> None:
+                 first: float = 1.0) -> None:
         self.ros = ros
         self.sent = 0  # measurements
-        self.process = ros.start(
-            'controller', {**PATIENT, **(parameters or {})}, arguments, command)
+        self.process = ros.start('controller', {**PATIENT, **(parameters or {})}, arguments)
         self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self.tracked = ros.listen(Temperature, reactor.ACTIVE_SETPOINT, topics.LATCHED_QOS)
         self.thermometer = ros.speak(Temperature, reactor.TEMPERATURE, qos, to='controller')
