@@ -184,7 +184,7 @@ def _action(now: Situation) -> str:
 
 def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     """Yield every warning with the name of its condition, the most urgent first."""
-    report, states = now.report, now.controller.model.states
+    report, states, tuning = now.report, now.controller.model.states, now.controller.tuning
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         yield CONNECTIONS, now.complaint
