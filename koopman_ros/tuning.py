@@ -130,8 +130,9 @@ class Tuning:
     max_gain: float = parameter(
         1000.0, 'Largest norm of a Riccati gain, in scaled coordinates, that a law may use.', '',
         0.0, 1e9, open_minimum=True)
+    # the root of the machine's precision; `ros2 param load` reads 1e-8 as a text
     max_riccati_residual: float = parameter(
-        1e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
+        1.5e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
         0.0, 1.0, open_minimum=True)
     #: own parameters of laws and estimators, by name
     plugins: Mapping[str, Any] = plugin_parameters()
