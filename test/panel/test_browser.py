@@ -368,7 +368,7 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
         own = page.get_by_label('Parameters of the controller')
         own.get_by_text('coolant temperature', exact=True).click()
         row = own.locator('[data-parameter="coolant_temperature.max"]')
-        expect(row).to_contain_text('highest command')
+        expect(row).to_contain_text('max [degC]')
         given = row.get_by_role('textbox')
         expect(given).to_have_value('32')
         for text, said in (('31', 'set'), ('x', "✖ refused: 'x' is not a number"),
