@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bounds on what strangers can take of the panel: its connections, and lines of its log."""
+"""Bounds of the connections of the web server, and of the lines of its log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any
 MAX_CONNECTIONS = 256
 BACKLOG = 64  # connections that are accepted at once
 _WAITING = 1024  # connections that the kernel holds until they are accepted
-_SHARE_OF_FILES = 4  # of which connections take one part
+_SHARE_OF_FILES = 4  # one part of the open files is for connections
 
 Peer = tuple[str, int]
 
@@ -27,11 +27,11 @@ class Listener(socket.socket):
     """
     A listening socket with a bound on the connections that are open at a time.
 
-    A new connection past the bound closes the oldest of those without a request that is served, of
-    the address that has most of them: connections that never finish their request keep none out.
-    The bound holds from the first packet, also before TLS has been negotiated.
+    A new connection past the bound closes the oldest without a request that is served:
+    connections that never finish their request keep none out. The bound holds from the first
+    packet, also before TLS has been negotiated.
 
-    :ivar most: connections that are open at a time; fewer where the process may open few files.
+    :ivar most: bound of the open connections; lower if the process may open few files.
     """
 
     def __init__(self, *args: Any, most: int = MAX_CONNECTIONS) -> None:
@@ -46,7 +46,7 @@ class Listener(socket.socket):
         super().listen(max(backlog, _WAITING))
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection; raise ConnectionAbortedError where all others are served."""
+        """Accept a connection; raise ConnectionAbortedError if all others are served."""
         connection, address = super().accept()
         self._open = {peer: one for peer, one in self._open.items() if one.fileno() >= 0}
         if len(self._open) >= self.most and not self._close_one():
@@ -68,21 +68,18 @@ class Listener(socket.socket):
                 del self._served[place]
 
     def _close_one(self) -> bool:
-        waiting = [peer for peer in self._open if peer not in self._served]
-        if not waiting:
+        oldest = next((peer for peer in self._open if peer not in self._served), None)
+        if oldest is None:
             return False
-        of_address = Counter(host for host, _ in waiting)
-        most = max(of_address.values())
-        oldest = next(peer for peer in waiting if of_address[peer[0]] == most)
         with contextlib.suppress(OSError):
-            # the event loop finds it at its end, and closes it
+            # the event loop notices the end, and closes the connection
             self._open.pop(oldest).shutdown(socket.SHUT_RDWR)
         return True
 
 
 class Seldom(logging.Filter):
     """
-    Passes so many records of a logger in a period, and leaves out the rest.
+    Passes a number of records of a logger in a period, and drops the rest.
 
     :param period: in s.
     """
@@ -94,7 +91,7 @@ class Seldom(logging.Filter):
         self._lock = threading.Lock()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is written; the last one says that others are left out."""
+        """Return whether a record is written; the last one mentions that others are dropped."""
         with self._lock:
             now = time.monotonic()
             if now - self._begun >= self._period:
@@ -102,6 +99,6 @@ class Seldom(logging.Filter):
             self._count += 1
             if self._count == self._most:
                 record.msg, record.args = (
-                    f'{record.getMessage()} (further lines are left out for up to '
+                    f'{record.getMessage()} (further lines are dropped for up to '
                     f'{self._period:g} s)'), ()
             return self._count <= self._most

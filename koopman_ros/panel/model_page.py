@@ -14,7 +14,7 @@ from nicegui import ui
 
 from koopman_ros.panel.layout import AnswerLine, box, card, label, PageLayout, show_if
 from koopman_ros.panel.model_card import status_card
-from koopman_ros.panel.report_cards import comparison_card, Figures, report_card
+from koopman_ros.panel.report_cards import comparison_card, report_card
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
@@ -44,6 +44,35 @@ def model_page(page: PageLayout) -> None:
         comparison_card(page)
 
 
+class _Figures:
+    """Figures, one in a line."""
+
+    def __init__(self, *, columns: bool = False) -> None:
+        self._lines = box('').classes('pairs columns' if columns else 'pairs')
+        self._shown: dict[str, ui.label] = {}
+
+    def show(self, found: Mapping[str, str]) -> None:
+        """Show figures, without the unknown ones."""
+        values = {key: _brief(value) for key, value in found.items() if value not in ('none', '')}
+        if list(values) != list(self._shown):
+            self._lines.clear()
+            self._shown = {}
+            with self._lines:
+                for key in values:
+                    with box('pair'):
+                        label('div', key, 'quiet')
+                        self._shown[key] = label('div', '')
+        for key, value in values.items():
+            self._shown[key].set_text(value)
+
+
+def _brief(value: str) -> str:
+    try:
+        return f'{float(value):.4g}' if '.' in value else value
+    except ValueError:
+        return value
+
+
 class _Status:
     """Message of a status, and a mark if it is a warning or an error."""
 
@@ -61,7 +90,7 @@ class _Status:
 def _model(page: PageLayout) -> None:
     with card('active model', 'Model'):
         name = label('div', '', 'value')
-        status, figures, origin = _Status(), Figures(columns=True), Figures(columns=True)
+        status, figures, origin = _Status(), _Figures(columns=True), _Figures(columns=True)
         trained = label('div', '', 'quiet')
 
         async def reload() -> None:
@@ -121,7 +150,7 @@ def _buttons(page: PageLayout, actions: Mapping[str, tuple[Any, ...]]) -> None:
 
 def _recording(page: PageLayout) -> None:
     with card('recording', 'Recording'):
-        status, figures = _Status(), Figures()
+        status, figures = _Status(), _Figures()
         _buttons(page, {'Record': ('record', True), 'Stop': ('record', False)})
 
     def show(now: Snapshot) -> None:
@@ -135,7 +164,7 @@ def _recording(page: PageLayout) -> None:
 
 def _experiment(page: PageLayout) -> None:
     with card('experiment', 'Experiment'):
-        status, figures = _Status(), Figures()
+        status, figures = _Status(), _Figures()
         limits = label('div', '', 'lines quiet')
 
         async def start() -> None:
@@ -190,7 +219,7 @@ def _training(page: PageLayout) -> None:
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')
-        status, figures = _Status(), Figures()
+        status, figures = _Status(), _Figures()
         _buttons(page, {'Train': ('train',), 'Cancel': ('cancel',)})
 
     def show(now: Snapshot) -> None:

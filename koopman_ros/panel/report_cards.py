@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cards of the last training and of a comparison: figures, picture and text."""
+"""Cards of the last training and of a comparison: verdict, picture and text."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import hashlib
 import time
 
@@ -25,45 +25,15 @@ from koopman_ros.panel.snapshot import Snapshot, TRAINING
 from koopman_ros.panel.training_report import Comparison, Findings, Report
 
 
-class Figures:
-    """Figures, one in a line."""
-
-    def __init__(self, *, columns: bool = False) -> None:
-        self._lines = box('').classes('pairs columns' if columns else 'pairs')
-        self._shown: dict[str, ui.label] = {}
-
-    def show(self, found: Mapping[str, str]) -> None:
-        """Show figures, without the unknown ones."""
-        values = {key: _brief(value) for key, value in found.items() if value not in ('none', '')}
-        if list(values) != list(self._shown):
-            self._lines.clear()
-            self._shown = {}
-            with self._lines:
-                for key in values:
-                    with box('pair'):
-                        label('div', key, 'quiet')
-                        self._shown[key] = label('div', '')
-        for key, value in values.items():
-            self._shown[key].set_text(value)
-
-
-def _brief(value: str) -> str:
-    try:
-        return f'{float(value):.4g}' if '.' in value else value
-    except ValueError:
-        return value
-
-
 def _findings(name: str, about: str) -> Callable[[Findings], None]:
-    """Add lines, figures, picture and text of a report; return the function that shows them."""
-    lines, figures = label('div', '', 'lines'), Figures(columns=True)
+    """Add lines, picture and text of a report; return the function that shows them."""
+    lines = label('div', '', 'lines')
     picture = attribute(ui.element('img').classes('picture hidden'), 'alt', about)
     with ui.expansion('the whole report').classes('hidden').props('dense') as whole:
         text = label('div', '', 'report')
 
     def show(found: Findings) -> None:
         lines.set_text('\n'.join(found.lines))
-        figures.show(found.figures)
         if found.picture:
             # another address for another picture
             version = hashlib.sha256(found.picture).hexdigest()[:16]

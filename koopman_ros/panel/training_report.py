@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Report of a training and of a replay, read from their files: figures, text and a picture."""
+"""Report of a training and of a replay, read from their files: verdict, text and a picture."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import json
 import os
 from pathlib import Path
@@ -15,26 +15,14 @@ from types import MappingProxyType
 from typing import Any
 
 from koopman_ros.panel.files import read_bounded, sanitize_text
-from koopman_ros.units import unit_label
 
-MAX_TEXT = 1_000_000  # bytes of a page or of figures
+MAX_TEXT = 1_000_000  # bytes of a text or of figures
 MAX_PICTURE = 16_000_000  # bytes
-_MAX_LINES = 40
-_MAX_LINE, _MAX_NAME = 500, 60  # characters
+_MAX_LINES, _MAX_LINE = 40, 500  # characters
 _PNG, _PNG_END = b'\x89PNG\r\n\x1a\n', b'IEND\xaeB`\x82'
 _ENDINGS = ('.refused.safetensors', '.safetensors')
 # Figures of the trainer's status that tell one training from another.
 _IDENTIFYING = ('accepted', 'measurements_read', 'measurements_used', 'model_file')
-_TRAINED = {
-    'model_class': 'Model class', 'heldout_error': 'Error on held-out records',
-    'heldout_error_of_present_lift': 'Error of the present model',
-    'heldout_error_of_linear_model': 'Error of the best linear model',
-    'noise': 'Measurement noise', 'closed_loops': 'Closed loops tested',
-    'closed_loops_failed': 'Closed loops failed', 'condition': 'Condition number',
-    'trained_from': 'Trained from', 'trained_to': 'Trained to', 'coverage': 'Cells visited',
-    'measurements_read': 'Measurements read', 'measurements_used': 'Measurements used'}
-_COMPARED = {'compared': 'Commands compared', 'beyond_tolerance': 'Commands that differ',
-             'largest_difference': 'Largest difference', 'largest_at_s': 'Time of it [s]'}
 
 
 @dataclass(frozen=True)
@@ -43,7 +31,6 @@ class Findings:
 
     problem: str = ''  #: why there is no result, or empty
     lines: tuple[str, ...] = ()
-    figures: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     text: str = ''  #: the whole report
     picture: bytes = b''  #: PNG, or empty
 
@@ -89,7 +76,6 @@ def report_base(model_file: str) -> Path | None:
 
 def report_time(base: Path) -> int:
     """Return the time of writing of a report in ns, 0 for none."""
-    # the figures are written before text and picture
     times = [0]
     for ending in ('.json', '.md', '.png'):
         with contextlib.suppress(OSError):
@@ -106,36 +92,34 @@ def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -
     path = Path(f'{base}.json')
     try:
         figures = _figures_of(path)
-        written = os.stat(path).st_mtime
     except (OSError, ValueError) as error:
         return Report('the panel cannot read the report, perhaps it is on another machine: '
                       f'{sanitize_text(str(error), _MAX_LINE)}')
     if any(name in trained and trained[name] != str(figures.get(name)) for name in _IDENTIFYING):
         return Report(f'the panel cannot read the report: {path} is of another training')
-    units = figures.get('units')
     return Report(
-        '', (*_texts(figures.get('reasons')),
-             *(f'Warning: {text}' for text in _texts(figures.get('warnings')))),
-        dict(_rows(figures, _TRAINED, units if isinstance(units, Mapping) else {})),
-        _read_text(Path(f'{base}.md')), _read_picture(Path(f'{base}.png')), written,
-        figures.get('accepted') is True, str(figures.get('model_file') or ''))
+        lines=(*_texts(figures.get('reasons')),
+               *(f'Warning: {text}' for text in _texts(figures.get('warnings')))),
+        text=_read_text(Path(f'{base}.md')), picture=_read_picture(Path(f'{base}.png')),
+        written=report_time(base) / 1e9, accepted=figures.get('accepted') is True,
+        model_file=str(figures.get('model_file') or ''))
 
 
 def read_comparison(folder: Path, model: str, since: float, output: str) -> Comparison:
     """Return the result of a replay; without one, the last lines of its output."""
     try:
         (bag,) = _figures_of(folder / 'summary.json')['bags']
-        line = ('The recorded commands are reproduced.' if bag['reproduced'] is True else
-                'The recorded commands are not all reproduced: see the whole report.')
-        figures = {
-            'Measurements': str(bag['measurements']), **dict(_rows(bag['new_model'], _COMPARED)),
-            'Commands of the active model that differ': str(
-                bag['recorded_model']['beyond_tolerance'])}
+        new = bag['new_model']
+        lines = (
+            'The recorded commands are reproduced.' if bag['reproduced'] is True else
+            'The recorded commands are not all reproduced: see the whole report.',
+            sanitize_text(f'{new["beyond_tolerance"]} of {new["compared"]} commands of the new '
+                          'model differ from the recorded ones.', _MAX_LINE))
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         last = ' '.join([line for line in output.splitlines() if line.strip()][-3:])
         return Comparison('the replay failed: ' + (
             sanitize_text(last, _MAX_LINE) or 'it has no output'), model=model, since=since)
-    return Comparison('', (line,), figures, _read_text(folder / 'report.md'),
+    return Comparison('', lines, _read_text(folder / 'report.md'),
                       _read_picture(folder / 'replay.png'), model, since)
 
 
@@ -167,28 +151,3 @@ def _figures_of(path: Path) -> Mapping[str, Any]:
 def _texts(found: Any) -> Iterator[str]:
     for one in (found if isinstance(found, list) else [])[:_MAX_LINES]:
         yield sanitize_text(str(one), _MAX_LINE)
-
-
-def _rows(figures: Mapping[str, Any], titles: Mapping[str, str],
-          units: Mapping[str, Any] = MappingProxyType({})) -> Iterator[tuple[str, str]]:
-    """Return the figures that have titles, and those of each signal with its unit."""
-    for key, title in titles.items():
-        value = figures.get(key)
-        if isinstance(value, Mapping):
-            for name, one in list(value.items())[:_MAX_LINES]:
-                about = f'{title}: {sanitize_text(str(name), _MAX_NAME)}'
-                yield about if len(value) > 1 else title, (
-                    f'{_brief(one)} {_unit(str(units.get(name, "")))}'.strip())
-        elif value is not None:
-            yield title, _brief(value)
-
-
-def _unit(unit: str) -> str:
-    # the figures are in units of the model, where K may be a difference
-    return unit if unit == 'K' else unit_label(sanitize_text(unit, _MAX_NAME))
-
-
-def _brief(value: Any) -> str:
-    if value is None:
-        return 'infinite'
-    return f'{value:.4g}' if isinstance(value, float) else sanitize_text(str(value), _MAX_LINE)

@@ -67,8 +67,8 @@ class HostileSource:
         own.alarms.acknowledge(TEXTS[0], TEXT, NOW + 2.0)
         own.alarms.shelve(f'shelved {TEXTS[0]}', 600.0, TEXT, NOW + 2.0)
         self.learning = Learning(
-            Report('', TEXTS, {TEXT: TEXT}, TEXT, _PICTURE, NOW, True, TEXT),
-            Comparison('', TEXTS, {TEXT: TEXT}, TEXT, _PICTURE, TEXT, NOW))
+            Report('', TEXTS, TEXT, _PICTURE, NOW, True, TEXT),
+            Comparison('', TEXTS, TEXT, _PICTURE, TEXT, NOW))
         self.title = TEXT
         self.snapshot = own.snapshot(NOW + 2.0)
         self.asked: list[Action] = []
