@@ -15,9 +15,8 @@ from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign
 from koopman_ros.reports import drawing, DRAWN_RANGE, legend, LIMIT, Picture
+from studies.campaign import Campaign
 from studies.paper import reactor, scalar, two_state
-from studies.paper.campaign import Campaign
-from studies.paper.datasets import random_step_episodes
 
 # The paper's colours.
 EXACT: dict[str, Any] = {'color': 'black', 'linewidth': 1.8}
@@ -25,6 +24,7 @@ LEARNED: dict[str, Any] = {'color': 'tab:green', 'linestyle': '--', 'linewidth':
 LINEAR: dict[str, Any] = {'color': 'tab:red', 'linewidth': 1.2}
 _LIFTED: dict[str, Any] = {'color': 'tab:red', 'linestyle': '--', 'linewidth': 1.8}
 FIGURE_SEED = 0
+_loops: dict[int, ClosedLoop] = {}  # by the identity of the model, which the campaign keeps
 FIGURE_NARROW_BOX = '[4,5.5]x[4,5.5]'
 
 
@@ -68,11 +68,11 @@ def worst_narrow(campaign: Campaign) -> tuple[int, LiftedModel]:
     return seed, campaign.models['narrow'][seed][FIGURE_NARROW_BOX]
 
 
-def _loop(campaign: Campaign, model: LiftedModel) -> ClosedLoop:
+def _loop(model: LiftedModel) -> ClosedLoop:
     """Regulate the two-state example with R = 1 by one of the models, once for all figures."""
-    if id(model) not in campaign.loops:
-        campaign.loops[id(model)] = two_state.close_loop(model, 1.0)
-    return campaign.loops[id(model)]
+    if id(model) not in _loops:
+        _loops[id(model)] = two_state.close_loop(model, 1.0)
+    return _loops[id(model)]
 
 
 def _scalar(campaign: Campaign, path: Path) -> str:
@@ -144,7 +144,7 @@ def _control(campaign: Campaign, path: Path, label: str, learned: LiftedModel
              ) -> tuple[ClosedLoop, ...]:
     """Draw the control by a learned lift beside those by linearisation and exact lift."""
     linear = _model(campaign, 'two_state', 'linear')
-    loops = _loop(campaign, linear), two_state.exact_loop(1.0), _loop(campaign, learned)
+    loops = _loop(linear), two_state.exact_loop(1.0), _loop(learned)
     with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
         for name, style, loop in zip(('linearisation', 'exact lift', label),
                                      (LINEAR, EXACT, LEARNED), loops, strict=True):
@@ -174,7 +174,7 @@ def _narrow_control(campaign: Campaign, path: Path) -> str:
 def _roll_outs(design: RandomStepDesign, where: str, campaign: Campaign, path: Path) -> str:
     models = {name: _model(campaign, 'reactor', name) for name in ('nz=3', 'linear')}
     states, inputs = models['nz=3'].states, models['nz=3'].inputs
-    truth = random_step_episodes(reactor.SYSTEM, design, 1, 60.0, 77)
+    truth = reactor.random_steps_of(design, 1, 60.0, 77)
     assert truth.time is not None
     errors = {}
     with drawing(path, 2, 1, size=(8.0, 5.5), sharex=True, height_ratios=(3, 1)
@@ -239,14 +239,14 @@ def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, ClosedLoop
 
 
 def _wide_box(campaign: Campaign, path: Path) -> str:
-    loop = _loop(campaign, _model(campaign, 'two_state', 'wide'))
+    loop = _loop(_model(campaign, 'two_state', 'wide'))
     _boxes(path, [('wide box', 'gold', two_state.WIDE, loop, 'tab:red')])
     return 'The wide training box holds the whole path of the controlled system.'
 
 
 def _narrow_box(campaign: Campaign, path: Path) -> str:
     seed, model = worst_narrow(campaign)
-    box, loop = two_state.NARROW[FIGURE_NARROW_BOX], _loop(campaign, model)
+    box, loop = two_state.NARROW[FIGURE_NARROW_BOX], _loop(model)
     _boxes(path, [('narrow box', 'gold', box, loop, 'tab:red')])
     return (f'The narrow training box, seed {seed}: the path starts in it and leaves it, by up '
             f'to {loop.distance(model):.2g} times half its width.')
@@ -256,8 +256,8 @@ def _both_boxes(campaign: Campaign, path: Path) -> str:
     _, narrow = worst_narrow(campaign)
     wide = _model(campaign, 'two_state', 'wide')
     _boxes(path, [
-        ('wide box', 'white', two_state.WIDE, _loop(campaign, wide), 'tab:green'),
-        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX], _loop(campaign, narrow),
+        ('wide box', 'white', two_state.WIDE, _loop(wide), 'tab:green'),
+        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX], _loop(narrow),
          'tab:red')])
     return 'Both boxes and paths in one picture: the same start, another training range.'
 
