@@ -105,9 +105,9 @@ def _draw(cases: Mapping[str, Models], path: Path) -> Picture:
                 for rx, worst, gone, accepted in zip(
                         m['rx'], m['ratio_worst'], m['not_arrived'], m['accepted'], strict=True):
                     if rx is not None:
-                        lost = bool(gone) or worst is None
-                        axis.plot(max(rx, _LOWEST), _HIGHEST if lost else min(worst, _HIGHEST),
-                                  'X' if lost else 'o', color=color, alpha=0.8,
+                        ratio = _HIGHEST if gone or worst is None else min(worst, _HIGHEST)
+                        axis.plot(max(rx, _LOWEST), ratio, 'X' if gone else 'o', color=color,
+                                  alpha=0.8,
                                   markerfacecolor='none' if accepted is False else color)
             for number, known in enumerate(label for label in models if label not in trained):
                 highest = max(present(models[known]['ratio_worst']), default=_HIGHEST)
