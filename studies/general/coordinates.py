@@ -18,11 +18,10 @@ from koopman_ros.learning.validation import drift_error
 from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plant_data import Samples, split_by_episode
 from koopman_ros.plants import describe
+from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import LEARNERS, RECIPES
 from studies.general.loops import judged, known, loops, STARTS
 from studies.general.systems import Case, CASES
-from studies.paper.campaign import Experiment
-from studies.paper.datasets import Metrics, Models
 
 PLACE = 'coordinates'  # of its figures in the summary
 SEEDS = 3  # as many of those of the study

@@ -17,7 +17,7 @@ from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import ControlAffineSystem, describe, RandomStepDesign
 from koopman_ros.retraining import decide, Decision, learn_lift, Thresholds
-from studies.paper.datasets import Metrics, Models
+from studies.campaign import Metrics, Models
 from studies.paper.reactor import SETPOINT, SYSTEM
 
 NOISE = 0.1  # K

@@ -24,7 +24,7 @@ from koopman_ros.control import (
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign, two_state_example
-from studies.paper.datasets import Metrics, Models
+from studies.campaign import Metrics, Models
 from studies.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,
