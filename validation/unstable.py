@@ -29,7 +29,7 @@ from koopman_ros.control import (
 from koopman_ros.control.simulate import Simulation
 from koopman_ros.jobs.backends import Backend, backend_of, Tell
 from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
-from koopman_ros.learning.starts import Recipe
+from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (

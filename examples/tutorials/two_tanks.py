@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
-from koopman_ros.identification import identify, weak_forms
-from koopman_ros.learning import roll_out
+from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
+from koopman_ros.learning.identification import identify, weak_forms
 from koopman_ros.lifting import load, save
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import (
@@ -33,7 +33,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
 )
 from koopman_ros.reports import draw_limits, DRAWN_RANGE, legend
-from koopman_ros.retraining import decide, learn_lift, Thresholds
 
 # a notebook has arguments of its own
 OUT = Path(*[word for word in sys.argv[1:2] if word[0] != '-'] or ['out/tutorials'])

@@ -19,7 +19,7 @@ from typing import Any, IO
 from koopman_ros.jobs.ending import see_it_end
 from koopman_ros.startup import command, ONE_THREAD
 
-_MODULE = 'koopman_ros.retraining.__main__'
+_MODULE = 'koopman_ros.learning.__main__'
 _CANCELLED = 'cancelled, nothing was written'
 
 
@@ -52,7 +52,7 @@ class JobState:
 
 class RetrainingJob:
     """
-    A retraining in a process of its own, of fields of :class:`koopman_ros.retraining.Task`.
+    A retraining in a process of its own, of fields of :class:`koopman_ros.learning.Task`.
 
     Of a fleet with ``plants``, such fields by name, and ``scheduler``.
     """

@@ -1,185 +1,158 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples that stay with the workers that read them: sums over them come back, nothing else."""
+"""A drift of bags that stay with the workers that read them: sums over them come back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-import functools
-import hashlib
-from pathlib import Path
-import pickle
-from typing import Any
+from collections.abc import Sequence
+import contextlib
+from dataclasses import dataclass, replace
+import math
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from koopman_ros.arrays import Array
+from koopman_ros.bags import Account, loop_episodes
+from koopman_ros.bags.episodes import distinct
 from koopman_ros.jobs.backends import Backend
-from koopman_ros.learning.drift import readout_rows
-from koopman_ros.learning.residuals import Problem, ScaledSamples, Sums
-from koopman_ros.learning.scaling import Scaling
-from koopman_ros.learning.threads import torch_threads
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Array, Samples
+from koopman_ros.learning.drift_samples import drift_samples
+from koopman_ros.learning.identification.drift import (
+    DriftModel,
+    longest_step,
+    prediction_error,
+    Segments,
+)
+from koopman_ros.learning.identification.weak_form import regress, weak_rows
+from koopman_ros.learning.lift.shards import Shard
+from koopman_ros.learning.record import Source
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import cut, Episode, Plant, Samples
+from koopman_ros.units import SECONDS_PER_TIME_UNIT
+
+_SEGMENT = 240  # samples
+_CHOOSING = 5  # each so many-th segment of a bag chooses the degree
+# Mean squared errors so close count as equal.
+_NEARLY = 1.1
 
 
 @dataclass(frozen=True)
-class Shard:
-    """How a worker reads a part of the samples; small, for it is sent in their place."""
+class DriftOfBags:
+    """A drift that was estimated where the bags are."""
 
-    name: str  #: for messages, one of its own
-    #: returns the samples, found by a worker under its name in a module, or sent by value
-    read: Callable[..., Samples]
-    arguments: tuple[Any, ...] = ()  #: of it, like the path of a file that the worker sees
-
-
-def write_samples(path: Path | str, samples: Samples) -> None:
-    """Write samples to a file ``.npz``, for :func:`read_samples`."""
-    arrays = {name: value for name in ('x', 'dxdt', 'u', 'episode', 'time')
-              if (value := getattr(samples, name)) is not None}
-    np.savez(path, allow_pickle=False, **arrays)
+    drift: DriftModel  #: the estimate
+    #: (n_x,) root mean square error of predictions by degree, over the segments that chose
+    rmse: dict[int, Array]
+    samples: int  #: in all bags
+    shards: tuple[Shard, ...]  #: samples of the drift along each bag, to :func:`train` a lift of
 
 
-def read_samples(path: Path | str) -> Samples:
+def identify_bags(plant: Plant, source: Source, backend: Backend, *,
+                  degrees: Sequence[int] = (1, 2, 3, 4), window: int = 40) -> DriftOfBags:
     """
-    Read samples from a file ``.npz``.
+    Estimate dx/dt = f(x) + B u from bags that workers open, each its own.
 
-    :raises ValueError: naming the file, for one of another content.
+    By the weak form (:func:`~koopman_ros.learning.identification.weak_form.weak_form`), without the other
+    methods and the refinement of :func:`identify`: what comes from a bag is its range, a triangle
+    of the QR decomposition of its equations, and sums of squared errors, whatever its length. Of
+    the degrees the lowest is taken that predicts about as well as the best, and fitted to all.
+
+    :param plant: names, units, time unit, and B where it is known and constant.
+    :param source: the bags, which the workers see under these paths.
+    :param window: samples of a window of the weak form.
+    :raises BagReadError: for bags that cannot be used.
+    :raises ValueError: when the bags do not determine a drift.
     """
-    with np.load(path, allow_pickle=False) as file:
-        if missing := {'x', 'dxdt', 'u', 'episode'} - set(file):
-            raise ValueError(f'{path} has no {", ".join(sorted(missing))}: write it with '
-                             'koopman_ros.learning.write_samples')
-        return Samples(**{name: file[name] for name in (
-            'x', 'dxdt', 'u', 'episode', 'time') if name in file})
+    bags = [str(bag) for bag in distinct(source.bags, Account())]
+    seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
+    with contextlib.closing(backend.keep(_Bag, {
+            bag: (source, bag, seconds) for bag in bags})) as kept:
+        extents = [found for found in kept.run(_extent, None) if found is not None]
+        if not extents:
+            raise ValueError('the bags hold no usable segment of measurements: record longer, '
+                             'without gaps')
+        lows, highs, counts = zip(*extents, strict=True)
+        n_x = len(plant.state_names)
+        corners = np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
+        box = Box.of(plant, corners[:, :n_x], corners[:, n_x:], nominal=False)
+        B = None if plant.B is None else box.input_matrix(plant.input_matrix(box.states.center))
+
+        def fitted(degree: int, choosing: bool) -> DriftModel:
+            rows = np.concatenate([found for found in kept.run(_triangle, (
+                box, degree, B, window, choosing)) if found is not None])
+            m = rows.shape[1] - n_x - (len(box.inputs) if B is None else B.shape[1])
+            return regress(box, degree, rows[:, :m], rows[:, m:-n_x], rows[:, -n_x:], B)
+
+        rmse: dict[int, Array] = {}
+        for degree in degrees:
+            with contextlib.suppress(ValueError, np.linalg.LinAlgError):
+                model = fitted(degree, choosing=True)
+                squares, of = map(sum, zip(*kept.run(_errors, model), strict=True))
+                rmse[degree] = np.sqrt(squares / of)
+        costs = {degree: float(np.mean((error / box.states.scale) ** 2))
+                 for degree, error in rmse.items()}
+        least = min(costs.values(), default=math.inf)
+        if not math.isfinite(least):
+            raise ValueError('no drift fits the bags: record longer, with steps of the input')
+        drift = fitted(min(d for d in costs if costs[d] <= _NEARLY * least), choosing=False)
+    return DriftOfBags(drift, rmse, sum(counts), tuple(
+        Shard(bag, samples_of_bag, (source, bag, seconds, drift)) for bag in bags))
 
 
-@dataclass(frozen=True)
-class _Extent:
-    """What is known of a shard without its samples."""
-
-    count: int
-    #: (2, n_x) and (2, n_u) lowest and highest values
-    x: Array
-    u: Array
-    digest: str
+def samples_of_bag(source: Source, bag: str, seconds: float, drift: DriftModel) -> Samples:
+    """Sample a drift along a bag's episodes; `seconds` are those of its time unit."""
+    return drift_samples(drift, tuple(_Bag((source, bag, seconds)).parts))
 
 
-class KeptShards:
-    """
-    Shards that the workers of a backend have read, for :class:`ScaledSamples`.
+class _Bag:
+    """The segments of a bag, where it was read."""
 
-    :raises ValueError: for names that repeat, or shards of other signals than the plant's.
-    """
-
-    def __init__(self, backend: Backend, shards: Sequence[Shard]) -> None:
-        items = {shard.name: shard for shard in shards}
-        if len(items) != len(shards) or not shards:
-            raise ValueError('each shard needs a name of its own, got '
-                             f'{[shard.name for shard in shards]}')
-        self._kept = backend.keep(_Samples, items)
-        self._call: dict[str, Any] = {}
-        try:
-            self._extents = self._kept.run(_extent, None)
-        except BaseException:
-            self._kept.close()
-            raise
-        for name, extent in zip(items, self._extents, strict=True):
-            sizes, wanted = ((one.x.shape[1], one.u.shape[1])
-                             for one in (extent, self._extents[0]))
-            if sizes != wanted:
-                raise ValueError(f'{name} has {sizes[0]} states and {sizes[1]} inputs, the first '
-                                 f'shard {wanted[0]} and {wanted[1]}')
-
-    def __len__(self) -> int:
-        """Return the number of samples."""
-        return sum(extent.count for extent in self._extents)
-
-    @property
-    def corners(self) -> tuple[Array, Array]:
-        """Lowest and highest states (2, n_x) and inputs (2, n_u)."""
-        x, u = (np.stack([getattr(extent, name) for extent in self._extents]) for name in 'xu')
-        return (np.stack([x[:, 0].min(axis=0), x[:, 1].max(axis=0)]),
-                np.stack([u[:, 0].min(axis=0), u[:, 1].max(axis=0)]))
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of those of the shards, in their order, in hexadecimal."""
-        return hashlib.sha256(''.join(one.digest for one in self._extents).encode()).hexdigest()
-
-    def scaled(self, scaling: Scaling, device: str, threads: int) -> None:
-        """Say how samples are scaled, and where and by how many threads sums are formed."""
-        self._call = {'scaling': pickle.dumps(scaling), 'device': device, 'threads': threads}
-
-    def sums(self, problem: Problem, theta: Tensor, derivatives: bool) -> Sums:
-        """Sum over all samples at parameters (p,): shard by shard, whoever has them."""
-        parts = self._kept.run(_sums, _Call(**self._call, problem=problem, theta=theta.cpu(),
-                                            derivatives=derivatives, N=len(self)))
-        return tuple(functools.reduce(torch.add, of_all).to(theta.device)
-                     for of_all in zip(*parts, strict=True))
-
-    def readout_rows(self, model: LiftedModel) -> Array:
-        """
-        Return what the read-out of a model is fitted to, as far as a least-squares fit goes by it.
-
-        The triangles of a QR decomposition of each shard's rows, one below the other: their
-        squares sum to the same, and a fit to them is as accurate.
-        """
-        return np.concatenate(self._kept.run(_triangle, model))
-
-    def close(self) -> None:
-        """Let the workers forget them."""
-        self._kept.close()
-
-
-@dataclass(frozen=True)
-class _Call:
-    """What goes to the workers with each evaluation."""
-
-    scaling: bytes
-    device: str
-    threads: int
-    problem: Problem
-    theta: Tensor
-    derivatives: bool
-    N: int
-
-
-class _Samples:
-    """The samples of a shard, where they were read."""
-
-    def __init__(self, shard: Shard) -> None:
-        self.samples = shard.read(*shard.arguments)
-        self._scaled: tuple[bytes, str, ScaledSamples] | None = None
+    def __init__(self, item: tuple[Source, str, float]) -> None:
+        source, bag, seconds = item
+        episodes, _ = loop_episodes(
+            [bag], source.states, source.inputs, tolerance_ns=source.tolerance_ns,
+            least_jumps=source.least_jumps)
+        self.count = sum(map(len, episodes))
+        self.parts = cut([replace(one, time=one.time / seconds,
+                                  input_time=one.input_time / seconds) for one in episodes],
+                         _SEGMENT)
 
     @property
     def nbytes(self) -> int:
         """Their size in bytes."""
-        samples = self.samples
-        return sum(a.nbytes for a in (samples.x, samples.dxdt, samples.u, samples.episode))
+        return sum(part.x.nbytes + part.u.nbytes for part in self.parts)
 
-    def scaled(self, scaling: bytes, device: str) -> ScaledSamples:
-        if self._scaled is None or self._scaled[:2] != (scaling, device):
-            found: Scaling = pickle.loads(scaling)
-            self._scaled = scaling, device, found.data(self.samples, device)
-        return self._scaled[2]
+    def share(self, choosing: bool) -> list[Episode]:
+        """Return the segments that choose, or the others."""
+        return [part for i, part in enumerate(self.parts)
+                if (i % _CHOOSING == _CHOOSING - 1) == choosing]
 
 
-def _extent(own: _Samples, _: None) -> _Extent:
-    x, u = (np.stack([a.min(axis=0), a.max(axis=0)]) for a in (own.samples.x, own.samples.u))
-    return _Extent(len(own.samples), x, u, own.samples.digest())
+def _extent(own: _Bag, _: None) -> tuple[Array, Array, int] | None:
+    """Return the lowest and highest states and inputs, and the number of samples."""
+    if not own.parts:
+        return None
+    x, u = (np.concatenate([getattr(part, name) for part in own.parts]) for name in 'xu')
+    return (np.concatenate([x.min(axis=0), u.min(axis=0)]),
+            np.concatenate([x.max(axis=0), u.max(axis=0)]), own.count)
 
 
-def _triangle(own: _Samples, model: LiftedModel) -> Array:
-    triangle: Array = np.linalg.qr(readout_rows(model, own.samples)).R
+def _triangle(own: _Bag, call: tuple[Box, int, Array | None, int, bool]) -> Array | None:
+    """Return the triangle of a bag's equations, of all segments or without those that choose."""
+    box, degree, B, window, choosing = call
+    parts = [part for part in (own.share(False) if choosing else own.parts)
+             if len(part) >= window]
+    if not parts:
+        return None
+    triangle: Array = np.linalg.qr(np.hstack(weak_rows(parts, box, degree, B, window))).R
     return triangle
 
 
-def _sums(own: _Samples, call: _Call) -> Sums:
-    with torch_threads(call.threads):
-        data = own.scaled(call.scaling, call.device)
-        sums = call.problem.on(data).sums(call.theta.to(data.x.device), call.derivatives, call.N)
-        return tuple(part.cpu() for part in sums)
+def _errors(own: _Bag, drift: DriftModel) -> tuple[Array, int]:
+    """Return sums of squared errors (n_x,) over the segments that choose, and of how many."""
+    parts = own.share(True)
+    if not parts:
+        return np.zeros(len(drift.box.states)), 0
+    segments = Segments.of(parts, longest_step(parts))
+    count = sum(map(len, parts))
+    return count * prediction_error(drift.rate, segments, drift.box.states.scale) ** 2, count

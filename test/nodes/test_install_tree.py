@@ -136,7 +136,7 @@ def test_no_module_of_the_wheel_needs_the_repository(wheel: Installation) -> Non
     modules = {'.'.join(path.relative_to(wheel.package.parent).with_suffix('').parts)
                for path in wheel.package.rglob('*.py') if not path.stem.startswith('__')}
     assert modules <= set(ended.stdout.split())
-    assert 'koopman_ros.learning.training' in modules
+    assert 'koopman_ros.learning.lift.training' in modules
     assert wheel.opened() == ''
     # which would be noted
     file = ROOT / 'setup.py'

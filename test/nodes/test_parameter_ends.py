@@ -25,6 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.bags import BagReadError
 from koopman_ros.demo import reactor
+from koopman_ros.learning import retrain, Task
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
@@ -32,7 +33,6 @@ from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.parameters.table import ConfigurationError, Specification
 from koopman_ros.plants import simulation
-from koopman_ros.retraining import retrain, Task
 from koopman_ros.ros import topics
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from koopman_ros.identification import DriftModel, Method, METHODS, weak_forms
+from koopman_ros.learning.identification import DriftModel, Method, METHODS, weak_forms
 from koopman_ros.lifting import Box, Coordinates
 from koopman_ros.plant_data import Episode, Plant
 from support.disturbance import disturbed

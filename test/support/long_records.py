@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from koopman_ros.retraining import Task
-from koopman_ros.retraining.record import Source
+from koopman_ros.learning import Task
+from koopman_ros.learning.record import Source
 from validation.benchmarks.retraining import cases, task_of, write_bags
 
 CASE = replace(cases()['reactor at 1 Hz'], bag=4000)

@@ -9,9 +9,9 @@ from functools import partial
 
 import pytest
 
-from koopman_ros.retraining import compare_classes, decide
-from koopman_ros.retraining import task as task_module
-from koopman_ros.retraining.report import _sections
+from koopman_ros.learning import compare_classes, decide
+from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning.report import _sections
 from support.known_plants import methods
 
 

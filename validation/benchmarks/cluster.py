@@ -31,7 +31,7 @@ from koopman_ros.jobs.backends import (
 )
 from koopman_ros.jobs.cluster import Cluster
 from koopman_ros.learning import Growth, read_samples, Shard, train, write_samples
-from koopman_ros.learning.starts import Progress
+from koopman_ros.learning.lift.multistart import Progress
 from koopman_ros.plant_data import Plant, Samples
 from koopman_ros.plants import describe, two_state_example
 from koopman_ros.reports import table

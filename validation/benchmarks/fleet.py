@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.learning.validation import lifted_rate
+from koopman_ros.learning import retrain_fleet, Task
+from koopman_ros.learning.config import FIRST
+from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.lifting import load
 from koopman_ros.plants import ControlAffineSystem, equilibrium_input
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.reports import table
-from koopman_ros.retraining import retrain_fleet, Task
-from koopman_ros.retraining.known import FIRST
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 from validation.benchmarks.long_records import Design, simulated
 from validation.benchmarks.retraining import Case, task_of, write_bags

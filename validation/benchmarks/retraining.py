@@ -16,13 +16,13 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from koopman_ros.bags import RecordedInput, RecordedState
-from koopman_ros.identification import Drift
 from koopman_ros.jobs.backends import backend_of
+from koopman_ros.learning import Task
+from koopman_ros.learning.identification import Drift
+from koopman_ros.learning.pipeline import retrain_by
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.reports import drawing, legend, table
-from koopman_ros.retraining import Task
-from koopman_ros.retraining.task import retrain_by
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 from validation.benchmarks import process

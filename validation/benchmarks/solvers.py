@@ -14,7 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.levenberg_marquardt import minimise, normal_equations, NormalEquations
+from koopman_ros.learning.lift.levenberg_marquardt import (
+    minimise,
+    normal_equations,
+    NormalEquations,
+)
 from validation.benchmarks.problems import artificial, Case, WHITENING
 from validation.benchmarks.process import allow, Tell
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.learning import fit
-from koopman_ros.learning.levenberg_marquardt import normal_equations
+from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from support.tensors import assert_close
 from validation.benchmarks import ipopt, process, solvers
