@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
-from koopman_ros.jobs.backends import Backend, Here, Tell
+from koopman_ros.execution import Backend, Serial, Tell
 
 Key = TypeVar('Key')
 Found = TypeVar('Found')
@@ -61,7 +61,7 @@ def over(backend: Backend | None, function: Callable[[Key], Found], keys: Iterab
     :param backend: this process by default.
     """
     by_name = {str(key): key for key in keys}
-    return {by_name[name]: found for name, found in (backend or Here()).run(
+    return {by_name[name]: found for name, found in (backend or Serial()).run(
         _called, by_name, shared=function)}
 
 

@@ -11,7 +11,8 @@ from koopman_ros.learning.acceptance import decide, Decision, Thresholds
 from koopman_ros.learning.config import Task
 from koopman_ros.learning.drift_samples import compare_classes, drift_samples, learn_lift
 from koopman_ros.learning.fleet import Outcome, retrain_fleet
-from koopman_ros.learning.lift.algorithm_1 import Algorithm1, Edmd, Linearisation
+from koopman_ros.learning.lift.algorithm_1 import Algorithm1
+from koopman_ros.learning.lift.edmd import Edmd, Linearisation
 from koopman_ros.learning.lift.incremental import Growth
 from koopman_ros.learning.lift.metrics import (
     evaluate,
@@ -23,7 +24,6 @@ from koopman_ros.learning.lift.metrics import (
 )
 from koopman_ros.learning.lift.multistart import Progress
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
-from koopman_ros.learning.lift.shards import read_samples, Shard, write_samples
 from koopman_ros.learning.lift.training import NoUsefulLift, train, Trained
 from koopman_ros.learning.model_selection import compare, Comparison, Contender, Judge
 from koopman_ros.learning.pipeline import retrain, Retrained
@@ -32,7 +32,7 @@ from koopman_ros.learning.report import write_report
 __all__ = [
     'Algorithm1', 'Comparison', 'Contender', 'Decision', 'Edmd', 'Figures', 'Fit', 'Growth',
     'Judge', 'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Outcome', 'Progress', 'Retrained',
-    'Shard', 'Task', 'Thresholds', 'Trained', 'compare', 'compare_classes', 'decide',
-    'drift_samples', 'evaluate', 'fit', 'learn_lift', 'read_samples', 'retrain', 'retrain_fleet',
-    'roll_out', 'rollout_rmse', 'train', 'write_report', 'write_samples',
+    'Task', 'Thresholds', 'Trained', 'compare', 'compare_classes', 'decide',
+    'drift_samples', 'evaluate', 'fit', 'learn_lift', 'retrain', 'retrain_fleet',
+    'roll_out', 'rollout_rmse', 'train', 'write_report',
 ]

@@ -11,7 +11,7 @@ import numpy as np
 from koopman_ros.arrays import Array, brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.control.usable import unusable
-from koopman_ros.jobs.backends import Backend
+from koopman_ros.execution import Backend
 from koopman_ros.learning.identification import (
     Drift,
     fitted_starts,

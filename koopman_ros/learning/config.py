@@ -63,7 +63,7 @@ class Task:
     setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
-    #: where it is worked, see :func:`~koopman_ros.jobs.backends.backend_of`
+    #: where it is worked, see :func:`~koopman_ros.execution.backend_of`
     scheduler: str = ''
     #: file of a lift of a plant of the same kind, which training begins from; empty for nothing.
     #: In a fleet also ``'first'``, see :func:`~koopman_ros.learning.fleet.retrain_fleet`.

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from koopman_ros.jobs.backends import (
+from koopman_ros.execution import (
     Backend,
     backend_of,
-    Here,
     SchedulerLost,
+    Serial,
     Tell,
     WorkerLost,
 )
@@ -65,7 +65,7 @@ def retrain_fleet(tasks: Mapping[str, Task], scheduler: str = '',
     wherever they are learned.
 
     :param tasks: by the names of the plants; their own `scheduler` counts for nothing.
-    :param scheduler: where they are worked, see :func:`~koopman_ros.jobs.backends.backend_of`.
+    :param scheduler: where they are worked, see :func:`~koopman_ros.execution.backend_of`.
     :raises ValueError: for plants that would write the same file, none, or another `scheduler`
         than there is.
     :raises SchedulerLost: when a scheduler is not reached, or is lost; what was yielded stands.
@@ -118,7 +118,7 @@ def _rounds(backend: Backend, waiting: dict[str, Task], on_progress: OnPlant
 def _retrained(_: None, task: Task, tell: Tell) -> Outcome:
     """Retrain one plant, wherever that is."""
     checked_device(task.device)
-    retrained = retrain_by(Here(), task, lambda share, text: tell((share, text)))
+    retrained = retrain_by(Serial(), task, lambda share, text: tell((share, text)))
     return Outcome(*reported(retrained))
 
 

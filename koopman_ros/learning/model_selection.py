@@ -14,9 +14,9 @@ import time
 import numpy as np
 
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
-from koopman_ros.jobs.backends import Backend
-from koopman_ros.learning.lift.algorithm_1 import Edmd
+from koopman_ros.execution import Backend
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
+from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import Growth
 from koopman_ros.learning.lift.metrics import evaluate, Figures, fit, ROUNDING
 from koopman_ros.learning.lift.multistart import Progress, Recipe, Watch
@@ -123,7 +123,7 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
     """Return the networks that are tried for a plant of `n_x` states, plainest first."""
     units = 8 if n_x == 1 else 16
     return {
-        NEURAL_DRIFT: NeuralDrift((units,)),
+        NEURAL_DRIFT: NeuralDrift(units),
         IDENTITY_LIFT: Growth(n_x + 3, hidden_first=units, max_iterations=300),
         FREE_LIFT: Growth(n_x, identity=False, hidden_first=units, max_iterations=300)}
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account
-from koopman_ros.jobs.backends import Backend, backend_of
+from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import decide, Decision, shortfalls, Thresholds
 from koopman_ros.learning.config import FIRST, known, Task
 from koopman_ros.learning.downsampling import coverage

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from koopman_ros.bags import (
     summary,
 )
 from koopman_ros.bags.episodes import distinct
-from koopman_ros.jobs.backends import Backend, Found, Here, Tell
+from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.downsampling import SEGMENT, Selection, Survey
 from koopman_ros.plant_data import Episode
 
@@ -103,20 +103,20 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
             for number, bag in enumerate(distinct(source.bags, account))}
     n_x, n_u = len(source.states), len(source.inputs)
 
-    def each(function: Callable[[_Numbered, Tick], Found]) -> Iterator[Found]:
-        done, under_way = 0, dict.fromkeys(bags.values(), 0)
+    def each(function: Callable[[_Numbered, Tick], Any]) -> Iterator[Any]:
+        done, under_way = 0, dict.fromkeys(bags, 0)
 
         def watch(name: str, read: int | None) -> bool:
             nonlocal done
             if read is not None:
-                under_way[bags[name]] = read
-            # a bag that is begun anew counts again from where it was
+                under_way[name] = read
+            # a bag that is read again counts from where it was
             now = max(done, sum(under_way.values()))
             tick(now - done)
             done = now
             return False
 
-        with contextlib.closing((backend or Here()).run(
+        with contextlib.closing((backend or Serial()).run(
                 _told, bags, shared=function, watch=watch)) as results:
             for _, result in results:
                 yield result
@@ -136,8 +136,8 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
         start.group * sum(map(len, episodes))))
 
 
-def _told(function: Callable[[_Numbered, Tick], Found], bag: _Numbered, tell: Tell) -> Found:
-    """Do what is to be done with a bag, wherever that is, and tell of the samples so far."""
+def _told(function: Callable[[_Numbered, Tick], Any], bag: _Numbered, tell: Tell) -> Any:
+    """Read a bag on a worker, and report the samples so far."""
     read = 0
 
     def tick(samples: int) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.execution import scheduler_refusal
 from koopman_ros.experiment import Experiment
-from koopman_ros.jobs.backends import scheduler_refusal
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire

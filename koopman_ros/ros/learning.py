@@ -18,7 +18,7 @@ import time
 from rclpy.node import Node
 import yaml
 
-from koopman_ros.jobs.replaying import ReplayJob
+from koopman_ros.execution.job import ReplayJob
 from koopman_ros.panel.learning import (
     Comparison,
     Learning,

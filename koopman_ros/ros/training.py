@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from koopman_ros.jobs.training import class_lines, constant_lines, JobState, RetrainingJob, scalars
+from koopman_ros.execution.training import (
+    class_lines,
+    constant_lines,
+    JobState,
+    scalars,
+    TrainingJob,
+)
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
 from koopman_ros.parameters.wire import preset, system_of, Wiring
@@ -96,7 +102,7 @@ class Training:
         self.settings = settings  # of the next training
         self._node, self._wiring = node, wiring
         self._recorded, self._on_end = recorded, on_end
-        self._job: RetrainingJob | None = None
+        self._job: TrainingJob | None = None
         self._state: JobState | None = None
         self._progress = Progress(node.get_logger().info)
         self._diagnostics = node.diagnostics.add('training', self._status)
@@ -112,7 +118,7 @@ class Training:
                 if bag]
         if not bags:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
-        self._job = RetrainingJob(task_fields(self._node, settings, self._wiring, bags))
+        self._job = TrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
         self._progress = Progress(self._node.get_logger().info)
         self._timer.reset()

@@ -10,7 +10,7 @@ import json
 import numpy as np
 import pytest
 
-from koopman_ros.jobs.training import _in_words, class_lines, scalars
+from koopman_ros.execution.training import _in_words, class_lines, scalars
 from koopman_ros.learning import (
     compare_classes,
     decide,
@@ -40,7 +40,7 @@ def small_networks():
     """Learn small networks; that of the identity lift is the task's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lift, 'usual_recipes', lambda _: {
-            'neural drift': NeuralDrift((3,), max_iterations=60), 'identity lift': Growth(2),
+            'neural drift': NeuralDrift(3, max_iterations=60), 'identity lift': Growth(2),
             'free lift': Growth(1, identity=False, hidden_first=3, max_iterations=60)})
         yield
 

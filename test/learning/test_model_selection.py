@@ -36,7 +36,7 @@ from support.small_plants import (
     unforced_samples,
 )
 
-RECIPES = {'neural drift': NeuralDrift((3,), max_iterations=40), 'identity lift': SMALL}
+RECIPES = {'neural drift': NeuralDrift(3, max_iterations=40), 'identity lift': SMALL}
 
 
 def contender(name, rx, refusal=''):
@@ -171,7 +171,7 @@ def test_all_laws_are_tried_where_the_data_are(monkeypatch):
         tried.append(model.training_states)
 
     monkeypatch.setattr(comparison, 'check_law', noted)
-    found = compare(TWO_STATE, two_state_samples(), {'drift': NeuralDrift((3,), max_iterations=5)},
+    found = compare(TWO_STATE, two_state_samples(), {'drift': NeuralDrift(3, max_iterations=5)},
                     degrees=(2,), starts=1)
     assert len(tried) == 3
     for known, one in zip(tried, found.contenders, strict=True):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
-from koopman_ros.jobs.training import constant_lines, scalars
+from koopman_ros.execution.training import constant_lines, scalars
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, Task, write_report
 from koopman_ros.learning.config import known

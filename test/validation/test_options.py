@@ -7,7 +7,7 @@ import argparse
 
 import pytest
 
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 from validation import options, saddle, unstable
 from validation.robustness import __main__ as robustness
 from validation.robustness import stability

@@ -33,7 +33,7 @@ def test_a_row_of_a_lift_that_was_learned_in_a_hurry(monkeypatch, capsys):
     monkeypatch.setattr(unstable, 'STEPS', unstable.STEPS[:1])
     monkeypatch.setattr(unstable, 'STARTS', 1)
     monkeypatch.setattr(unstable, 'RECIPES', {
-        'neural drift': NeuralDrift((12,), max_iterations=150),
+        'neural drift': NeuralDrift(12, max_iterations=150),
         'free lift': replace(unstable.LIFT, hidden_first=24, max_iterations=250)})
     monkeypatch.setattr(unstable, 'LIMITED_STARTS', 1)
     monkeypatch.setattr(unstable, 'LIMITED_SAMPLES', 120)

@@ -16,7 +16,7 @@ from validation.benchmarks import growth
 # A part has its PLANS by extent, the PACKAGES whose versions matter, and `measure`, which fills
 # in the figures of one plan and yields them piece by piece as text.
 # It is a module here, imported when it is asked for: most need what the others do without.
-PARTS = ('training', 'retraining', 'recording', 'loop', 'panel', 'site', 'cluster', 'fleet')
+PARTS = ('training', 'retraining', 'recording', 'loop', 'panel', 'site', 'fleet')
 
 
 def main(args: list[str] | None = None) -> int:

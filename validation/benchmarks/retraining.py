@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from koopman_ros.bags import RecordedInput, RecordedState
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 from koopman_ros.learning import Task
 from koopman_ros.learning.identification import Drift
 from koopman_ros.learning.pipeline import retrain_by

@@ -93,7 +93,7 @@ RECIPES: dict[str, Callable[[int], Recipe]] = {
     'identity lift': lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS),
     'free lift': lambda n_x: Growth(
         n_x, identity=False, hidden_first=16, max_iterations=_STEPS),
-    'neural drift': lambda n_x: NeuralDrift((16,), max_iterations=_STEPS),
+    'neural drift': lambda n_x: NeuralDrift(16, max_iterations=_STEPS),
 }
 LEARNERS: dict[str, Learner] = {
     'linear': _polynomial(1),

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from koopman_ros import __version__
 from koopman_ros.control import ClosedLoop
-from koopman_ros.jobs.backends import backend_of, SchedulerLost, Tell, WorkerLost
+from koopman_ros.execution import backend_of, SchedulerLost, Tell, WorkerLost
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reports import write_figures
 from validation.paper import reactor, scalar, sensors, two_state
@@ -84,7 +84,7 @@ def run_campaign(seeds: int, experiments: Mapping[str, Experiment] | None = None
     Run every experiment for the seeds 0 ... `seeds` - 1; an interrupt keeps what is done.
 
     :param experiments: by the place of their figures in the summary; the paper's by default.
-    :param scheduler: where the runs go, see :func:`~koopman_ros.jobs.backends.backend_of`.
+    :param scheduler: where the runs go, see :func:`~koopman_ros.execution.backend_of`.
     """
     experiments = EXPERIMENTS if experiments is None else experiments
     campaign = Campaign()

@@ -9,7 +9,7 @@ import sys
 import time
 
 from koopman_ros import __version__
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 from koopman_ros.reports import write_figures
 from validation.options import add_output, add_scheduler, read
 from validation.robustness.report import write_report

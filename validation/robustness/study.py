@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from koopman_ros.control import Simulation
-from koopman_ros.jobs.backends import Backend
+from koopman_ros.execution import Backend
 from koopman_ros.plants import ControlAffineSystem
 from validation.options import over
 from validation.paper.datasets import Metrics

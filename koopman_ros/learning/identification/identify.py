@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from koopman_ros.arrays import brief
-from koopman_ros.jobs.backends import Backend, Here, Tell
+from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.drift import (
     box_of,
     Drift,
@@ -208,7 +208,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
             raise Stopped
         return False
 
-    with contextlib.closing((backend or Here()).run(
+    with contextlib.closing((backend or Serial()).run(
             _candidate, words, shared=_Given(fit, fitter, chooser, box, known, methods),
             watch=progress)) as candidates:
         for name, candidate in candidates:

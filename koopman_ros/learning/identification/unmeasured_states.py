@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.jobs.backends import Backend, Here, Tell
+from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.data_split import Record
 from koopman_ros.learning.identification.drift import DriftModel
 from koopman_ros.learning.identification.excitation import check_inputs
@@ -108,7 +108,7 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
             raise Stopped
         return False
 
-    with contextlib.closing((backend or Here()).run(
+    with contextlib.closing((backend or Serial()).run(
             _tried, words, shared=(record, highest_degree), watch=told)) as results:
         for name, found in results:
             under_way[name] = highest_degree

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Growth of a lift one coordinate at a time, which keeps coordinates from collapsing."""
+"""Incremental training of a lift, one coordinate at a time, which keeps them from collapsing."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 import itertools
 import math
 
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, Minimum, MinimumStatus
-from koopman_ros.learning.lift.network import check_activation, Layout, Parameters, Pass
+from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 
 _STILL = 1e-6  # root mean square, in the scale of the states, of a coordinate that stands still
@@ -48,10 +47,8 @@ class Growth:
 
     n_z: int  #: number of lifted coordinates
     identity: bool = True  #: whether z starts with the state
-    hidden_first: int = 8  #: units of the first free coordinates, in each hidden layer
-    hidden_more: int = 3  #: units added with each further coordinate, in each hidden layer
-    layers: int = 1  #: number of hidden layers, 1 or 2
-    activation: str = 'tanh'  #: ``'tanh'``, ``'sigmoid'``, ``'sine'`` or ``'softplus'``
+    hidden_first: int = 8  #: hidden units of the first free coordinates
+    hidden_more: int = 3  #: units added with each further coordinate
     whitening: float = 1.0  #: weight of the residual that keeps E[z z'] near the identity
     #: further such weights: starts take all of them in turn, and validation episodes choose
     other_whitenings: tuple[float, ...] = ()
@@ -73,9 +70,6 @@ class Growth:
         if self.hidden_first < 1 or self.hidden_more < 0:
             raise ValueError(f'hidden units must be positive, got {self.hidden_first} first and '
                              f'{self.hidden_more} more')
-        if self.layers not in (1, 2):
-            raise ValueError(f'layers must be 1 or 2, got {self.layers}')
-        check_activation(self.activation)
         if min(self.whitening, *self.other_whitenings, math.inf) < 0.0:
             raise ValueError('whitening weights must be at least 0, got '
                              f'{(self.whitening, *self.other_whitenings)}')
@@ -107,88 +101,86 @@ class Growth:
             layout, theta = parent.layout, parent.theta
         else:
             layout, theta = self._extended(data, n_z, parent or self.root(data), seed)
-        run = partial(minimise, max_iterations=self.max_iterations, tolerance=self.tolerance,
-                      monitor=monitor)
-        problem = LiftProblem(layout, data, ResidualWeights(self.whitening,
-                                                self.decoder_weight * bool(layout.decoder)))
-        minimum: Minimum = run(problem.add_residuals, theta)
-        iterations = minimum.iterations
-        if layout.decoder and minimum.status is not MinimumStatus.INTERRUPTED:
-            last = problem.with_weights(replace(problem.weights,
-                                                decoder=1e-3 * self.decoder_weight))
-            minimum = run(last.add_residuals, minimum.theta)
-            iterations += minimum.iterations
-        return Grown(layout, minimum.theta, minimum.status, minimum.decrease,
-                     iterations=iterations)
+        weights = [self.decoder_weight, 1e-3 * self.decoder_weight] if layout.decoder else [0.0]
+        iterations = 0
+        for weight in weights:
+            problem = LiftProblem(layout, data, ResidualWeights(self.whitening, weight))
+            minimum: Minimum = minimise(
+                problem.add_residuals, theta, max_iterations=self.max_iterations,
+                tolerance=self.tolerance, monitor=monitor)
+            theta, iterations = minimum.theta, iterations + minimum.iterations
+            if minimum.status is MinimumStatus.INTERRUPTED:
+                break
+        return Grown(layout, theta, minimum.status, minimum.decrease, iterations=iterations)
 
     def root(self, data: ScaledSamples) -> Grown:
-        """Return the lift without a network that growth starts from."""
+        """Return the lift without hidden units that growth starts from."""
         n_x = data.x.shape[1]
         n_z = n_x if self.identity else 0
         default = 8 if n_x > 1 and not self.identity else 0
-        decoder = default if self.decoder is None else self.decoder
-        layout = Layout(n_x, n_z, (), self.identity, self.activation,
-                        0 if data.u is None else data.u.shape[1], decoder)
+        layout = Layout(n_x, n_z, 0, self.identity, 0 if data.u is None else data.u.shape[1],
+                        default if self.decoder is None else self.decoder)
         drift, B = linear_drift(data)
-        empty = data.x.new_zeros
-        network = None if not decoder else (
-            empty((decoder, n_z)), empty(decoder), empty((n_x, decoder)), empty(n_x))
-        return Grown(layout, layout.join(Parameters(
-            (), empty((layout.n_free, 0)), drift if self.identity else empty((0, 0)), B,
-            network)), MinimumStatus.CONVERGED)
+        zeros = layout.split(data.x.new_zeros(layout.size))
+        return Grown(layout, layout.join(replace(zeros, A=drift if self.identity else zeros.A,
+                                                 B=B)), MinimumStatus.CONVERGED)
 
-    def planted(self, data: ScaledSamples, hidden: Sequence[tuple[Tensor, Tensor]], V: Tensor
-                ) -> Grown:
+    def planted(self, data: ScaledSamples, W: Tensor, b: Tensor, V: Tensor) -> Grown:
         """
         Return the lift of a network that was learned elsewhere, its A fitted to the samples.
 
-        :param hidden: (W, b) of each hidden layer, of the states as the samples have them.
+        :param W: (h, n_x) and b (h,) of the hidden layer, of the states as the samples have them.
         :param V: (n_free, h) output weights; each coordinate is scaled to variance 1 here.
         :raises ValueError: for a coordinate that stands still on the samples.
         """
         root = self.root(data)
         n_z = root.layout.n_z + len(V)
-        layout = replace(root.layout, n_z=n_z, hidden=tuple(len(b) for _, b in hidden))
-        given, zero = root.layout.split(root.theta), data.x.new_zeros
-        drift = data.drift(given.B)
-        begun = Parameters(tuple(hidden), V, zero((n_z, n_z)), given.B)
-        plain = replace(layout, decoder=0, n_u=0)
-        size = Pass(plain, begun, data.x, drift).z[:, n_z - len(V):].square().mean(0).sqrt()
+        layout = replace(root.layout, n_z=n_z, hidden=len(b))
+        begun = Parameters(W, b, V, data.x.new_zeros((n_z, n_z)), root.layout.split(root.theta).B)
+        size = _lifted(layout, begun, data).z[:, n_z - len(V):].square().mean(0).sqrt()
         if not bool((size > _STILL).all()):
             raise ValueError('a coordinate of the lift that is begun from stands still on the '
                              'samples: begin from that of a plant in the same range, or from '
                              'nothing')
         begun = replace(begun, V=V / size[:, None])
-        lifted = Pass(plain, begun, data.x, drift)
-        A = least_squares(lifted.z, lifted.z_rate).T
-        decoder = None if not layout.decoder else _decoder_start(
-            lifted.z, data.x, layout.decoder, torch.Generator().manual_seed(0))
-        return Grown(layout, layout.join(replace(begun, A=A, decoder=decoder)),
-                     MinimumStatus.CONVERGED)
+        return Grown(layout, _with_linear_fits(layout, begun, data, torch.Generator().manual_seed(
+            0)), MinimumStatus.CONVERGED)
 
     def _extended(self, data: ScaledSamples, n_z: int, parent: Grown, seed: int
                   ) -> tuple[Layout, Tensor]:
-        """Add the coordinates up to `n_z`, started from what the present ones do not span."""
+        """Add the coordinates up to `n_z`, started from the least spanned product."""
         old = parent.layout
         generator = torch.Generator().manual_seed(seed)
         given = old.split(parent.theta)
-        drift = data.drift(given.B)
+        # the coordinates that there are do not depend on the new units
         count = self.hidden_more if old.hidden else self.hidden_first
-        hidden = _widened(given, old.n_x, count, self.layers, generator)
-        layout = replace(old, n_z=n_z, hidden=tuple(len(b) for _, b in hidden))
+        W = torch.cat([given.W, xavier(count, old.n_x, generator).to(data.x)])
+        b = torch.cat([given.b, 0.5 * torch.randn(count, generator=generator,
+                                                  dtype=torch.float64).to(data.x)])
+        layout = replace(old, n_z=n_z, hidden=len(b))
         zero = data.x.new_zeros
-        blank = Parameters(hidden, zero((layout.n_free, layout.hidden[-1])), zero((n_z, n_z)))
-        features = Pass(replace(layout, decoder=0, n_u=0), blank, data.x, drift).features
-        V = torch.cat([given.V, zero((len(given.V), features.shape[1] - given.V.shape[1]))], 1)
-        targets = (_least_spanned_product(parent, data.x, drift)[:, None]
+        begun = Parameters(W, b, zero((layout.n_free, layout.hidden)), zero((n_z, n_z)), given.B)
+        features = _lifted(layout, begun, data).features
+        targets = (_least_spanned_product(parent, data)[:, None]
                    if n_z == old.n_z + 1 else _whitened(data.x))
-        V = torch.cat([V, _ridge_fit(features, targets, self.ridge).T])
-        begun = Parameters(hidden, V, zero((n_z, n_z)), given.B)
-        lifted = Pass(layout, begun, data.x, drift)
-        A = least_squares(lifted.z, lifted.z_rate).T
-        decoder = (_decoder_start(lifted.z, data.x, layout.decoder, generator)
-                   if layout.decoder else None)
-        return layout, layout.join(replace(begun, A=A, decoder=decoder))
+        begun = replace(begun, V=torch.cat([
+            torch.cat([given.V, zero((len(given.V), count))], 1),
+            _ridge_fit(features, targets, self.ridge).T]))
+        return layout, _with_linear_fits(layout, begun, data, generator)
+
+
+def _lifted(layout: Layout, parameters: Parameters, data: ScaledSamples) -> Pass:
+    return Pass(layout, parameters, data.x, data.drift(parameters.B))
+
+
+def _with_linear_fits(layout: Layout, parameters: Parameters, data: ScaledSamples,
+                      generator: torch.Generator) -> Tensor:
+    """Fit A, and the decoder where there is one; return the vector of all parameters."""
+    lifted = _lifted(layout, parameters, data)
+    decoder = (_decoder_start(lifted.z, data.x, layout.decoder, generator)
+               if layout.decoder else None)
+    return layout.join(replace(parameters, A=least_squares(lifted.z, lifted.z_rate).T,
+                               decoder=decoder))
 
 
 def linear_drift(data: ScaledSamples) -> tuple[Tensor, Tensor | None]:
@@ -214,22 +206,6 @@ def xavier(rows: int, columns: int, generator: torch.Generator) -> Tensor:
     return spread * torch.randn((rows, columns), generator=generator, dtype=torch.float64)
 
 
-def _widened(given: Parameters, n_x: int, count: int, layers: int, generator: torch.Generator
-             ) -> tuple[tuple[Tensor, Tensor], ...]:
-    """Add `count` random units to each hidden layer; the old ones do not see the new ones."""
-    hidden = []
-    width, added, like = n_x, 0, given.A
-    for i in range(layers):
-        W, b = given.hidden[i] if given.hidden else (like.new_zeros((0, width)),
-                                                     like.new_zeros(0))
-        old = torch.cat([W, W.new_zeros((len(W), added))], 1) if given.hidden else W
-        new_W = xavier(count, width, generator).to(like)
-        new_b = 0.5 * torch.randn(count, generator=generator, dtype=torch.float64).to(like)
-        hidden.append((torch.cat([old, new_W]), torch.cat([b, new_b])))
-        width, added = len(b) + count, count
-    return tuple(hidden)
-
-
 def _ridge_fit(features: Tensor, targets: Tensor, ridge: float) -> Tensor:
     """Fit `targets` (N, k) by features (N, h); return the weights (h, k)."""
     N, h = features.shape
@@ -253,15 +229,15 @@ def _decoder_start(z: Tensor, x: Tensor, units: int, generator: torch.Generator
     return W, b, fit[:, :-1].contiguous(), fit[:, -1].contiguous()
 
 
-def _least_spanned_product(grown: Grown, x: Tensor, f: Tensor) -> Tensor:
-    """Return what the lift spans least of products of slow eigenfunctions (N,), of variance 1."""
+def _least_spanned_product(grown: Grown, data: ScaledSamples) -> Tensor:
+    """Return the product of slow eigenfunctions that the lift spans least (N,), of variance 1."""
+    x, parameters = data.x, grown.layout.split(grown.theta)
     if grown.layout.n_z == 0:
-        values, vectors = torch.linalg.eig(least_squares(x, f))
+        values, vectors = torch.linalg.eig(least_squares(x, data.drift(parameters.B)))
         z = x
     else:
-        parameters = grown.layout.split(grown.theta)
         values, vectors = torch.linalg.eig(parameters.A.T)
-        z = Pass(grown.layout, parameters, x, f).z
+        z = _lifted(grown.layout, parameters, data).z
     slowest = torch.argsort(values.real, descending=True)[:max(2, x.shape[1])]
     functions = z.to(values.dtype) @ vectors[:, slowest]
     basis = z if grown.layout.n_z else z[:, :0]

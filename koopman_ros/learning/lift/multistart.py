@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The starts of a training: where they run, and what is told of them."""
+"""The starts of a training on a backend, and their progress."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+import contextlib
 from dataclasses import dataclass
 import math
 
 import numpy as np
 import torch
 
-from koopman_ros.jobs.backends import Backend, Tell
+from koopman_ros.execution import Backend, Tell
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.incremental import Grown, Growth
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
 from koopman_ros.learning.lift.residuals import ScaledSamples
-from koopman_ros.learning.lift.threads import torch_threads
 
 Recipe = Growth | Algorithm1 | NeuralDrift
 
@@ -72,10 +72,21 @@ class Tracker:
         return self.stop
 
 
+@contextlib.contextmanager
+def torch_threads(count: int) -> Generator[None]:
+    """Let torch work with so many threads for a while; the bits of its sums depend on them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
                parent: Grown | None, seed: int, starts: int, threads: int, tracker: Tracker
                ) -> Generator[tuple[str, Grown | str]]:
-    """Run one round; yield what each start has found, in their order, or why it has nothing."""
+    """Run one round; yield the result of each start in their order, or the reason of a failure."""
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     items = {f'start {i + 1} with n_z = {n_z}': (
         recipe.of_start(i) if isinstance(recipe, Growth) else recipe, number)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The frame that a lift of an unstable plant is learned in: under a feedback, states whitened."""
+"""Prestabilization: an unstable plant is learned under a feedback, its states whitened."""
 
 from __future__ import annotations
 
@@ -89,8 +89,7 @@ class Frame:
         largest and smallest variance, so that they do not add to the condition number.
         """
         back = np.linalg.inv(self.T)
-        (W, b), *further = observables.hidden
-        hidden = ((W @ self.T, b), *further)
+        W, b = observables.hidden[0]
         output = observables.output
         if observables.identity:
             spread = np.linalg.eigvalsh(back @ back.T)
@@ -99,5 +98,5 @@ class Frame:
             n_free = len(output)
             A = block_diag(back, size * np.eye(n_free)) @ A @ block_diag(
                 self.T, np.eye(n_free) / size)
-        return (replace(observables, hidden=hidden, output=output), A,
+        return (replace(observables, hidden=((W @ self.T, b),), output=output), A,
                 None if B is None else back @ B)

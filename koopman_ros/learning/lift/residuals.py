@@ -1,51 +1,29 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stacked residuals by which a lift is learned, with their hand-derived Jacobian, in torch."""
+"""The residuals by which a lift is learned, with their hand-derived Jacobian, in torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
 
 import torch
 from torch import Tensor
 
 from koopman_ros.learning.lift.levenberg_marquardt import NormalEquations
-from koopman_ros.learning.lift.moment_sums import FeatureMap, MomentSums, ProductSums
+from koopman_ros.learning.lift.moment_sums import feature_count, MomentSums
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, Samples
+
+# Numbers in a chunk of the residual Jacobian: 2 MiB, the cache of a core.
+CHUNK = 1 << 18
 
 
 def deviations(box: Box, samples: Samples) -> tuple[Array, Array, Array]:
     """Scale samples to deviations: x (N, n_x), dx/dt (N, n_x), u (N, n_u)."""
     return (box.states.to_deviation(samples.x), samples.dxdt / box.states.scale,
             box.inputs.to_deviation(samples.u))
-
-
-# What samples add to the cost and its derivatives at some parameters, as far as it simply adds up.
-Sums = tuple[Tensor, ...]
-
-
-class Problem(Protocol):
-    """A least-squares problem on samples."""
-
-    def on(self, data: ScaledSamples) -> Self:
-        """Return the same problem on other samples."""
-        ...
-
-    def sums(self, theta: Tensor, derivatives: bool, N: int) -> Sums:
-        """Sum over its samples, which are some of N, at parameters (p,)."""
-        ...
-
-
-class SamplesElsewhere(Protocol):
-    """Samples that stay where they are: sums over them come from there."""
-
-    def sums(self, problem: Problem, theta: Tensor, derivatives: bool) -> Sums:
-        """Sum over all of them at parameters (p,), in an order of their own that never changes."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -57,29 +35,15 @@ class ScaledSamples:
     #: (N, n_u) inputs whose B is to be learned, and their products with monomials of the state
     #: where it depends on that; None where B is known
     u: Tensor | None = None
-    #: over which residuals are summed in the place of these, which then only start a lift
-    elsewhere: SamplesElsewhere | None = None
 
     def drift(self, B: Tensor | None) -> Tensor:
-        """Return the rates without what the inputs do, (N, n_x)."""
+        """Return the rates less the effect of the inputs, (N, n_x)."""
         return self.f if B is None or self.u is None else self.f - self.u @ B.T
 
     def part(self, start: int, length: int) -> ScaledSamples:
         """Return some consecutive samples."""
         rows = slice(start, start + length)
         return ScaledSamples(self.x[rows], self.f[rows], None if self.u is None else self.u[rows])
-
-    def none(self) -> ScaledSamples:
-        """Return no samples of the same kind."""
-        # not a view, which would be pickled with all samples
-        return ScaledSamples(*(None if a is None else a.new_empty((0, a.shape[1]))
-                               for a in (self.x, self.f, self.u)))
-
-    def sums(self, problem: Problem, theta: Tensor, derivatives: bool) -> Sums:
-        """Sum over these or those elsewhere, for a problem on these."""
-        if self.elsewhere is None:
-            return problem.sums(theta, derivatives, len(self))
-        return self.elsewhere.sums(problem.on(self.none()), theta, derivatives)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -111,9 +75,7 @@ class LiftProblem:
     layout: Layout  #: sizes of the lift
     data: ScaledSamples  #: the samples
     weights: ResidualWeights  #: weights of the residuals
-    #: samples at a time; by default as many as keep the residual Jacobian in 2 MiB, the cache of a
-    #: core
-    chunk: int = 0
+    chunk: int = 0  #: samples at a time; by default as many as fit into the cache
 
     def __post_init__(self) -> None:
         if self.layout.n_u and self.data.u is None:
@@ -121,69 +83,40 @@ class LiftProblem:
         if self.weights.decoder and not self.layout.decoder:
             raise ValueError('a decoder weight needs a decoder network')
         if not self.chunk:
-            shallow = len(self.layout.hidden) == 1
-            rows = max(self.layout.n_x if self.layout.decoder else 0,
-                       0 if shallow else self.layout.n_z)
-            floats = max(rows * self.layout.size,
-                         FeatureMap.size(self.layout) if shallow else 0)
-            object.__setattr__(self, 'chunk', max(64, (1 << 18) // floats))
+            floats = max(feature_count(self.layout),
+                         self.layout.n_x * self.layout.size * bool(self.layout.decoder))
+            object.__setattr__(self, 'chunk', max(64, CHUNK // floats))
 
     def with_weights(self, weights: ResidualWeights) -> LiftProblem:
         """Return the same problem with other weights."""
         return replace(self, weights=weights)
 
-    def on(self, data: ScaledSamples) -> LiftProblem:
-        """Return the same problem on other samples."""
-        return replace(self, data=data)
-
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
         """Add the residuals at parameters (p,) over all samples."""
-        layout, derivatives = self.layout, equations.derivatives
-        cost, moment, *others = self.data.sums(self, theta, derivatives)
-        decoder = others[-2:] if derivatives and self.weights.decoder else []
-        equations.add_sums(cost, *decoder)
-        i, j, scale, r = _whitening(layout, moment, self.weights.whitening)
-        J = None
-        if derivatives:
-            gradient, matrix, moment_rate = self._kind.result(
-                layout, layout.split(theta), self.weights.whitening > 0.0,
-                others[:len(others) - len(decoder)])
-            equations.add_sums(0.0, gradient, matrix)
-            J = scale[:, None] * (moment_rate[i, j] + moment_rate[j, i])
-        equations.add(r, J)
-
-    def sums(self, theta: Tensor, derivatives: bool, N: int) -> Sums:
-        """
-        Sum over its samples, which are some of N, at parameters (p,).
-
-        :return: the cost, E[z z'] (n_z, n_z), what the residuals of the dynamics add to the normal
-            equations, and gradient (p,) and matrix (p, p) of the decoder's, where there is one.
-        """
-        layout = self.layout
+        layout, derivatives, N = self.layout, equations.derivatives, len(self.data)
         parameters = layout.split(theta)
-        decoding = bool(self.weights.decoder)
-        equations = NormalEquations(theta, derivatives=derivatives and decoding)
-        dynamics = self._kind(layout, parameters, N, self.weights.whitening > 0.0) if (
-            derivatives) else None
-        moment = theta.new_zeros((layout.n_z, layout.n_z))
-        for start in range(0, len(self.data), self.chunk):
+        dynamics = MomentSums(layout, parameters, N) if derivatives else None
+        moment, cost = theta.new_zeros((layout.n_z, layout.n_z)), theta.new_zeros(())
+        for start in range(0, N, self.chunk):
             data = self.data.part(start, self.chunk)
             f = data.drift(parameters.B)
             lifted = Pass(layout, parameters, data.x, f)
             r = lifted.z_rate - lifted.z @ parameters.A.T
-            equations.add(r, count=N)
+            cost += 0.5 * torch.sum(r * r) / N
             moment += lifted.z.T @ lifted.z / N
             if dynamics is not None:
-                dynamics.add(data.x, f, data.u, lifted, r)
-            if decoding:
+                dynamics.add(data.x, f, data.u if layout.n_u else None, lifted, r)
+            if self.weights.decoder:
                 equations.add(*_decoder_block(layout, parameters, data.x, lifted,
                                               self.weights.decoder ** 0.5, derivatives), count=N)
-        cost, *others = equations.sums
-        return cost, moment, *(dynamics.sums if dynamics else ()), *others
-
-    @property
-    def _kind(self) -> type[MomentSums | ProductSums]:
-        return MomentSums if len(self.layout.hidden) == 1 else ProductSums
+        equations.add_sums(cost, *(dynamics.result() if dynamics else ()))
+        if self.weights.whitening > 0.0:
+            i, j, scale, residual = _whitening(layout, moment, self.weights.whitening)
+            J = None
+            if dynamics is not None:
+                rates = dynamics.moment_rates()
+                J = scale[:, None] * (rates[i, j] + rates[j, i])
+            equations.add(residual, J)
 
 
 def _decoder_block(layout: Layout, parameters: Parameters, x: Tensor, lifted: Pass,
@@ -204,11 +137,9 @@ def _decoder_block(layout: Layout, parameters: Parameters, x: Tensor, lifted: Pa
     for m in range(layout.n_x):
         J[:, m, at_V].unflatten(1, V.shape)[:, m] = -weight * t
         J[:, m, at_c][:, m] = -weight
-    if layout.hidden:
-        to_free = (to_input @ W)[:, :, layout.n_z - layout.n_free:]
-        lifted.pull_back(J, to_free @ parameters.V, None)
-        J[:, :, layout.slices[2 * len(layout.hidden)]] = torch.einsum(
-            'nmk,nh->nmkh', to_free, lifted.features).flatten(2)
+    to_free = (to_input @ W)[:, :, layout.n_z - layout.n_free:]
+    lifted.pull_back(J, to_free @ parameters.V)
+    J[:, :, layout.slices[2]] = torch.einsum('nmk,nh->nmkh', to_free, lifted.features).flatten(2)
     return r, J
 
 

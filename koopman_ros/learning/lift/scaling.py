@@ -21,7 +21,7 @@ from koopman_ros.plant_data import Array, Plant, Samples
 
 @dataclass(frozen=True)
 class Scaling:
-    """How samples are scaled; small, so that it can be sent to where they are."""
+    """Scaling of samples for training, and of its result back."""
 
     box: Box  #: names and scaling of states and inputs
     inputs: InputModel  #: what is known of B
@@ -72,31 +72,22 @@ class Scaling:
                 raise ValueError(f'the lift that is begun from has the {kind} {_listed(its)}, the '
                                  f'plant has {_listed(ours)}: begin from that of a plant of the '
                                  'same kind')
-        wanted = recipe.identity, recipe.layers, recipe.activation
         if not isinstance(network, NetworkObservables) or not len(network.output) or (
-                network.identity, len(network.hidden), network.activation) != wanted:
+                network.identity != recipe.identity):
             raise ValueError(
                 'the lift that is begun from is of another class: begin from one with '
-                f'{"" if recipe.identity else "no "}identity coordinates and others by a network '
-                f'of {recipe.layers} hidden layer(s) of {recipe.activation}')
+                f'{"" if recipe.identity else "no "}identity coordinates and others by a network')
         # deviations there are `stretch` times those here and `shift`
         stretch = own.scale / begin.states.scale
         shift = (own.center - begin.states.center) / begin.states.scale
-        (W, b), *further = network.hidden
+        (W, b), V = network.hidden[0], network.output
         W, b = W * stretch, b + W @ shift
         if self.frame:
             W = W @ np.linalg.inv(self.frame.T)
-        layers = [(W, b), *further]
-        if len(layers) == 1:
-            # units of the read-out alone have no part in z
-            used = np.any(network.output != 0.0, axis=0)
-            layers, output = [(W[used], b[used])], network.output[:, used]
-        else:
-            output = network.output
-        like = data.x
-        return recipe.planted(data, [
-            (like.new_tensor(np.ascontiguousarray(W)), like.new_tensor(b)) for W, b in layers],
-            like.new_tensor(np.ascontiguousarray(output)))
+        # units of the read-out alone have no part in z
+        used = np.any(V != 0.0, axis=0)
+        return recipe.planted(data, *(data.x.new_tensor(np.ascontiguousarray(a)) for a in (
+            W[used], b[used], V[:, used])))
 
     def model(self, grown: Grown, **about: Any) -> LiftedModel:
         """Return what was learned in units; `about` are further fields of the model."""
@@ -105,9 +96,8 @@ class Scaling:
             self.pace * parts.B.numpy())
         alone = grown.drift_alone
         observables = NetworkObservables(
-            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
-            parts.V.numpy()[:0 if alone else None], alone or grown.layout.identity,
-            grown.layout.activation)
+            ((parts.W.numpy(), parts.b.numpy()),), parts.V.numpy()[:0 if alone else None],
+            alone or grown.layout.identity)
         if self.frame:
             observables, A, B = self.frame.leave(observables, A, B)
         constant, terms = self.inputs.matrix(B)

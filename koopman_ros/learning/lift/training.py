@@ -15,16 +15,15 @@ import numpy as np
 from koopman_ros import __version__
 from koopman_ros.arrays import brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
-from koopman_ros.jobs.backends import Backend, Here
-from koopman_ros.learning.lift.algorithm_1 import Edmd
+from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
+from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import Grown, Growth
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.lift.metrics import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
 from koopman_ros.learning.lift.multistart import Recipe, run_starts, Tracker, Watch
-from koopman_ros.learning.lift.neural_drift import fitted_readout, readout_rows, SMALLEST
+from koopman_ros.learning.lift.neural_drift import SMALLEST, with_readout
 from koopman_ros.learning.lift.scaling import Scaling
-from koopman_ros.learning.lift.shards import KeptShards, Shard
 from koopman_ros.lifting import Box, LiftedModel, Provenance, TrainingStates
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 
@@ -60,27 +59,6 @@ class NoUsefulLift(ValueError):  # noqa: N818
 
 
 @dataclass(frozen=True)
-class _Assembly:
-    """What turns the solution of a start into a model."""
-
-    scaling: Scaling
-    samples: Samples  # for its training, where there are no shards
-    shards: KeptShards | None
-    training_states: TrainingStates | None
-    provenance: Provenance
-
-    def model(self, grown: Grown) -> LiftedModel:
-        return self.scaling.model(grown, training_states=self.training_states,
-                                  provenance=self.provenance)
-
-    def readouts(self, model: LiftedModel) -> list[LiftedModel]:
-        """Return the model with each read-out that is tried."""
-        rows, N = (readout_rows(model, self.samples), len(self.samples)) if (
-            self.shards is None) else (self.shards.readout_rows(model), len(self.shards))
-        return [fitted_readout(model, rows, N, smallest) for smallest in SMALLEST]
-
-
-@dataclass(frozen=True)
 class _Candidate:
     grown: Grown
     model: LiftedModel  # its drift read off the rate of z or out of its features
@@ -96,20 +74,13 @@ class _Candidate:
 def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
           split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
           loops: int = LOOPS, device: str = 'cpu', threads: int = 1,
-          backend: Backend | None = None, shards: Sequence[Shard] = (),
-          begin: LiftedModel | None = None) -> Trained:
+          backend: Backend | None = None, begin: LiftedModel | None = None) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
     A fifth of the episodes chooses the winner of each round and another fifth, touched by nothing
-    else, gives the figures reported. The starts of a round run where `backend` says, and give the
-    same model wherever that is. An interrupt from the keyboard ends the training and keeps the
-    best so far.
-
-    With `shards` the model is fitted to those alone, wherever workers have them: sums over them
-    come back, no samples. The starts then run here, one after the other, and `samples` are some of
-    the plant's, from which the starts begin, of which two fifths choose and judge as ever, and
-    which the checks of data are made on.
+    else, gives the figures reported. The result does not depend on the backend. An interrupt from
+    the keyboard ends the training and keeps the best so far.
 
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
@@ -119,19 +90,18 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         refused.
     :param loops: closed loops in which the law is tried before, see
         :func:`~koopman_ros.control.law_check.check_law`; 0 for none.
-    :param device: where the residuals are evaluated, as torch names it, on every worker.
+    :param device: that evaluates the residuals, as torch names it, on every worker.
     :param threads: torch's threads for each start, for a number of which the bits are the same.
-    :param backend: where starts and closed loops run and shards are, see
-        :func:`~koopman_ros.jobs.backends.backend_of`; this process by default.
-    :param shards: how workers read what the model is fitted to.
-    :param begin: a lift of a plant of the same kind, which the training goes on from: what it has
-        of coordinates is fitted to the samples in one start, further ones are added as ever.
-        None to begin from nothing.
+    :param backend: of starts and closed loops, see :func:`~koopman_ros.execution.backend_of`; this
+        process by default.
+    :param begin: a lift of a plant of the same kind that the training begins from: its coordinates
+        are fitted to the samples in one start, further ones are added as usual. None to begin from
+        nothing.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes, or when its law fails in closed loop.
-    :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe that
-        does not fit, a lift to begin from that does not, times that contradict the derivatives,
-        a nominal point where the plant moves, or a device that there is not.
+    :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe or a lift
+        to begin from that does not fit, times that contradict the derivatives, a nominal point
+        where the plant moves, or an unknown device.
     :raises KeyboardInterrupt: when interrupted before the first start finished.
     :raises WorkerLost: when workers of the backend are lost and none takes over.
     :raises SchedulerLost: when its scheduler is.
@@ -143,27 +113,27 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         rounds = _further(recipe, rounds, begin)
     parts = split_by_episode(samples, split_seed)
     tracker = Tracker(watch, starts * len(rounds) - (starts - 1) * (begin is not None))
-    backend = backend or Here()
-    with contextlib.ExitStack() as stack:
-        kept = stack.enter_context(contextlib.closing(KeptShards(backend, shards))) if (
-            shards) else None
-        box, digest = _extent(plant, samples, kept)
-        check_rates(plant, samples)
-        check_nominal_point(plant, samples, box)
-        scaling = Scaling.of(plant, box, parts[0],
-                             recipe.pre_feedback if isinstance(recipe, Growth) else None)
-        data = scaling.data(parts[0], device)
-        if kept is not None:
-            kept.scaled(scaling, device, threads)
-            data = replace(data, elsewhere=kept)
-        assembly = _Assembly(scaling, parts[0], kept, training_states(box, samples),
-                             Provenance(plant.name, seed, digest, {}, __version__))
-        first = None if begin is None or not isinstance(recipe, Growth) else scaling.planted(
-            recipe, begin, data)
-        path, interrupted = _run_rounds(
-            assembly, parts[1], rounds, tracker, lambda n_z, parent: run_starts(
-                Here() if kept else backend, recipe, data, n_z, parent or first, seed,
-                1 if parent is None and first is not None else starts, threads, tracker))
+    backend = backend or Serial()
+    box = Box.of(plant, samples.x, samples.u)
+    check_rates(plant, samples)
+    check_nominal_point(plant, samples, box)
+    scaling = Scaling.of(plant, box, parts[0],
+                         recipe.pre_feedback if isinstance(recipe, Growth) else None)
+    data = scaling.data(parts[0], device)
+    about = {'training_states': training_states(box, samples),
+             'provenance': Provenance(plant.name, seed, samples.digest(), {}, __version__)}
+    first = None if begin is None or not isinstance(recipe, Growth) else scaling.planted(
+        recipe, begin, data)
+
+    def run(n_z: int, parent: Grown | None) -> Generator[tuple[str, Grown | str]]:
+        count = 1 if parent is None and first is not None else starts
+        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, threads,
+                          tracker)
+
+    def judge(grown: Grown | str) -> _Candidate | str:
+        return _judged(grown, lambda found: scaling.model(found, **about), parts)
+
+    path, interrupted = _run_rounds(rounds, tracker, run, judge)
     return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse,
                      backend)
 
@@ -179,17 +149,10 @@ def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple
     return tuple(n_z for n_z in rounds if n_z >= begin.n_z)
 
 
-def _extent(plant: Plant, samples: Samples, kept: KeptShards | None) -> tuple[Box, str]:
-    """Return the range of all samples, and their digest."""
-    if kept is None:
-        return Box.of(plant, samples.x, samples.u), samples.digest()
-    x, u = kept.corners
-    return Box.of(plant, np.vstack([samples.x, x]), np.vstack([samples.u, u])), kept.digest
-
-
-def _run_rounds(assembly: _Assembly, validation: Samples, rounds: Sequence[int],
-                tracker: Tracker, run: Callable[[int, Grown | None], Generator[
-                    tuple[str, Grown | str]]]) -> tuple[list[_Candidate], bool]:
+def _run_rounds(rounds: Sequence[int], tracker: Tracker,
+                run: Callable[[int, Grown | None], Generator[tuple[str, Grown | str]]],
+                judge: Callable[[Grown | str], _Candidate | str]
+                ) -> tuple[list[_Candidate], bool]:
     """Return the winners of the rounds, and whether they were interrupted."""
     path: list[_Candidate] = []
     reasons: list[str] = []
@@ -203,7 +166,7 @@ def _run_rounds(assembly: _Assembly, validation: Samples, rounds: Sequence[int],
                 for _, grown in finds:
                     if not isinstance(grown, str):
                         tracker.steps += grown.iterations
-                    candidate = _judged(assembly, grown, validation)
+                    candidate = judge(grown)
                     if isinstance(candidate, str):
                         reasons.append(candidate)
                     elif best is None or candidate.score < best.score:
@@ -314,15 +277,17 @@ def training_states(box: Box, samples: Samples) -> TrainingStates | None:
         states.to_deviation(samples.x), 0.5 * (states.upper - states.lower) / states.scale)
 
 
-def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples) -> _Candidate | str:
-    """Return the candidate of a start, or why it has none."""
+def _judged(grown: Grown | str, model_of: Callable[[Grown], LiftedModel],
+            parts: tuple[Samples, Samples, Samples]) -> _Candidate | str:
+    """Return the candidate of a start, or the reason why there is none."""
     if isinstance(grown, str):
         return grown
     if grown.status is MinimumStatus.STALLED:
         return grown.status.value
+    validation = parts[1]
     try:
-        model = assembly.model(grown)
-        readings = [model, *assembly.readouts(model)]
+        model = model_of(grown)
+        readings = [model, *(with_readout(model, parts[0], smallest) for smallest in SMALLEST)]
         fits = [fit(reading, validation.x, validation.dxdt, validation.u) for reading in readings]
         best = int(np.nanargmin([found.rx for found in fits]))
     except (ValueError, np.linalg.LinAlgError) as error:

@@ -214,7 +214,7 @@ def test_it_ends_when_parameters_hardly_move_or_after_max_rounds(
 
 
 def test_it_lowers_the_residual_of_the_dynamics(data):
-    recipe = Algorithm1(2, identity=True, hidden=(4,), decoder=4, max_iterations=60)
+    recipe = Algorithm1(2, identity=True, hidden=4, decoder=4, max_iterations=60)
     grown = recipe.start(data, 2, None, 0)
     problem = LiftProblem(grown.layout, data, ResidualWeights())
     found = normal_equations(problem.add_residuals, grown.theta, derivatives=False)

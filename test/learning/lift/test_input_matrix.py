@@ -174,7 +174,7 @@ def test_observer_and_hindsight_know_what_an_input_does_at_each_state():
 
 def test_lifts_and_drifts_are_learned_with_it():
     """Held to the true plant: the law holds all over the box, on the plant itself."""
-    for plant, recipe in ((KNOWN, NeuralDrift((10,), max_iterations=60)),
+    for plant, recipe in ((KNOWN, NeuralDrift(10, max_iterations=60)),
                           (UNKNOWN, Growth(4, hidden_first=10, max_iterations=60))):
         model = train(plant, samples(), recipe, starts=1, loops=0).model
         fresh = samples()

@@ -130,7 +130,7 @@ def test_the_sums_of_a_drift_are_those_of_its_differentiated_residual(hidden, n_
 def test_a_neural_drift_is_learned_saved_and_controls(B, tmp_path):
     """The paper's two-state example, whose quadratic drift no tanh spans."""
     trained = train(replace(TWO_STATE, B=B), two_state_samples(400),
-                    NeuralDrift((6,), max_iterations=100), starts=2, loops=16)
+                    NeuralDrift(6, max_iterations=100), starts=2, loops=16)
     model = trained.model
     assert (model.n_z, model.identity, model.readout.shape) == (2, True, (2, 8))
     assert trained.figures.fit.rx < 1e-4 * trained.linear.fit.rx
@@ -150,7 +150,7 @@ def test_a_plant_that_is_linear_needs_no_network():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     with pytest.raises(NoUsefulLift, match='does not predict the motion better than a linear'):
-        train(BENT, linear, NeuralDrift((3,), max_iterations=20), starts=1)
+        train(BENT, linear, NeuralDrift(3, max_iterations=20), starts=1)
 
 
 @pytest.mark.parametrize(('change', 'message'), [

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 
+from koopman_ros.learning.shards import identify_bags
 import numpy as np
 import pytest
 import torch
@@ -19,13 +20,12 @@ import torch
 import koopman_ros
 from koopman_ros.bags import loop_episodes
 from koopman_ros.control.law_check import check_law
-from koopman_ros.jobs.backends import Here
+from koopman_ros.execution import Serial
 from koopman_ros.learning import NeuralDrift, read_samples, Shard, train
 from koopman_ros.learning.config import known
 from koopman_ros.learning.identification import identify, identify_hidden
 from koopman_ros.learning.identification.weak_form import weak_form
 from koopman_ros.learning.record import read_record
-from koopman_ros.learning.shards import identify_bags
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.plant_data import cut
 from support.known_plants import CUBIC, methods, PAIR
@@ -67,7 +67,7 @@ def test_many_samples_go_to_processes(places):
     assert some.x.nbytes > 1 << 20
     recipe = replace(SMALL, max_iterations=2, tolerance=0.0)
     one, other = (train(BENT, some, recipe, starts=1, loops=16, backend=backend)
-                  for backend in (Here(), places['joblib:2']))
+                  for backend in (Serial(), places['joblib:2']))
     assert bits(other.model) == bits(one.model)
     assert np.isfinite(one.figures.fit.rw)
 
@@ -90,7 +90,7 @@ def test_a_start_that_fails_is_named(places):
 
 
 @pytest.mark.parametrize('recipe', [replace(SMALL, max_iterations=8),
-                                    NeuralDrift((4,), max_iterations=5)],
+                                    NeuralDrift(4, max_iterations=5)],
                          ids=['lift', 'drift'])
 def test_the_bits_do_not_depend_on_where_shards_are(recipe, places, tmp_path):
     shards = shards_of(bent_samples(length=200, seed=3), tmp_path)
@@ -187,7 +187,7 @@ def test_a_drift_of_bags_that_stay_with_their_workers(bags, places):
     plant = known(task(bags, Path('none.safetensors')), None)[0]
     sizes = []
 
-    class Weighed(Here):
+    class Weighed(Serial):
         def keep(self, load, items):
             kept = super().keep(load, items)
             original = kept.run
@@ -241,7 +241,7 @@ def test_the_watch_follows_and_can_end_starts_anywhere(kind, places):
 
 PROGRAM = """
 import signal
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 from koopman_ros.learning import Growth, train
 from support.small_plants import BENT, bent_samples
 

@@ -274,7 +274,7 @@ def test_b_is_learned(plant, samples):
 
 
 def test_the_recipe_of_the_paper():
-    recipe = Algorithm1(2, identity=True, hidden=(4,), decoder=4, max_rounds=3, max_iterations=60)
+    recipe = Algorithm1(2, identity=True, hidden=4, decoder=4, max_rounds=3, max_iterations=60)
     trained = train(BENT, bent_samples(), recipe, starts=2, loops=16)
     assert trained.model.n_z == 2
     assert trained.figures.fit.rx < trained.linear.fit.rx

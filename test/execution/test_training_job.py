@@ -13,10 +13,10 @@ import subprocess
 import sys
 import time
 
+from koopman_ros.jobs import ending, training
 import pytest
 
-from koopman_ros.jobs import ending, training
-from koopman_ros.jobs.training import JobState, RetrainingJob
+from koopman_ros.execution.training import JobState, TrainingJob
 from koopman_ros.resources import model_path
 from support.nodes import TIMEOUT, wait_until_ended
 from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
@@ -34,7 +34,7 @@ def task(bag: Path, tmp_path: Path) -> dict[str, object]:
             'states': list(map(asdict, STATES)), 'inputs': list(map(asdict, INPUTS))}
 
 
-def follow(job: RetrainingJob) -> Iterator[JobState]:
+def follow(job: TrainingJob) -> Iterator[JobState]:
     """Yield the states of a job to its end."""
     deadline = time.monotonic() + TIMEOUT
     while not job.state.ended:
@@ -56,7 +56,7 @@ def test_process_that_gets_a_signal(
         number: int, code: int, words: str) -> None:
     # its libraries may take their time to end on a busy machine
     monkeypatch.setattr(ending, '_PATIENCE', TIMEOUT)
-    job = RetrainingJob(task)
+    job = TrainingJob(task)
     assert any(state.text.startswith(step) for state in itertools.chain([job.state], follow(job)))
     os.kill(job._process.pid, number)
     *_, state = follow(job)
@@ -81,7 +81,7 @@ def test_process_that_gets_a_signal(
 def test_process_that_breaks_down(
         monkeypatch: pytest.MonkeyPatch, program: str, state: JobState) -> None:
     monkeypatch.setattr(training, '_command', lambda: (sys.executable, '-c', program))
-    job = RetrainingJob({})
+    job = TrainingJob({})
     *_, last = follow(job)
     assert last == state
     job.close()
@@ -91,7 +91,7 @@ def test_process_that_ends_before_it_has_read_its_task(monkeypatch: pytest.Monke
     monkeypatch.setattr(
         training, '_command', lambda: (sys.executable, '-c', 'raise SystemExit("no time")'))
     # more than a pipe holds
-    job = RetrainingJob({'output': 'x' * 1_000_000})
+    job = TrainingJob({'output': 'x' * 1_000_000})
     *_, last = follow(job)
     assert last == JobState(0.0, 'the training process ended with code 1: no time', True)
     job.close()
@@ -102,8 +102,8 @@ def test_process_ends_with_its_parent_that_is_killed(
         task: dict[str, object], tmp_path: Path, word: str) -> None:
     program = (
         'import sys, time\n'
-        'from koopman_ros.jobs.training import RetrainingJob\n'
-        f'job = RetrainingJob({task!r})\n'
+        'from koopman_ros.execution.training import TrainingJob\n'
+        f'job = TrainingJob({task!r})\n'
         f'while not job.poll().text.startswith({word!r}):\n'
         '    time.sleep(0.01)\n'
         'print(job._process.pid, flush=True)\n'
@@ -121,7 +121,7 @@ def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(training, '_command', lambda: (
         'sh', '-c', 'echo \'{"progress": 0.5, "text": "x"}\'; exec sleep 3600'))
     monkeypatch.setattr(ending, '_PATIENCE', 0.2)
-    job = RetrainingJob({})
+    job = TrainingJob({})
     next(follow(job))
     job.close()
     assert job._process.returncode == -signal.SIGKILL

@@ -9,13 +9,13 @@ import subprocess
 import sys
 import time
 
-from koopman_ros.jobs.replaying import ReplayJob
+from koopman_ros.execution.job import ReplayJob
 from support.nodes import TIMEOUT, wait_until_ended
 
 START = """
 import sys
 from pathlib import Path
-from koopman_ros.jobs.replaying import ReplayJob
+from koopman_ros.execution.job import ReplayJob
 job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]'], Path(sys.argv[1]))
 print(job._process.pid, flush=True)
 sys.stdin.read()

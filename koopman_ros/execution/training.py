@@ -1,25 +1,19 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A retraining in a process of its own: start, progress, outcome, cancel; without ROS."""
+"""A training in a child process: start, progress, outcome, cancel; without ROS and torch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-import contextlib
 from dataclasses import dataclass, field, replace
 import json
-import os
 import queue
 import signal
-import subprocess
-import threading
-from typing import Any, IO
+from typing import Any
 
-from koopman_ros.jobs.ending import see_it_end
-from koopman_ros.startup import command, ONE_THREAD
+from koopman_ros.execution.job import Job
 
-_MODULE = 'koopman_ros.learning.__main__'
 _CANCELLED = 'cancelled, nothing was written'
 
 
@@ -50,9 +44,9 @@ class JobState:
         return bool(self.summary and not self.summary['accepted'])
 
 
-class RetrainingJob:
+class TrainingJob(Job):
     """
-    A retraining in a process of its own, of fields of :class:`koopman_ros.learning.Task`.
+    A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`.
 
     Of a fleet with ``plants``, such fields by name, and ``scheduler``.
     """
@@ -60,49 +54,22 @@ class RetrainingJob:
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()
         self._cancelled = False
-        # a session of its own: an interrupt of the terminal is passed on by us
-        self._process = subprocess.Popen(
-            _command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, encoding='utf-8', errors='replace', start_new_session=True,
-            env={**ONE_THREAD, **os.environ})
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._complaints: list[str] = []
-        stdin, *outputs = self._process.stdin, self._process.stdout, self._process.stderr
-        assert stdin is not None
-        # one that ended at once has read nothing, and says why below
-        with contextlib.suppress(BrokenPipeError):
-            stdin.write(json.dumps(dict(task)) + '\n')
-            stdin.flush()
-        self._threads = [
-            threading.Thread(target=read, args=(stream,), daemon=True) for read, stream in zip(
-                (self._read_lines, self._read_complaints), outputs, strict=True)]
-        for thread in self._threads:
-            thread.start()
+        super().__init__('koopman_ros.learning.__main__', task=json.dumps(dict(task)))
 
     def poll(self) -> JobState:
-        """Take note of what the process has said since, and return where it stands."""
-        while not self.state.ended and not self._lines.empty():
-            line = self._lines.get()
-            self.state = self._ended() if line is None else self._told(line)
+        """Read the output of the process since the last call, and return its state."""
+        try:
+            while not self.state.ended:
+                line = self.line()
+                self.state = self._ended() if line is None else self._told(line)
+        except queue.Empty:
+            pass
         return self.state
 
     def cancel(self) -> None:
-        """Ask the process to end; nothing is written then."""
+        """Request the end of the process; nothing is written then."""
         self._cancelled = True
-        assert self._process.stdin is not None
-        # it may have ended
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-
-    def close(self) -> None:
-        """End the process, by force when it does not end in time."""
-        self.cancel()
-        see_it_end(self._process)
-        for thread in self._threads:
-            thread.join()
-        for stream in (self._process.stdout, self._process.stderr):
-            assert stream is not None
-            stream.close()
+        super().cancel()
 
     def _told(self, line: str) -> JobState:
         try:
@@ -123,7 +90,7 @@ class RetrainingJob:
         return self._conclusion(said)
 
     def _conclusion(self, said: Mapping[str, Any]) -> JobState:
-        """Return how a retraining ended, by its last words."""
+        """Return the state by the last line of a training."""
         if 'summary' in said:
             return JobState(1.0, _in_words(said['summary']), True, said['summary'])
         if 'stopped' in said:
@@ -131,8 +98,8 @@ class RetrainingJob:
         return JobState(self.state.share, f'training failed: {said["error"]}', True)
 
     def _ended(self) -> JobState:
-        """Say what is known of a process that ended without a word."""
-        code = self._process.wait()
+        """Return the state of a process that ended without a last line."""
+        code = self.process.wait()
         if self._cancelled:
             text = _CANCELLED
         elif code < 0:
@@ -140,27 +107,12 @@ class RetrainingJob:
             text = (f'the training process was killed by {name}: see whether the memory '
                     'suffices, and train again')
         else:
-            self._threads[1].join()
-            last = self._complaints[-1] if self._complaints else 'it said nothing'
+            last = self.errors[-1] if self.errors else 'it said nothing'
             text = f'the training process ended with code {code}: {last}'
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): '
                         'pip install torch cloudpickle joblib tqdm')
         return replace(self.state, text=text, ended=True)
-
-    def _read_lines(self, stream: IO[str]) -> None:
-        for line in stream:
-            self._lines.put(line)
-        self._lines.put(None)
-
-    def _read_complaints(self, stream: IO[str]) -> None:
-        for line in stream:
-            self._complaints = [*self._complaints[-20:], line.strip()]
-
-
-def _command() -> tuple[str, ...]:
-    # killed with us: nobody would hear what it says
-    return command(_MODULE, signal.SIGKILL, interrupted=1)
 
 
 def _in_words(summary: Mapping[str, Any]) -> str:

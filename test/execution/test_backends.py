@@ -12,9 +12,8 @@ import signal
 import numpy as np
 import pytest
 
-from koopman_ros.jobs.backends import backend_of, Here, SchedulerLost, WorkerLost
-from koopman_ros.jobs.cluster import Cluster
-from koopman_ros.jobs.processes import Processes
+from koopman_ros.execution import backend_of, SchedulerLost, Serial, WorkerLost
+from koopman_ros.execution.pools import Cluster, Processes
 from koopman_ros.parameters.trainer import trainer_table
 from support.places import KINDS, places
 
@@ -47,7 +46,7 @@ def test_the_bits_do_not_depend_on_the_place(place):
     matrix = np.random.default_rng(0).normal(size=(64, 64))
     items = {str(n): n for n in range(3)}
     assert list(place.run(product, items, shared=matrix)) == list(
-        Here().run(product, items, shared=matrix))
+        Serial().run(product, items, shared=matrix))
 
 
 def test_what_tasks_tell_is_watched(place):
@@ -205,7 +204,7 @@ def test_other_names_are_refused(text):
 
 
 def test_a_scheduler_without_workers(places, monkeypatch):
-    monkeypatch.setattr('koopman_ros.jobs.cluster._JOIN', 0.1)
+    monkeypatch.setattr('koopman_ros.execution.pools._JOIN', 0.1)
     import distributed
     with distributed.LocalCluster(
             n_workers=0, processes=False, host='127.0.0.1', protocol='tcp://',
@@ -229,6 +228,6 @@ def test_the_trainer_refuses_other_names():
 
 
 def test_an_address_without_a_scheduler(monkeypatch):
-    monkeypatch.setattr('koopman_ros.jobs.cluster._CONNECT', 0.3)
+    monkeypatch.setattr('koopman_ros.execution.pools._CONNECT', 0.3)
     with pytest.raises(SchedulerLost, match=r'no scheduler answers at tcp://127\.0\.0\.1:9 '):
         backend_of('tcp://127.0.0.1:9')
