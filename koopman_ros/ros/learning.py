@@ -106,7 +106,7 @@ class LearningWatch:
         try:
             self._job = ReplayJob(
                 ['--ros-args', '--params-file', str(file), '-r',
-                 f'__ns:={self._node.get_namespace()}', *remaps], folder / 'log')
+                 f'__ns:={self._node.get_namespace()}', *remaps])
         except OSError as error:
             return Answer(False, f'the replay cannot be started: {error}')
         self._cancelled = False

@@ -14,16 +14,15 @@ from support.nodes import TIMEOUT, wait_until_ended
 
 START = """
 import sys
-from pathlib import Path
 from koopman_ros.execution.job import ReplayJob
-job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]'], Path(sys.argv[1]))
-print(job._process.pid, flush=True)
+job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]'])
+print(job.process.pid, flush=True)
 sys.stdin.read()
 """
 
 
-def test_it_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
-    with subprocess.Popen([sys.executable, '-c', START, str(tmp_path / 'log')],
+def test_it_ends_with_the_process_that_started_it() -> None:
+    with subprocess.Popen([sys.executable, '-c', START],
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE) as parent:
         try:
             assert parent.stdout is not None
@@ -34,10 +33,9 @@ def test_it_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
 
 
 def test_it_gives_way_and_says_what_is_wrong(tmp_path: Path) -> None:
-    job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]', '-p', f'output:={tmp_path}/out'],
-                    tmp_path / 'log')
+    job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]', '-p', f'output:={tmp_path}/out'])
     try:
-        assert os.getpriority(os.PRIO_PROCESS, job._process.pid) >= 10
+        assert os.getpriority(os.PRIO_PROCESS, job.process.pid) >= 10
         deadline = time.monotonic() + TIMEOUT
         while job.running:
             assert time.monotonic() < deadline

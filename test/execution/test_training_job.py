@@ -13,9 +13,10 @@ import subprocess
 import sys
 import time
 
-from koopman_ros.jobs import ending, training
 import pytest
 
+from koopman_ros.execution import job as job_module
+from koopman_ros.execution import training
 from koopman_ros.execution.training import JobState, TrainingJob
 from koopman_ros.resources import model_path
 from support.nodes import TIMEOUT, wait_until_ended
@@ -55,16 +56,16 @@ def test_process_that_gets_a_signal(
         task: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str,
         number: int, code: int, words: str) -> None:
     # its libraries may take their time to end on a busy machine
-    monkeypatch.setattr(ending, '_PATIENCE', TIMEOUT)
+    monkeypatch.setattr(job_module, '_PATIENCE', TIMEOUT)
     job = TrainingJob(task)
     assert any(state.text.startswith(step) for state in itertools.chain([job.state], follow(job)))
-    os.kill(job._process.pid, number)
+    os.kill(job.process.pid, number)
     *_, state = follow(job)
     assert (state.text, state.ended) == (words, True)
     assert (state.accepted, state.refused) == (False, False)
     assert state.share < 1.0
     job.close()
-    assert job._process.returncode == code
+    assert job.process.returncode == code
     assert list(tmp_path.iterdir()) == []
 
 
@@ -80,7 +81,7 @@ def test_process_that_gets_a_signal(
 ])
 def test_process_that_breaks_down(
         monkeypatch: pytest.MonkeyPatch, program: str, state: JobState) -> None:
-    monkeypatch.setattr(training, '_command', lambda: (sys.executable, '-c', program))
+    monkeypatch.setattr(TrainingJob, 'command', lambda *_: (sys.executable, '-c', program))
     job = TrainingJob({})
     *_, last = follow(job)
     assert last == state
@@ -89,7 +90,7 @@ def test_process_that_breaks_down(
 
 def test_process_that_ends_before_it_has_read_its_task(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        training, '_command', lambda: (sys.executable, '-c', 'raise SystemExit("no time")'))
+        TrainingJob, 'command', lambda *_: (sys.executable, '-c', 'raise SystemExit("no time")'))
     # more than a pipe holds
     job = TrainingJob({'output': 'x' * 1_000_000})
     *_, last = follow(job)
@@ -106,7 +107,7 @@ def test_process_ends_with_its_parent_that_is_killed(
         f'job = TrainingJob({task!r})\n'
         f'while not job.poll().text.startswith({word!r}):\n'
         '    time.sleep(0.01)\n'
-        'print(job._process.pid, flush=True)\n'
+        'print(job.process.pid, flush=True)\n'
         'time.sleep(600)\n')
     with subprocess.Popen(
             [sys.executable, '-c', program], stdout=subprocess.PIPE, text=True) as parent:
@@ -118,13 +119,13 @@ def test_process_ends_with_its_parent_that_is_killed(
 
 
 def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, '_command', lambda: (
+    monkeypatch.setattr(TrainingJob, 'command', lambda *_: (
         'sh', '-c', 'echo \'{"progress": 0.5, "text": "x"}\'; exec sleep 3600'))
-    monkeypatch.setattr(ending, '_PATIENCE', 0.2)
+    monkeypatch.setattr(job_module, '_PATIENCE', 0.2)
     job = TrainingJob({})
     next(follow(job))
     job.close()
-    assert job._process.returncode == -signal.SIGKILL
+    assert job.process.returncode == -signal.SIGKILL
     assert job.poll().text == 'cancelled, nothing was written'
 
 
