@@ -18,7 +18,7 @@ import numpy as np
 from koopman_ros.control.law_check import LOOPS
 from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.learning.lift.multistart import Watch
-from koopman_ros.learning.lift.progress import training_progress
+from koopman_ros.learning.progress import training_progress
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (

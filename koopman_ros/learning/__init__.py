@@ -8,7 +8,6 @@ Nodes start ``python -m koopman_ros.learning``.
 """
 
 from koopman_ros.learning.acceptance import decide, Decision, Thresholds
-from koopman_ros.learning.config import Task
 from koopman_ros.learning.drift_samples import compare_classes, drift_samples, learn_lift
 from koopman_ros.learning.fleet import Outcome, retrain_fleet
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
@@ -28,11 +27,12 @@ from koopman_ros.learning.lift.training import NoUsefulLift, train, Trained
 from koopman_ros.learning.model_selection import compare, Comparison, Contender, Judge
 from koopman_ros.learning.pipeline import retrain, Retrained
 from koopman_ros.learning.report import write_report
+from koopman_ros.learning.task import TrainingTask
 
 __all__ = [
     'Algorithm1', 'Comparison', 'Contender', 'Decision', 'Edmd', 'Figures', 'Fit', 'Growth',
     'Judge', 'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Outcome', 'Progress', 'Retrained',
-    'Task', 'Thresholds', 'Trained', 'compare', 'compare_classes', 'decide',
+    'Thresholds', 'Trained', 'TrainingTask', 'compare', 'compare_classes', 'decide',
     'drift_samples', 'evaluate', 'fit', 'learn_lift', 'retrain', 'retrain_fleet',
     'roll_out', 'rollout_rmse', 'train', 'write_report',
 ]

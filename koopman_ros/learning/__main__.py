@@ -20,7 +20,7 @@ import threading
 import time
 from typing import Any
 
-from koopman_ros.learning import retrain, retrain_fleet, Task
+from koopman_ros.learning import retrain, retrain_fleet, TrainingTask
 from koopman_ros.learning.fleet import EXPECTED, one_line
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.pipeline import OnProgress
@@ -52,7 +52,7 @@ def main() -> int:
         values = json.loads(line)
         if 'plants' in values:
             return _fleet(values, now_and_then)
-        retrained = retrain(Task.of(values), now_and_then)
+        retrained = retrain(TrainingTask.of(values), now_and_then)
     except BrokenPipeError:
         # the process that started it is gone
         return 1
@@ -69,7 +69,7 @@ def main() -> int:
 
 def _fleet(values: Mapping[str, Any], now_and_then: OnProgress) -> int:
     """Retrain many plants; the exit code is that of the worst of them."""
-    tasks = {name: Task.of(fields) for name, fields in values['plants'].items()}
+    tasks = {name: TrainingTask.of(fields) for name, fields in values['plants'].items()}
     shares = dict.fromkeys(tasks, 0.0)
 
     def on_progress(name: str, share: float, text: str) -> bool:

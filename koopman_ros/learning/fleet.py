@@ -19,11 +19,11 @@ from koopman_ros.execution import (
     Tell,
     WorkerLost,
 )
-from koopman_ros.learning.config import FIRST, Task
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.pipeline import retrain_by
 from koopman_ros.learning.report import reported
+from koopman_ros.learning.task import FIRST, TrainingTask
 
 #: What a retraining raises where the task, the bags or the machine are to blame.
 EXPECTED = (ValueError, TypeError, KeyError, OSError, MemoryError, WorkerLost, SchedulerLost,
@@ -49,7 +49,7 @@ class Outcome:
         return bool(self.summary and self.summary['accepted'])
 
 
-def retrain_fleet(tasks: Mapping[str, Task], scheduler: str = '',
+def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
                   on_progress: OnPlant = lambda *_: False
                   ) -> Generator[tuple[str, Outcome]]:
     """
@@ -75,14 +75,14 @@ def retrain_fleet(tasks: Mapping[str, Task], scheduler: str = '',
         yield from _rounds(backend, dict(tasks), on_progress)
 
 
-def kind_of(task: Task) -> tuple[object, ...]:
+def kind_of(task: TrainingTask) -> tuple[object, ...]:
     """Return what the lifts of siblings have in common."""
     return (task.model_class, task.coordinates, task.equations, task.hidden_states,
             *((state.name, state.unit) for state in task.states),
             *((one.name, one.unit) for one in task.inputs))
 
 
-def _rounds(backend: Backend, waiting: dict[str, Task], on_progress: OnPlant
+def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnPlant
             ) -> Generator[tuple[str, Outcome]]:
     first: dict[tuple[object, ...], str] = {}  # the file of the first lift of a kind
     stopped = False
@@ -93,7 +93,7 @@ def _rounds(backend: Backend, waiting: dict[str, Task], on_progress: OnPlant
         return stopped
 
     while waiting and not stopped:
-        now: dict[str, Task] = {}
+        now: dict[str, TrainingTask] = {}
         tried = set()
         for name, task in waiting.items():
             kind = kind_of(task)
@@ -115,7 +115,7 @@ def _rounds(backend: Backend, waiting: dict[str, Task], on_progress: OnPlant
         yield name, Outcome(None, stopped=True)
 
 
-def _retrained(_: None, task: Task, tell: Tell) -> Outcome:
+def _retrained(_: None, task: TrainingTask, tell: Tell) -> Outcome:
     """Retrain one plant, wherever that is."""
     checked_device(task.device)
     retrained = retrain_by(Serial(), task, lambda share, text: tell((share, text)))
@@ -135,7 +135,7 @@ def one_line(error: BaseException) -> str:
     return said if said and expected else ': '.join(filter(None, [type(error).__name__, said]))
 
 
-def _check(tasks: Mapping[str, Task]) -> None:
+def _check(tasks: Mapping[str, TrainingTask]) -> None:
     if not tasks:
         raise ValueError('there is no plant to retrain: name at least one')
     by_file: dict[Path, str] = {}

@@ -18,7 +18,6 @@ from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import decide, Decision, shortfalls, Thresholds
-from koopman_ros.learning.config import FIRST, known, Task
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_samples import compare_classes
 from koopman_ros.learning.identification import (
@@ -34,6 +33,7 @@ from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.lift.training import NoUsefulLift
 from koopman_ros.learning.model_selection import Comparison, Contender
 from koopman_ros.learning.record import read_record, Reduction, Source
+from koopman_ros.learning.task import FIRST, known, TrainingTask
 from koopman_ros.lifting import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plant_data import Episode, Plant
@@ -57,7 +57,7 @@ OnProgress = Callable[[float, str], bool]
 class Retrained:
     """Result of a retraining."""
 
-    task: Task  #: the task
+    task: TrainingTask  #: the task
     account: Account  #: counts of used and dropped measurements
     found: Identified  #: the estimated drift
     #: the classes that were learned, None when there is no model worth judging
@@ -157,7 +157,7 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
+def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -172,7 +172,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
         return retrain_by(backend, task, on_progress)
 
 
-def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False
+def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = lambda *_: False
                ) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.

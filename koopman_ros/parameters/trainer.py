@@ -240,7 +240,7 @@ class TrainerParameters:
                 if name in signals.controlled and low < high}
 
     def training(self) -> dict[str, Any]:
-        """Return the fields of a :class:`koopman_ros.learning.Task` that are settings."""
+        """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""
         return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
                 'seed': self.training_seed, 'starts': self.training_starts,
                 'most_samples': self.training_samples,

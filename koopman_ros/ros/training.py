@@ -42,7 +42,7 @@ def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
 
 def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
                 bags: Iterable[str]) -> dict[str, Any]:
-    """Return the fields of a :class:`koopman_ros.learning.Task` of a trainer's parameters."""
+    """Return the fields of a `koopman_ros.learning.TrainingTask` of a trainer's parameters."""
     def found(place: Place) -> dict[str, str]:
         return {**asdict(place), 'topic': node.resolve_topic_name(place.topic)}
 

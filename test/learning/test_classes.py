@@ -18,8 +18,8 @@ from koopman_ros.learning import (
     lift,
     NeuralDrift,
     retrain,
-    Task,
     Thresholds,
+    TrainingTask,
 )
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning.identification import identify, Stopped
@@ -204,8 +204,8 @@ def bag(tmp_path_factory):
 
 
 def task(bag, folder, model_class):
-    return Task((str(bag),), str(folder / 'new.safetensors'), '', STATES, INPUTS, coordinates=2,
-                starts=1, model_class=model_class)
+    return TrainingTask((str(bag),), str(folder / 'new.safetensors'), '', STATES, INPUTS,
+                        coordinates=2, starts=1, model_class=model_class)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from koopman_ros.learning import retrain, retrain_fleet, Task
+from koopman_ros.learning import retrain, retrain_fleet, TrainingTask
 from koopman_ros.lifting import load
 from support.quick_retraining import quick_retraining
 from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
@@ -20,8 +20,8 @@ def tasks_of_reactors(tmp_path_factory):
     bags = {'lost': folder / 'none.mcap', **{
         name: write_bag(folder / f'{name}.mcap', driven(reactor(share), 12.0))
         for name, share in (('first', 1.0), ('second', 0.9))}}
-    return {name: Task((str(bag),), str(folder / f'{name}.safetensors'), '', STATES, INPUTS,
-                       coordinates=2, starts=1, sibling='first') for name, bag in bags.items()}
+    return {name: TrainingTask((str(bag),), str(folder / f'{name}.safetensors'), '', STATES,
+                               INPUTS, coordinates=2, starts=1, sibling='first') for name, bag in bags.items()}
 
 
 @pytest.fixture(scope='module', autouse=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from koopman_ros.learning import retrain, Task, write_report
+from koopman_ros.learning import retrain, write_report
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.record import read_record
 from support.long_records import bags_of, CASE, source, task
@@ -33,7 +33,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return bags_of(BAGS, tmp_path_factory.mktemp('bags'))
 
 
-def small(bags: list[Path], output: Path) -> Task:
+def small(bags: list[Path], output: Path) -> TrainingTask:
     return replace(task(bags, output), coordinates=2, starts=1, most_samples=3000)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.bags import BagReadError
-from koopman_ros.learning import compare_classes, decide, retrain, Task, write_report
+from koopman_ros.learning import compare_classes, decide, retrain, TrainingTask, write_report
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
@@ -57,8 +57,8 @@ def few_methods():
 
 
 def small(bag, output, present=SHIPPED, **others):
-    return Task((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2, starts=1,
-                **others)
+    return TrainingTask((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2,
+                        starts=1, **others)
 
 
 @pytest.fixture(scope='module')
@@ -231,14 +231,14 @@ def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, do
 
 
 def test_a_task_survives_json():
-    task = Task(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
+    task = TrainingTask(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
                 (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)), seed=3,
                 input_gain={'temperature': {'other': 2.1}})
-    assert Task.from_json(json.dumps(asdict(task))) == task
+    assert TrainingTask.from_json(json.dumps(asdict(task))) == task
     with pytest.raises(TypeError, match='nonsense'):
-        Task.from_json(json.dumps({**asdict(task), 'nonsense': 1}))
+        TrainingTask.from_json(json.dumps({**asdict(task), 'nonsense': 1}))
     with pytest.raises(TypeError, match='nonsense'):
-        Task.from_json(json.dumps({**asdict(task), 'states': [
+        TrainingTask.from_json(json.dumps({**asdict(task), 'states': [
             {**asdict(STATES[0]), 'nonsense': 1}]}))
 
 
@@ -270,7 +270,8 @@ def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, e
     save(random_lift(), tmp_path / 'two.safetensors')
     write_bag(tmp_path / 'short.mcap', linear_run(9))
     with pytest.raises(error, match=words):
-        retrain(replace(Task((str(bag),), 'new.safetensors', SHIPPED, STATES, INPUTS), **values))
+        retrain(replace(TrainingTask((str(bag),), 'new.safetensors', SHIPPED, STATES, INPUTS),
+                        **values))
 
 
 BOX = box([0.0], [10.0], [100.0], [200.0])

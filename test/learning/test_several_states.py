@@ -15,9 +15,9 @@ import pytest
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
 from koopman_ros.execution.training import constant_lines, scalars
 from koopman_ros.learning import pipeline as task_module
-from koopman_ros.learning import retrain, Task, write_report
-from koopman_ros.learning.config import known
+from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.identification import identify, identify_hidden
+from koopman_ros.learning.task import known
 from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
@@ -79,7 +79,7 @@ def retrained(bag, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task_module, 'identify',
                       partial(identify, degrees=(1, 3), methods=methods(20)))
-        return retrain(Task((str(bag),), str(folder / 'new.safetensors'),
+        return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
                             str(folder / 'present.safetensors'), STATES, INPUTS, coordinates=4,
                             starts=1))
 
@@ -177,8 +177,8 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
     """Tank 1 flows into tank 2, so that what it holds shows there."""
     monkeypatch.setattr(task_module, 'identify_hidden',
                         partial(identify_hidden, highest_degree=2))
-    found = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1], INPUTS,
-                         model_class='polynomial', hidden_states=1))
+    found = retrain(TrainingTask((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1],
+                                 INPUTS, model_class='polynomial', hidden_states=1))
     assert found.reasons == ()
     assert not any('hidden_1' in warning for warning in found.decision.warnings)
     model = load(found.model_file)
@@ -197,11 +197,11 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
 def by_equations(tmp_path_factory):
     """Return what the equations make of eight minutes of the lower level alone."""
     folder = tmp_path_factory.mktemp('equations')
-    task = Task((str(write_tanks(folder / 'run.mcap', 500.0)),), str(folder / 'new.safetensors'),
-                '', STATES[:1], INPUTS, model_class='polynomial', equations='two_tanks',
+    task = TrainingTask((str(write_tanks(folder / 'run.mcap', 500.0)),),
+                        str(folder / 'new.safetensors'), '', STATES[:1], INPUTS, model_class='polynomial', equations='two_tanks',
                 constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
     # as the process that retrains is given it
-    return retrain(Task.from_json(json.dumps(asdict(task))))
+    return retrain(TrainingTask.from_json(json.dumps(asdict(task))))
 
 
 def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
@@ -236,7 +236,7 @@ def test_constants_are_in_summary_report_and_diagnostics(by_equations):
     ({'constants': {'orifice_1': None}}, 'constants name orifice_1, but there are no equations')])
 def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        known(replace(Task((), '', '', STATES, INPUTS), **given), None)
+        known(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)
 
 
 def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
@@ -245,7 +245,7 @@ def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
                                   np.array([9.0, 4.0]), TANKS.nominal_input))
     present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), TANKS.B, *boxes, 's',
                                Provenance('two tanks'))
-    task = Task((), '', 'present', STATES[:1], INPUTS)
+    task = TrainingTask((), '', 'present', STATES[:1], INPUTS)
     plant, states, inputs = known(replace(task, equations='two_tanks'), present)
     assert plant.state_names == tuple(state.name for state in states) == ('level_2',)
     assert plant.input_names == tuple(one.name for one in inputs) == TANKS.input_names

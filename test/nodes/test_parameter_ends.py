@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.bags import BagReadError
 from koopman_ros.demo import reactor
-from koopman_ros.learning import retrain, Task
+from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
@@ -355,7 +355,7 @@ def test_training_is_told_every_parameter_at_its_ends(tmp_path: Path) -> None:
             parameters = TABLES['trainer'].snapshot(change)
             assert TABLES['trainer'].check(parameters) == ''
             training.settings = parameters
-            task = Task.from_json(json.dumps({
+            task = TrainingTask.from_json(json.dumps({
                 **task_fields(place.node, parameters, training._wiring, ['/nowhere/run.mcap']),
                 'output': str(tmp_path / 'new.safetensors')}))
             # all else was looked at before

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from koopman_ros.learning import Task
 from koopman_ros.learning.record import Source
 from validation.benchmarks.retraining import cases, task_of, write_bags
 
@@ -19,7 +18,7 @@ def bags_of(count: int, folder: Path) -> list[Path]:
     return write_bags(CASE, count * CASE.bag, folder)
 
 
-def task(bags: Sequence[Path], output: Path) -> Task:
+def task(bags: Sequence[Path], output: Path) -> TrainingTask:
     """Return the task of a first lift from some bags."""
     return task_of(CASE, bags, output)
 

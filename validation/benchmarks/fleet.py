@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.learning import retrain_fleet, Task
-from koopman_ros.learning.config import FIRST
+from koopman_ros.learning import retrain_fleet, TrainingTask
 from koopman_ros.learning.lift.metrics import lifted_rate
+from koopman_ros.learning.task import FIRST
 from koopman_ros.lifting import load
 from koopman_ros.plants import ControlAffineSystem, equilibrium_input
 from koopman_ros.plants.library.reactor import OneStateReactor
@@ -87,7 +87,7 @@ def measure(plan: Plan, figures: dict[str, Any], _: Path) -> Iterator[str]:
         yield f'{kind}\n\n{_table(rows)}'
 
 
-def _learned(cases: Mapping[str, Case], tasks: Mapping[str, Task]) -> dict[str, Any]:
+def _learned(cases: Mapping[str, Case], tasks: Mapping[str, TrainingTask]) -> dict[str, Any]:
     rows = {}
     since = time.process_time()
     for name, outcome in retrain_fleet(tasks):

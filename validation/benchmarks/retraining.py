@@ -17,7 +17,7 @@ import numpy as np
 
 from koopman_ros.bags import RecordedInput, RecordedState
 from koopman_ros.execution import backend_of
-from koopman_ros.learning import Task
+from koopman_ros.learning import TrainingTask
 from koopman_ros.learning.identification import Drift
 from koopman_ros.learning.pipeline import retrain_by
 from koopman_ros.plants.library.reactor import OneStateReactor
@@ -115,14 +115,14 @@ def write_bags(case: Case, samples: int, folder: Path) -> list[Path]:
                   1.0 + run * (len(states) * period + 3600.0)) for run in range(runs)]
 
 
-def task_of(case: Case, bags: Sequence[Path], output: Path) -> Task:
+def task_of(case: Case, bags: Sequence[Path], output: Path) -> TrainingTask:
     """Return the task of a first lift from some bags."""
     system = case.design.system
 
     def place(name: str, unit: str) -> Place:
         return Place(f'/{name}', TYPE, FIELD, unit)
 
-    return Task(tuple(map(str, bags)), str(output), '', tuple(
+    return TrainingTask(tuple(map(str, bags)), str(output), '', tuple(
         RecordedState(name, unit, place(name, unit)) for name, unit in zip(
             system.state_names, system.state_units, strict=True)), tuple(
         RecordedInput(name, unit, place(name, unit)) for name, unit in zip(

@@ -22,10 +22,10 @@ from koopman_ros.bags import loop_episodes
 from koopman_ros.control.law_check import check_law
 from koopman_ros.execution import Serial
 from koopman_ros.learning import NeuralDrift, read_samples, Shard, train
-from koopman_ros.learning.config import known
 from koopman_ros.learning.identification import identify, identify_hidden
 from koopman_ros.learning.identification.weak_form import weak_form
 from koopman_ros.learning.record import read_record
+from koopman_ros.learning.task import known
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.plant_data import cut
 from support.known_plants import CUBIC, methods, PAIR

@@ -27,7 +27,7 @@ MOST_SAMPLES = 20_000  # more cost more time, and tell less and less
 
 
 @dataclass(frozen=True)
-class Task:
+class TrainingTask:
     """Input files, output file and settings of a retraining."""
 
     bags: tuple[str, ...]  #: files or folders
@@ -71,12 +71,12 @@ class Task:
     device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
-    def from_json(cls, text: str) -> Task:
+    def from_json(cls, text: str) -> TrainingTask:
         """Read a task; unknown or missing fields are a TypeError."""
         return cls.of(json.loads(text))
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Task:
+    def of(cls, values: Mapping[str, Any]) -> TrainingTask:
         """Return the task of its fields as JSON has them; as :meth:`from_json`."""
         states = tuple(RecordedState(**{**signal, 'place': Place(**signal['place'])})
                        for signal in values['states'])
@@ -88,7 +88,7 @@ class Task:
                       'inputs': inputs})
 
 
-def known(task: Task, current: LiftedModel | None
+def known(task: TrainingTask, current: LiftedModel | None
           ) -> tuple[Plant, Sequence[RecordedState], Sequence[RecordedInput]]:
     """
     Return what is known of a plant before it is estimated, and its signals in order.
@@ -139,7 +139,7 @@ def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: st
     return [by_name[name] for name in wanted.names]
 
 
-def _unknown(task: Task) -> Plant:
+def _unknown(task: TrainingTask) -> Plant:
     """Return what is known of a plant without a lift, but for its nominal point."""
     states, inputs = task.states, task.inputs
     return Plant(task.plant, tuple(signal.name for signal in states),
@@ -148,7 +148,7 @@ def _unknown(task: Task) -> Plant:
                  np.full(len(inputs), np.nan), None)
 
 
-def _known_gain(task: Task, plant: Plant) -> Array | None:
+def _known_gain(task: TrainingTask, plant: Plant) -> Array | None:
     """Return B (n_x, n_u) of a task per time unit of a plant, None to learn it."""
     if not task.input_gain:
         return None
