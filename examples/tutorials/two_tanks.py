@@ -22,7 +22,7 @@ import numpy as np
 
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
 from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
-from koopman_ros.learning.identification import identify, weak_forms
+from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.lifting import load, save
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import (
@@ -94,7 +94,7 @@ figure.savefig(OUT / 'two_tanks_record.png')
 unknown = np.full(2, np.nan)
 plant = Plant('two tanks', LEVELS, ('m', 'm'), PUMPS, ('V', 'V'), 's', nominal_state=unknown,
               nominal_input=unknown, B=None)
-found = identify(plant, [episode], degrees=(1, 2, 3), methods=weak_forms(20))
+found = identify(plant, [episode], degrees=(1, 2, 3), methods=[WeakForm(WeakFormParameters((20,)))])
 print(f'drift of degree {found.drift.degree}, found by {found.method}')
 print(f'noise: {1e3 * found.noise.round(6)} mm, in truth {1e3 * NOISE} mm')
 print(f'B:\n{found.drift.input_matrix.round(6)}, in truth\n{truth.B.round(6)} m/(V s)')

@@ -26,6 +26,7 @@ from koopman_ros.learning.identification import (
     identify,
     identify_grey,
     identify_hidden,
+    methods_of,
     Stopped,
 )
 from koopman_ros.learning.lift.multistart import Progress
@@ -197,6 +198,7 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
                          'one call, or name a model file')
     current, sibling = (load(path) if path else None for path in (task.model, task.sibling))
     plant, states, inputs = known(task, current)
+    methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
@@ -225,7 +227,8 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
         found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
                                 watch=estimating, backend=backend)
     else:
-        found = identify(plant, episodes, seed=task.seed, watch=estimating, backend=backend)
+        found = identify(plant, episodes, methods=methods, seed=task.seed, watch=estimating,
+                         backend=backend)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
     states_found = found.drift.box.states

@@ -61,6 +61,10 @@ class TrainingTask:
     #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
     #: units
     setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: methods of identification, see :func:`methods_of`; where all states are measured
+    methods: tuple[str, ...] = ('weak_form', 'total_variation')
+    #: their parameters, by the name of the method
+    method_parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
     #: where it is worked, see :func:`~koopman_ros.execution.backend_of`

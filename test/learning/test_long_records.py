@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from koopman_ros.learning import retrain, write_report
+from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.record import read_record
 from support.long_records import bags_of, CASE, source, task

@@ -198,8 +198,9 @@ def by_equations(tmp_path_factory):
     """Return what the equations make of eight minutes of the lower level alone."""
     folder = tmp_path_factory.mktemp('equations')
     task = TrainingTask((str(write_tanks(folder / 'run.mcap', 500.0)),),
-                        str(folder / 'new.safetensors'), '', STATES[:1], INPUTS, model_class='polynomial', equations='two_tanks',
-                constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
+                        str(folder / 'new.safetensors'), '', STATES[:1], INPUTS,
+                        model_class='polynomial', equations='two_tanks',
+                        constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
     # as the process that retrains is given it
     return retrain(TrainingTask.from_json(json.dumps(asdict(task))))
 

@@ -8,6 +8,11 @@ Training needs states with their derivatives; sensors give states with noise. He
 dx/dt = f(x) + B u is found from the measurements first; the lift is then learned from that drift.
 """
 
+from koopman_ros.learning.identification.base import (
+    DriftEstimate,
+    DriftProblem,
+    IdentificationMethod,
+)
 from koopman_ros.learning.identification.drift import (
     box_of,
     Drift,
@@ -22,20 +27,47 @@ from koopman_ros.learning.identification.identify import (
     EstimatedConstant,
     Identified,
     identify,
-    Method,
     METHODS,
+    methods_of,
     Score,
     Standing,
     Stopped,
-    weak_forms,
 )
 from koopman_ros.learning.identification.output_error import output_error
+from koopman_ros.learning.identification.total_variation import (
+    noise_level,
+    total_variation,
+    TotalVariation,
+)
 from koopman_ros.learning.identification.unmeasured_states import identify_hidden
-from koopman_ros.learning.identification.weak_form import noise_level, total_variation, weak_form
+from koopman_ros.learning.identification.weak_form import weak_form, WeakForm, WeakFormParameters
 
 __all__ = [
-    'METHODS', 'Drift', 'DriftModel', 'EstimatedConstant', 'Identified', 'Method', 'Score',
-    'Segments', 'Standing', 'Stopped', 'box_of', 'fitted_starts', 'identify', 'identify_grey',
-    'identify_hidden', 'longest_step', 'noise_level', 'output_error', 'prediction_error',
-    'total_variation', 'weak_form', 'weak_forms',
+    'METHODS',
+    'Drift',
+    'DriftEstimate',
+    'DriftModel',
+    'DriftProblem',
+    'EstimatedConstant',
+    'IdentificationMethod',
+    'Identified',
+    'Score',
+    'Segments',
+    'Standing',
+    'Stopped',
+    'TotalVariation',
+    'WeakForm',
+    'WeakFormParameters',
+    'box_of',
+    'fitted_starts',
+    'identify',
+    'identify_grey',
+    'identify_hidden',
+    'longest_step',
+    'methods_of',
+    'noise_level',
+    'output_error',
+    'prediction_error',
+    'total_variation',
+    'weak_form',
 ]

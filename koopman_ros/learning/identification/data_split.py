@@ -16,7 +16,8 @@ from koopman_ros.learning.identification.drift import Drift, DriftModel, longest
 from koopman_ros.learning.identification.identify import Identified, Score, segments_of, split
 from koopman_ros.learning.identification.innovations_form import Predictor, Run
 from koopman_ros.learning.identification.output_error import output_error
-from koopman_ros.learning.identification.weak_form import noise_level, regress
+from koopman_ros.learning.identification.total_variation import noise_level
+from koopman_ros.learning.identification.weak_form import regress
 from koopman_ros.plant_data import Array, cut, Episode, Plant
 
 _GROWTH = 2.0  # exponent by which roll-outs that judge an unstable plant may grow

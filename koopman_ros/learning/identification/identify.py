@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from enum import Enum
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 
 from koopman_ros.arrays import brief
 from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
 from koopman_ros.learning.identification.drift import (
     box_of,
     Drift,
@@ -24,32 +26,16 @@ from koopman_ros.learning.identification.drift import (
 )
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.output_error import output_error
-from koopman_ros.learning.identification.weak_form import noise_level, total_variation, weak_form
+from koopman_ros.learning.identification.total_variation import noise_level, TotalVariation
+from koopman_ros.learning.identification.weak_form import WeakForm
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, cut, Episode, Plant
+from koopman_ros.plugs import contained, plug
 
-# Fits a drift to episodes: their box, the degree, B as DriftModel has it or None to learn it, and
-# a rough B: that of the method before, None for the first where B is to be learned. A method that
-# raises ValueError, as on short episodes, is left out.
-Method = Callable[[Sequence[Episode], Box, int, Array | None, Array | None], DriftModel]
-
-
-def weak_forms(*windows: int, input_degree: int = 0) -> dict[str, Method]:
-    """Return the weak form with windows of so many samples, by name, for B(x) of a degree."""
-    def method(window: int) -> Method:
-        return lambda episodes, box, degree, B, _: weak_form(episodes, box, degree, B, window,
-                                                             input_degree)
-
-    return {f'weak form, {window} samples': method(window) for window in windows}
-
-
-_WINDOWS = (10, 20, 40, 80)
-# A row for each method; the widest window knows B best, and is what total variation goes by.
-METHODS: Mapping[str, Method] = {
-    **weak_forms(*_WINDOWS),
-    'total variation': total_variation,
-}
+#: By name; one that needs a rough B comes after one that estimates it.
+METHODS: Mapping[str, type[IdentificationMethod]] = {
+    method.name: method for method in (WeakForm, TotalVariation)}
 DEGREES = (1, 2, 3, 4, 5, 6)
 # Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
 # minutes for more, and an hour does not determine them.
@@ -164,7 +150,7 @@ class Identified:
 
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
-             methods: Mapping[str, Method] | None = None, seed: int = 0,
+             methods: Sequence[IdentificationMethod] | None = None, seed: int = 0,
              watch: Watch = lambda *_: False, backend: Backend | None = None) -> Identified:
     """
     Estimate dx/dt = f(x) + B(x) u from sampled, noisy measurements.
@@ -178,8 +164,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     :param plant: names, units, and B where it is known, or the degree of the B(x) to learn.
     :param degrees: of f that are tried, rising, the first one 1; by default those whose drift has
         few enough coefficients for so many states.
-    :param methods: by name; those that go by a rough B come after one that learns it. By default
-        ``METHODS``, or the weak forms where B depends on the state.
+    :param methods: in the order in which they pass a rough B on; all of ``METHODS`` by default.
     :param seed: of the split.
     :param backend: where the degrees are estimated, each by itself; this process by default.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
@@ -197,9 +182,10 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     chooser, fitter = Segments.of(choose, step), Segments.of(fit, step)
     inputs = InputModel.of(plant, box, np.concatenate([part.x for part in parts]))
     known = inputs.weights
-    methods = methods or (weak_forms(*_WINDOWS, input_degree=inputs.degree) if inputs.degree
-                          else METHODS)
+    if methods is None:
+        methods = [method() for method in METHODS.values()]
     scores: list[Score] = []
+    failures: dict[str, None] = {}
     best: dict[int, tuple[DriftModel, Score]] = {}
     done, words = 0, {f'drift of degree {degree}': degree for degree in degrees}
 
@@ -209,16 +195,18 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
         return False
 
     with contextlib.closing((backend or Serial()).run(
-            _candidate, words, shared=_Given(fit, fitter, chooser, box, known, methods),
-            watch=progress)) as candidates:
+            _candidate, words, watch=progress, shared=_Given(
+                fit, fitter, chooser, box, known, inputs.degree, methods))) as candidates:
         for name, candidate in candidates:
             done += 1
-            if candidate is not None:
-                scores += candidate.scores
+            failures |= dict.fromkeys(candidate.failures)
+            scores += candidate.scores
+            if candidate.best is not None:
                 best[words[name]] = candidate.best
     least = min((score.cost for _, score in best.values()), default=math.inf)
     if not math.isfinite(least):
-        raise ValueError('no drift fits the episodes: record longer, with steps of the input')
+        raise ValueError('; '.join(['no drift fits the episodes: record longer, with steps of the '
+                                    'input', *failures]))
     good = [d for d, (_, score) in best.items() if score.cost <= _NEARLY * least]
     degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
 
@@ -234,7 +222,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
                                    monitor=monitor) if OUTPUT_ERROR in score.method else model
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
-                      (*fit, *choose), tuple(held_out), warnings=warnings)
+                      (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures))
 
 
 @dataclass(frozen=True)
@@ -246,36 +234,38 @@ class _Given:
     chooser: Segments
     box: Box
     known: Array | None  # B as DriftModel has it
-    methods: Mapping[str, Method]
+    input_degree: int  # of the B(x) to estimate
+    methods: Sequence[IdentificationMethod]
 
 
 @dataclass(frozen=True)
 class _Candidate:
     """The best estimate of a degree, with the scores of all of them that were refined."""
 
-    best: tuple[DriftModel, Score]
+    best: tuple[DriftModel, Score] | None
     scores: tuple[Score, ...]
+    failures: tuple[str, ...]  # reasons of methods that raised unexpectedly
 
 
-def _candidate(given: _Given, degree: int, tell: Tell) -> _Candidate | None:
-    """Estimate a drift of a degree by every method, and refine the best; None without any."""
+def _candidate(given: _Given, degree: int, tell: Tell) -> _Candidate:
+    """Estimate a drift of a degree by every method, and refine the best."""
     def monitor(*_: object) -> bool:
         return tell(None)
 
     monitor()
-    rated = [(model, _score(model, given.chooser, method)) for method, model in _estimates(
-        given.fit, given.box, degree, given.known, given.methods)]
+    estimates, failures = _estimates(given, degree)
+    rated = [(model, _score(model, given.chooser, method)) for method, model in estimates]
     model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
     if model is None or score is None:
-        return None
+        return _Candidate(None, (), failures)
     if not math.isfinite(score.cost):
-        return _Candidate((model, score), ())
+        return _Candidate((model, score), (), failures)
     refined = output_error(model, given.fitter, learn_input_matrix=given.known is None,
                            monitor=monitor)
     polished = _score(refined, given.chooser, f'{OUTPUT_ERROR} from {score.method}')
     # the better estimate in theory needs no proof, only that it does no harm
     best = (refined, polished) if polished.cost <= _NEARLY * score.cost else (model, score)
-    return _Candidate(best, (*(score for _, score in rated), polished))
+    return _Candidate(best, (*(score for _, score in rated), polished), failures)
 
 
 def segments_of(episodes: Sequence[Episode], signals: int) -> list[Episode]:
@@ -314,16 +304,49 @@ def split(parts: Sequence[Episode], seed: int) -> tuple[list[int], list[int], li
     return sorted(fit), sorted(choose), sorted(held_out)
 
 
-def _estimates(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
-               methods: Mapping[str, Method]) -> list[tuple[str, DriftModel]]:
-    """Return the estimate of each method; a method that fails is left out."""
+def _estimates(given: _Given, degree: int
+               ) -> tuple[list[tuple[str, DriftModel]], tuple[str, ...]]:
+    """Return the estimates of all methods by name, and why methods failed unexpectedly."""
     found: list[tuple[str, DriftModel]] = []
-    assumed = B
-    for name, method in methods.items():
-        with contextlib.suppress(ValueError, np.linalg.LinAlgError):
-            model = method(episodes, box, degree, B, assumed)
-            found.append((name, model))
-            assumed = model.B
+    failures = []
+    for method in given.methods:
+        rough = found[-1][1].B if found else given.known
+        try:
+            for estimate in method.estimate(DriftProblem(
+                    given.fit, given.box, degree, given.known, rough, given.input_degree)):
+                words = [method.name.replace('_', ' '), estimate.variant]
+                if not np.all(np.isfinite(estimate.model.coefficients)):
+                    raise ValueError('its coefficients are not finite')
+                found.append((', '.join(filter(None, words)), estimate.model))
+        except (ValueError, np.linalg.LinAlgError):
+            # as on short segments
+            continue
+        except Exception as error:
+            failures.append(f'the method {method.name} failed: {contained(error)}')
+    return found, tuple(failures)
+
+
+def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
+               ) -> list[IdentificationMethod]:
+    """
+    Return methods of identification.
+
+    :param names: of ``METHODS``, or ``module:Class`` for one of your own.
+    :param parameters: fields of its `Parameters` by the name of the method.
+    :raises ValueError: for a name without a method, a class that does not fulfil the contract, or
+        parameters that it does not have.
+    """
+    found: list[IdentificationMethod] = []
+    for name in names:
+        kind = plug(name, 'identification method', METHODS)
+        if not (isinstance(kind, type) and issubclass(kind, IdentificationMethod)):
+            raise ValueError(f'the identification method {name!r} is no class derived from '
+                             'IdentificationMethod: derive it')
+        try:
+            found.append(kind(kind.Parameters(**parameters.get(kind.name, {}))))
+        except Exception as error:
+            raise ValueError(f'the identification method {name!r} cannot be configured: '
+                             f'{contained(error)}') from error
     return found
 
 
