@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from koopman_ros.learning import TrainingTask
 from koopman_ros.learning.record import Source
 from validation.benchmarks.retraining import cases, task_of, write_bags
 

@@ -16,19 +16,15 @@ import torch
 
 import koopman_ros
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, MinimumStatus, normal_equations
-from koopman_ros.learning.lift.network import ACTIVATIONS, Layout, Pass
+from koopman_ros.learning.lift.network import Layout, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.lifting import NetworkObservables
 
-FUNCTIONS = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
-             'softplus': torch.nn.functional.softplus}
 COUNT = 11
 
 # torch's own import of its forward derivatives
 pytestmark = pytest.mark.filterwarnings('ignore:`torch.jit.script` is deprecated')
 
-every_depth = pytest.mark.parametrize('hidden', [(5,), (4, 3), (3, 4, 2)], ids=str)
-every_activation = pytest.mark.parametrize('activation', FUNCTIONS)
 identity_or_free = pytest.mark.parametrize('identity', [True, False], ids=['identity', 'free'])
 
 
@@ -37,26 +33,21 @@ def normals(seed):
     return partial(torch.randn, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@pytest.mark.parametrize('sizes', [(3, 2, (4,), True), (0, 1, (4,), False), (1, 2, (0,), True),
-                                   (1, 2, (3, 0), True)], ids=str)
+@pytest.mark.parametrize('sizes', [(3, 2, 4, True), (0, 1, 4, False), (1, 2, -1, True)], ids=str)
 def test_sizes_that_do_not_fit(sizes):
     with pytest.raises(ValueError, match='sizes do not fit: Layout'):
         Layout(*sizes)
 
 
-@every_depth
-@pytest.mark.parametrize('name', ACTIVATIONS)
 @identity_or_free
-def test_a_pass_is_what_the_model_evaluates_at_run_time(name, hidden, identity):
-    layout = Layout(2, 4, hidden, identity, name)
+def test_a_pass_is_what_the_model_evaluates_at_run_time(identity):
+    layout = Layout(2, 4, 5, identity)
     normal = normals(0)
     parts, x, f = layout.split(normal(layout.size)), normal(20, 2), normal(20, 2)
     lifted = Pass(layout, parts, x, f)
-    z, J = NetworkObservables(
-        tuple((W.numpy(), b.numpy()) for W, b in parts.hidden), parts.V.numpy(), identity,
-        name).lift_and_jacobian(x.numpy())
+    z, J = NetworkObservables(((parts.W.numpy(), parts.b.numpy()),), parts.V.numpy(),
+                              identity).lift_and_jacobian(x.numpy())
     np.testing.assert_allclose(lifted.z, z, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(lifted.jacobian(), J, rtol=0, atol=1e-14)
     np.testing.assert_allclose(lifted.z_rate, (J @ f.numpy()[..., None])[..., 0],
                                rtol=0, atol=1e-14)
 
@@ -72,12 +63,10 @@ def random_problem(layout, weights, chunk=4, seed=1):
 def residuals(theta, of):
     """Write the three residuals as the paper and the docstring have them."""
     layout, data, weights = of.layout, of.data, of.weights
-    parts, function = layout.split(theta), FUNCTIONS[layout.activation]
+    parts = layout.split(theta)
 
     def network(x):
-        for W, b in parts.hidden:
-            x = function(x @ W.T + b)
-        return x @ parts.V.T if parts.hidden else x[:, :0]
+        return torch.tanh(x @ parts.W.T + parts.b) @ parts.V.T
 
     def N(x):
         free = network(x) - network(torch.zeros_like(x))
@@ -110,31 +99,19 @@ def assert_normal_equations(of, theta):
             msg=lambda text: f'{of.layout}\n{text}')
 
 
-@every_depth
-@every_activation
-def test_normal_equations(hidden, activation):
-    """Every combination of the other sizes, with two of three numbers of states."""
-    for number, (identity, n_u, decoder) in enumerate(
-            itertools.product((True, False), (0, 2), (0, 3))):
-        for n_x in (1 + number % 3, 1 + (number + 1) % 3):
-            layout = Layout(n_x, n_x + 2, hidden, identity, activation, n_u, decoder)
-            assert_normal_equations(*random_problem(
-                layout, ResidualWeights(whitening=0.7, decoder=0.3 if decoder else 0.0)))
-
-
-@every_depth
 @identity_or_free
+@pytest.mark.parametrize('n_u', [0, 2])
 @pytest.mark.parametrize('weights', [
-    ResidualWeights(), ResidualWeights(whitening=2.0), ResidualWeights(decoder=3.0)], ids=str)
-def test_each_term_alone(hidden, identity, weights):
-    assert_normal_equations(*random_problem(Layout(2, 3, hidden, identity, decoder=3), weights))
+    ResidualWeights(), ResidualWeights(whitening=2.0), ResidualWeights(decoder=3.0),
+    ResidualWeights(whitening=0.7, decoder=0.3)], ids=str)
+def test_normal_equations(identity, n_u, weights):
+    """Every term alone and together, for several numbers of states."""
+    for n_x in (1, 3):
+        assert_normal_equations(*random_problem(
+            Layout(n_x, n_x + 2, 4, identity, n_u, 3), weights))
 
 
-def test_the_lift_without_a_network_is_linear_regression():
-    assert_normal_equations(*random_problem(Layout(2, 2, (), True, n_u=1), ResidualWeights()))
-
-
-LAYOUT = Layout(2, 4, (5,), True, n_u=1, decoder=3)
+LAYOUT = Layout(2, 4, 5, True, n_u=1, decoder=3)
 ALL_TERMS = ResidualWeights(whitening=0.5, decoder=0.2)
 
 
@@ -149,7 +126,7 @@ def test_any_chunks_and_the_cost_alone(chunk):
 
 @pytest.mark.parametrize(('layout', 'weights', 'words'), [
     (LAYOUT, ResidualWeights(), 'the inputs are needed to learn B'),
-    (Layout(2, 4, (3,), True), ALL_TERMS, 'a decoder weight needs a decoder network')])
+    (Layout(2, 4, 3, True), ALL_TERMS, 'a decoder weight needs a decoder network')])
 def test_what_a_problem_needs(layout, weights, words):
     with pytest.raises(ValueError, match=words):
         LiftProblem(layout, ScaledSamples(torch.zeros(3, 2), torch.zeros(3, 2)), weights)
@@ -163,7 +140,7 @@ from koopman_ros.learning.lift.residuals import ScaledSamples
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 import torch
 torch.set_num_threads(1)
-layout = Layout(2, 5, (8,), True)
+layout = Layout(2, 5, 8, True)
 theta = 0.1 * torch.ones(layout.size, dtype=torch.float64)
 peaks = []
 for count in (6_000, 60_000):
