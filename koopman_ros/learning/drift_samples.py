@@ -14,7 +14,7 @@ from koopman_ros.control.law_check import LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance import HeldOut, Thresholds
 from koopman_ros.learning.identification import Drift, fitted_starts, Identified, longest_step
-from koopman_ros.learning.identification.drift import Segments
+from koopman_ros.learning.identification.drift import Segments, steady_point
 from koopman_ros.learning.lift.incremental import Growth
 from koopman_ros.learning.lift.metrics import ROUNDING
 from koopman_ros.learning.lift.multistart import Watch
@@ -36,10 +36,6 @@ _MAX_SAMPLES = 2000
 _CELLS = 20
 # Parts among which the samples are dealt out.
 _SHARES = 10
-# The range is that of noisy measurements.
-_SLIGHTLY_OUTSIDE = 1.1
-# A search that is so far outside does not come back.
-_LOST = 1e3
 
 
 def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> Samples:
@@ -99,35 +95,6 @@ def _quota(sizes: NDArray[np.int64], total: int) -> int:
         low, high = (middle, high) if np.sum(np.minimum(sizes, middle)) <= total else (
             low, middle - 1)
     return low
-
-
-def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
-    """
-    Find a state and an input near given ones under which the drift stands still.
-
-    With as many inputs as states the state stays what it is; otherwise both move as little as
-    they can, in units of their range. ValueError when there is none nearby.
-
-    :param x: (n_x,) in state units.
-    :param u: (n_u,) in input units.
-    """
-    box = drift.box
-    xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
-    n_x = len(xi)
-    held = np.linalg.matrix_rank(drift.scaled_input_matrix(xi)) == n_x
-    for _ in range(50):
-        rate = drift.scaled_rate(xi, v)
-        slope, B = drift.scaled_slope(xi, v), drift.scaled_input_matrix(xi)
-        change = -np.linalg.pinv(np.hstack([0.0 * slope if held else slope, B])) @ rate
-        xi, v = xi + change[:n_x], v + change[n_x:]
-        # far outside, the polynomial means nothing and overflows at last
-        if np.max(np.abs(change)) < 1e-13 or np.max(np.abs(xi)) > _LOST:
-            break
-    near = np.all(np.abs(xi) <= _SLIGHTLY_OUTSIDE)
-    if not (near and np.all(np.abs(drift.scaled_rate(xi, v)) < 1e-9)):
-        raise ValueError('no steady state was found within the range of the episodes: record '
-                         'around a state that the plant can hold')
-    return box.states.to_physical(xi), box.inputs.to_physical(v)
 
 
 def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: int,

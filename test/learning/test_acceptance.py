@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from koopman_ros.control.law_check import LawCheck
 from koopman_ros.learning import decide, learn_lift, Thresholds
 from koopman_ros.learning.acceptance import shortfalls
-from koopman_ros.learning.drift_samples import _spread, drift_samples, steady_point
+from koopman_ros.learning.drift_samples import _spread, drift_samples
 from koopman_ros.learning.identification import (
     DriftModel,
     identify,
@@ -24,6 +24,7 @@ from koopman_ros.learning.identification import (
     Segments,
     Stopped,
 )
+from koopman_ros.learning.identification.drift import steady_point
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.lifting import linearised_model, load, ModelFileError, Provenance, save
 from koopman_ros.plant_data import Episode

@@ -111,11 +111,6 @@ def test_a_held_out_episode_at_rest():
         train(BENT, replace(at_rest, x=x), SMALL)
 
 
-def test_there_must_be_a_start():
-    with pytest.raises(ValueError, match='starts must be at least 1, got 0'):
-        train(BENT, bent_samples(), SMALL, starts=0)
-
-
 def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     """Two free coordinates can be x1 and x1^2, whose rw is 0 and which do not hold x2."""
     plant, samples = small_plants.TWO_STATE, small_plants.two_state_samples(400)

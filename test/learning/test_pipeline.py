@@ -4,7 +4,6 @@
 """Retraining from bags, end to end within one process."""
 
 from dataclasses import asdict, replace
-from functools import partial
 import json
 from pathlib import Path
 
@@ -12,15 +11,15 @@ import numpy as np
 import pytest
 
 from koopman_ros.bags import BagReadError
-from koopman_ros.learning import compare_classes, decide, retrain, TrainingTask, write_report
 from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.plant_data import Episode
 from koopman_ros.resources import model_path
-from support.known_plants import box, methods
-from support.quick_retraining import page_of
+from support.known_plants import box
+from support.quick_retraining import page_of, quick_retraining
 from support.random_lifts import random_lift
 from support.recorded_runs import (
     driven,
@@ -47,12 +46,7 @@ def few_methods():
 
     What they find is the matter of test_identify and test_law_check.
     """
-    original = task_module.identify
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task_module, 'identify',
-                      partial(original, degrees=(1, 3), methods=methods(10, 20)))
-        patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=16))
-        patch.setattr(task_module, 'decide', partial(decide, loops=16))
+    with quick_retraining(16):
         yield
 
 

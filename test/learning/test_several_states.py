@@ -25,7 +25,7 @@ from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.units import NANOSECONDS as SECOND
 from koopman_ros.wire import Place
 from support.known_plants import methods
-from support.quick_retraining import page_of
+from support.quick_retraining import page_of, quick_retraining
 from support.recorded_runs import NOISE, reactor
 
 JOINTS, ARRAY = 'sensor_msgs/msg/JointState', 'std_msgs/msg/Float64MultiArray'
@@ -76,9 +76,7 @@ def retrained(bag, tmp_path_factory):
     present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), 1.5 * TANKS.B, *boxes,
                                's', Provenance('two tanks'))
     save(present, folder / 'present.safetensors')
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task_module, 'identify',
-                      partial(identify, degrees=(1, 3), methods=methods(20)))
+    with quick_retraining(128):
         return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
                             str(folder / 'present.safetensors'), STATES, INPUTS, coordinates=4,
                             starts=1))

@@ -27,6 +27,9 @@ Rate = Callable[[Array, Array], Array]
 # A state; features that depend on it, what they turn into, and their factors.
 _Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
+# Of the search of a steady state: the range is that of noisy measurements, and a search that is so
+# far outside does not come back.
+_SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
 # Difference of two starts that tells the slope, in units of the states' scale.
 _STEP = 1e-4
 
@@ -289,6 +292,35 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
             inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
             x0 = x0 - scale * (inverse @ right[..., None])[..., 0]
     return best, least * scale ** 2
+
+
+def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
+    """
+    Find a state and an input near given ones under which the drift stands still.
+
+    With as many inputs as states the state stays what it is; otherwise both move as little as
+    they can, in units of their range. ValueError when there is none nearby.
+
+    :param x: (n_x,) in state units.
+    :param u: (n_u,) in input units.
+    """
+    box = drift.box
+    xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
+    n_x = len(xi)
+    held = np.linalg.matrix_rank(drift.scaled_input_matrix(xi)) == n_x
+    for _ in range(50):
+        rate = drift.scaled_rate(xi, v)
+        slope, B = drift.scaled_slope(xi, v), drift.scaled_input_matrix(xi)
+        change = -np.linalg.pinv(np.hstack([0.0 * slope if held else slope, B])) @ rate
+        xi, v = xi + change[:n_x], v + change[n_x:]
+        # far outside, the polynomial means nothing and overflows at last
+        if np.max(np.abs(change)) < 1e-13 or np.max(np.abs(xi)) > _LOST:
+            break
+    near = np.all(np.abs(xi) <= _SLIGHTLY_OUTSIDE)
+    if not (near and np.all(np.abs(drift.scaled_rate(xi, v)) < 1e-9)):
+        raise ValueError('no steady state was found within the range of the episodes: record '
+                         'around a state that the plant can hold')
+    return box.states.to_physical(xi), box.inputs.to_physical(v)
 
 
 def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:

@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples that contradict themselves or what is said of the plant, refused before training."""
+"""Checks of samples before training: their times, rates and nominal point."""
 
+import contextlib
+from dataclasses import replace
 import math
 
 import numpy as np
 
+from koopman_ros.learning.identification.drift import DriftModel, steady_point
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.residuals import deviations
-from koopman_ros.lifting import Box, Coordinates, PolynomialObservables
+from koopman_ros.lifting import Box, Coordinates
 from koopman_ros.plant_data import Array, Plant, Samples
 
 # Times and derivatives contradict each other beyond this factor, by so many steps at least.
@@ -18,8 +21,9 @@ _ALIKE = 2.0
 # The share of all steps whose derivatives are alike where samples resolve the motion.
 _RESOLVED = 0.5
 _FEWEST_STEPS = 20
-# A steady state this near, in half widths, is taken for the nominal point.
-_NEAR = 0.02
+# A steady state this near, in half widths, is taken for the nominal point; one farther away than
+# the other number is not suggested.
+_NEAR, _FAR = 0.02, 2.0
 # The drift there is told from zero where it is so many standard errors, and so many times what
 # another degree of the polynomial makes of it.
 _ERRORS, _DIFFERENCES = 5.0, 3.0
@@ -27,7 +31,6 @@ _ERRORS, _DIFFERENCES = 5.0, 3.0
 _MISFITS, _FEWEST_NEAR = 4.0, 10
 _DEGREES = (5, 4, 3, 2)
 _ROWS, _MOST_COLUMNS = 2000, 130
-_NEWTON_STEPS = 20
 
 
 def check_rates(plant: Plant, samples: Samples) -> None:
@@ -89,57 +92,45 @@ def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
     """
     x, rate, u = deviations(box, samples)
     rows = np.linspace(0, len(x) - 1, min(len(x), _ROWS)).astype(int)
-    x, rate, u = x[rows], rate[rows], u[rows]
-    n_x = x.shape[1]
+    x = x[rows]
     inputs = InputModel.of(plant, box, samples.x[rows])
-    rate, regressors = inputs.apart(x, rate, u)
-    u = u[:, :0] if regressors is None else regressors
+    rate, regressors = inputs.apart(x, rate[rows], u[rows])
     fits = []
     for degree in _DEGREES:
-        monomials = PolynomialObservables.total_degree(n_x, degree)
-        left = np.hstack([np.ones((len(x), 1)), u, monomials.lift(x)])
-        if left.shape[1] > min(_MOST_COLUMNS, len(x) // 3):
-            continue
-        inverse = np.linalg.pinv(left)
-        solution = inverse @ rate
-        rest = rate - left @ solution
-        error = np.sqrt(np.mean(rest ** 2, axis=0)) * np.linalg.norm(inverse[0])
-        fits.append((solution, error, monomials, rest))
+        m = math.comb(x.shape[1] + degree, degree)
+        shape = DriftModel(box, degree, np.empty(0), np.empty(0))
+        left = np.hstack([shape.features(x), x[:, :0] if regressors is None else regressors])
+        if left.shape[1] <= min(_MOST_COLUMNS, len(x) // 3):
+            inverse = np.linalg.pinv(left)
+            solution = inverse @ rate
+            rest = rate - left @ solution
+            error = np.sqrt(np.mean(rest ** 2, axis=0)) * np.linalg.norm(inverse[0])
+            B = inputs.weights if inputs.weights is not None else solution[m:].T
+            fits.append((replace(shape, coefficients=solution[:m], B=B), error, rest))
         if len(fits) == 2:
             break
     else:
         return
-    (solution, error, monomials, rest), (other, *_) = fits
-    drift = solution[0]
+    (fitted, error, rest), (other, *_) = fits
+    drift = fitted.coefficients[0]
     nearest = rest[np.argsort(np.max(np.abs(x), axis=1), kind='stable')[
         :max(_FEWEST_NEAR, len(x) // 30)]]
     spread = np.sqrt(np.mean(nearest ** 2, axis=0) / len(nearest))
-    moves = (np.abs(drift) > _ERRORS * error + _DIFFERENCES * np.abs(drift - other[0])) & (
-        np.abs(drift) > _ERRORS * spread) & (
-        np.abs(drift) > _MISFITS * np.abs(np.mean(nearest, axis=0)))
+    moves = np.abs(drift) > np.max([
+        _ERRORS * error + _DIFFERENCES * np.abs(drift - other.coefficients[0]),
+        _ERRORS * spread, _MISFITS * np.abs(np.mean(nearest, axis=0))], axis=0)
     if not moves.any():
         return
-    B, terms = inputs.matrix(solution[1:1 + u.shape[1]].T if plant.B is None else None)
-    coefficients = solution[1 + u.shape[1]:]
-    y = np.zeros(n_x + B.shape[1])
-    held = np.linalg.matrix_rank(B) == n_x
-    for _ in range(_NEWTON_STEPS):
-        z, J = monomials.lift_and_jacobian(y[:n_x])
-        here = B if terms is None else B + terms.matrix(y[:n_x])
-        slope = 0.0 * B[:, :0] if held else coefficients.T @ J
-        if terms is not None and not held:
-            slope = slope + terms.jacobian(y[:n_x], y[n_x:])
-        step = np.linalg.pinv(np.hstack([slope, here])) @ (
-            drift + coefficients.T @ z + here @ y[n_x:])
-        y[n_x if held else 0:] -= step
-        if not np.max(np.abs(y), initial=0.0) <= 2.0 or np.max(np.abs(step), initial=0.0) < 1e-9:
-            break
-    if np.max(np.abs(y), initial=0.0) <= _NEAR:
-        return
     nearby = 'move the plant around a state that it can hold'
-    if np.max(np.abs(y)) <= 2.0:
-        nearby = (f'by the samples it does with nominal_state = {_text(box.states, y[:n_x])} and '
-                  f'nominal_input = {_text(box.inputs, y[n_x:])}')
+    with contextlib.suppress(ValueError):
+        x_held, u_held = steady_point(fitted, box.states.center, box.inputs.center)
+        apart = max(np.max(np.abs(one.to_deviation(held)), initial=0.0) for one, held in (
+            (box.states, x_held), (box.inputs, u_held)))
+        if apart <= _NEAR:
+            return
+        if apart <= _FAR:
+            nearby = (f'by the samples it does with nominal_state = {_text(box.states, x_held)} '
+                      f'and nominal_input = {_text(box.inputs, u_held)}')
     states = box.states
     speeds = ', '.join(
         f'{drift[i] * states.scale[i]:.3g} {states.units[i]}/{box.time_unit} of {states.names[i]}'
@@ -148,9 +139,8 @@ def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
                      f'{speeds}: {nearby}')
 
 
-def _text(signals: Coordinates, deviation: Array) -> str:
+def _text(signals: Coordinates, values: Array) -> str:
     """Write values to a ten thousandth of their range."""
     # without the sign of -0.0
     return str([round(float(value), 4 - math.floor(math.log10(scale))) + 0.0
-                for value, scale in zip(signals.to_physical(deviation), signals.scale,
-                                        strict=True)])
+                for value, scale in zip(values, signals.scale, strict=True)])

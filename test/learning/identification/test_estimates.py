@@ -26,7 +26,8 @@ from koopman_ros.learning.identification import (
     weak_form,
 )
 from koopman_ros.learning.identification.output_error import _Filter, _Problem, Weights
-from koopman_ros.learning.identification.weak_form import _input_integral, _smoothed, smoothed
+from koopman_ros.learning.identification.total_variation import smoothed
+from koopman_ros.learning.identification.weak_form import _input_integral
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
 from koopman_ros.solvers import runge_kutta_step
@@ -174,18 +175,6 @@ def test_errors_are_those_of_the_best_estimate_possible():
     assert chi2.ppf(1e-3, 5) < distance < chi2.ppf(0.999, 5)
 
 
-def test_start_that_diverges_and_one_segment_of_few_samples():
-    record = CUBIC.excited(300, 0.1)
-    model, segments = start_of(CUBIC, [record], 3)
-    wild = type(model)(model.box, 3, model.coefficients + 50.0, model.B)
-    kept = output_error(wild, segments, learn_input_matrix=True)
-    assert np.array_equal(kept.coefficients, wild.coefficients)
-    short = Episode(record.time[:3], record.x[:3], record.input_time[:1], record.u[:1])
-    found = output_error(model, Segments.of([short], 0.2), learn_input_matrix=True)
-    # three samples do not determine five coefficients: damping keeps it near its start
-    assert np.max(np.abs(found.coefficients - model.coefficients)) < 1.0
-
-
 def estimate(method, plant, records, degree, B=None, window=20):
     box = box_of(plant.plant, records)
     known = None if B is None else box.input_matrix(B)
@@ -207,27 +196,6 @@ def test_recovers_the_drift(method, plant, degree, known):
     # both are of second order in a period of 0.05 at rates up to 2; smoothing takes some more
     assert plant.misfit(found) < 1e-2
     assert found.input_matrix == pytest.approx(plant.B, abs=1e-12 if known else 2e-2)
-
-
-@either
-def test_error_falls_with_the_square_of_the_period(method):
-    misfits = [CUBIC.misfit(estimate(
-        method, CUBIC, [CUBIC.excited(300 * n, 0.1 / n, hold=20 * n)], 3, window=10 * n))
-        for n in (1, 2)]
-    # a factor of four; inputs of other levels make it uneven
-    assert misfits[1] < 0.4 * misfits[0]
-
-
-def test_weak_form_integrates_the_input_exactly():
-    # f = 0: -integral(phi' x) = B integral(phi u), whatever the times at which u changes
-    rng = np.random.default_rng(0)
-    times = np.cumsum(rng.uniform(0.01, 0.02, 2000))
-    changes = np.concatenate(([0.0], np.sort(rng.uniform(0.0, times[-1], 400))))
-    bare = Episode(times, np.zeros((2000, 1)), changes, rng.uniform(-1.0, 1.0, (401, 1)))
-    record = Episode(times, 1.7 * bare.input_integral(times), changes, bare.u)
-    found = estimate('weak form', CUBIC, [record], 1, window=40)
-    # what is left is the trapezoidal rule on phi' x, which has kinks between samples
-    assert found.input_matrix == pytest.approx(np.array([[1.7]]), rel=2e-3)
 
 
 @either
@@ -288,16 +256,6 @@ def test_smoothing_takes_away_noise_alone():
     found = smoothed(t, true + sigma * rng.standard_normal(true.shape))
     # two thirds of the noise go; what is taken away has its size (discrepancy principle)
     assert np.all(np.sqrt(np.mean((found - true) ** 2, axis=0)) < sigma / 3.0)
-
-
-def test_records_that_are_smoothed_at_once_do_not_touch_each_other():
-    rng, records = np.random.default_rng(0), []
-    for count, level in ((40, 0.0), (25, 30.0), (60, -5.0)):
-        t = np.cumsum(rng.uniform(0.05, 0.15, count))
-        records.append((t, np.column_stack([level + np.sin(t) + 0.02 * rng.standard_normal(count),
-                                            np.ones(count)])))
-    for found, (t, values) in zip(_smoothed(records), records, strict=True):
-        np.testing.assert_allclose(found, smoothed(t, values), rtol=0.0, atol=1e-5)
 
 
 def test_smoothing_of_a_parabola_finds_it_and_leaves_what_has_no_noise():

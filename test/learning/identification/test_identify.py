@@ -4,7 +4,6 @@
 """Choice of a drift model on held-out segments."""
 
 from dataclasses import replace
-import importlib
 import sys
 import tracemalloc
 
@@ -15,6 +14,7 @@ from koopman_ros.learning.identification import (
     box_of,
     identify,
     longest_step,
+    methods_of,
     Segments,
     Stopped,
     weak_form,
@@ -102,36 +102,75 @@ def test_two_states_two_inputs_and_records_of_different_length():
     assert min(len(part) for part in (*found.fitted, *found.held_out)) >= 10
 
 
-def test_output_error_is_taken_although_chance_is_against_it():
-    """On a short record the few segments to choose by rate luck above skill."""
-    for seed in range(2):
-        record = CUBIC.excited(300, 0.1, noise=0.05, seed=seed)
-        found = identify(CUBIC.plant, [record], degrees=(2, 3), methods=methods(10, 20))
-        assert found.method.startswith('output error')
-
-
 METHOD = """
-from koopman_ros.learning.identification import weak_form
+from dataclasses import dataclass
+from koopman_ros.learning.identification import DriftEstimate, IdentificationMethod, weak_form
 
 
-def regularised(episodes, box, degree, B, assumed):
-    if len(episodes[0]) < 4 or assumed is None:
-        raise ValueError('left out')
-    return weak_form(episodes, box, degree, B, 15)
+@dataclass(frozen=True)
+class OneWindow:
+    window: int = 30
+
+    def __post_init__(self):
+        if self.window < 5:
+            raise ValueError('window must be at least 5')
+
+
+class Own(IdentificationMethod):
+    name = 'own'
+    Parameters = OneWindow
+
+    def estimate(self, problem):
+        return [DriftEstimate(weak_form(problem.episodes, problem.box, problem.degree, problem.B,
+                                        self.parameters.window), f'{self.parameters.window}')]
+
+
+class Raising(IdentificationMethod):
+    name = 'raising'
+
+    def estimate(self, problem):
+        return 1 // 0
+
+
+class Unfinished(IdentificationMethod):
+    name = 'unfinished'
+
+
+def function():
+    pass
 """
 
 
-def test_method_of_another_module_is_a_candidate(noisy, tmp_path, monkeypatch):
-    """CONTRIBUTING says how to add one."""
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / 'another_method.py').write_text(METHOD)
-    method = importlib.import_module('another_method').regularised
-    record = [noisy.part(0, 200)]
-    # the first has no rough B and is left out
-    found = identify(CUBIC.plant, record, degrees=(1, 3), methods={
-        'first': method, **methods(10), 'another': method})
-    assert {score.method for score in found.scores if 'output' not in score.method} == {
-        'weak form, 10 samples', 'total variation', 'another'}
+    (tmp_path / 'own_methods.py').write_text(METHOD)
+
+
+@pytest.mark.usefixtures('own_module')
+def test_a_method_of_ones_own_has_its_own_parameters(noisy):
+    """One that raises is a reason, and the others go on."""
+    own = methods_of(['own_methods:Own', 'own_methods:Raising'], {'own': {'window': 12}})
+    found = identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1, 3), methods=own)
+    assert {score.method for score in found.scores} == {'own, 12', 'output error from own, 12'}
+    (warning,) = found.warnings
+    assert 'raising' in warning
+    assert 'ZeroDivisionError' in warning
+    with pytest.raises(ValueError, match=r'no drift fits the episodes: .*raising.*ZeroDivision'):
+        identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1,), methods=own[1:])
+
+
+@pytest.mark.usefixtures('own_module')
+@pytest.mark.parametrize(('name', 'parameters', 'words'), [
+    ('own_methods:Unfinished', {}, 'abstract'),
+    ('own_methods:function', {}, 'no class derived from IdentificationMethod'),
+    ('own_methods:Own', {'own': {'window': 3}}, 'window must be at least 5'),
+    ('own_methods:Own', {'own': {'size': 3}}, 'size'),
+    ('own_methods:Absent', {}, 'Absent'), ('weak', {}, 'choose one of weak_form, total_variation'),
+    ('weak_form', {'weak_form': {'windows': (3,)}}, 'at least 4')])
+def test_methods_are_checked_when_configured(name, parameters, words):
+    with pytest.raises(ValueError, match=words):
+        methods_of([name], parameters)
 
 
 def test_progress_and_stop(noisy):
