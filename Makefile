@@ -6,9 +6,7 @@ BIN := $(VENV)/bin
 # changed its mind about which of them governs that).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
-# What controllers would compile, half a minute, beside what is measured and tested.
-COMPILE := $(BIN)/python -m koopman_ros.compiled
-# Where the environment forbids to keep what is compiled, each process would compile the package anew.
+# Where the environment forbids to keep byte code, each process would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 # All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
 unexport PYTHONPATH AMENT_PREFIX_PATH
@@ -36,7 +34,6 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,test,bench]'
-	$(COMPILE)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
@@ -65,7 +62,6 @@ $(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,bench,fast]'
-	$(COMPILE)
 	@touch $@
 
 demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, to be run from a browser)

@@ -80,3 +80,10 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
                          'check where that number was computed or measured')
     array.setflags(write=False)
     return array
+
+
+def kept(value: ArrayLike) -> Array:
+    """Return a read-only copy of numbers."""
+    copy = np.array(value, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy

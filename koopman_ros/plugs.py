@@ -1,24 +1,26 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a name in a parameter stands for: something of the package, or ``module:name`` of any."""
+"""Plug-ins by name: a class of the package, or ``module:Class`` of any module."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import importlib
 import traceback
-from typing import Any
+from typing import Any, TypeVar
 
 _LONGEST = 200  # characters of an error's text that reach a status
+
+Base = TypeVar('Base')
 
 
 def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) -> Any:
     """
-    Return what a name stands for: something known, or ``module:name`` of any module.
+    Return a class or function by its name: a known one, or ``module:name`` of any module.
 
-    :param kind: what it is, for the error, e.g. ``'law'``.
+    :param kind: of plug-in, for the error, e.g. ``'law'``.
     :param known: by name, itself or as ``module:name``, which is imported only when it is asked
         for.
-    :raises ValueError: for a name that stands for nothing that can be called.
+    :raises ValueError: for a name without something that can be called.
     """
     found = known.get(name, name)
     if not isinstance(found, str):
@@ -38,27 +40,46 @@ def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) ->
     return found
 
 
-def plugged(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str],
-            arguments: Sequence[Any], members: Sequence[str]) -> Any:
+def plug_class(name: str, kind: str, known: Mapping[str, type[Any] | str], base: type[Base]
+               ) -> type[Base]:
     """
-    Return what :func:`plug` finds, called with arguments.
+    Return the class of a plug-in, see :func:`plug`, which fulfils the contract of its base.
 
-    :param members: attributes that the result must have.
-    :raises ValueError: where it cannot be called with the arguments, or lacks a member.
+    :raises ValueError: for one that is no subclass, or lacks a method, naming it.
     """
-    factory = plug(name, kind, known)
+    found = plug(name, kind, known)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f'the {kind} {name!r} is no subclass of {base.__module__}.'
+                         f'{base.__name__}: derive its class from that')
+    if missing := sorted(getattr(found, '__abstractmethods__', ())):
+        raise ValueError(f'the {kind} {name!r} lacks {", ".join(missing)}: define '
+                         f'{"them" if len(missing) > 1 else "it"} in its class')
+    return found
+
+
+def plug_in(name: str, kind: str, known: Mapping[str, type[Any] | str], base: type[Base],
+            *arguments: Any) -> Base:
+    """
+    Return a plug-in, constructed from arguments of which the last is the tuning.
+
+    Its own parameters in the tuning are the last argument of its constructor.
+
+    :raises ValueError: as :func:`plug_class`, and where it cannot be constructed.
+    """
+    found: Any = plug_class(name, kind, known, base)
     try:
-        made = factory(*arguments)
-        missing = [member for member in members if not hasattr(made, member)]
+        made: Base = found(*arguments, arguments[-1].of_plugin(name, found.Parameters))
+        return made
     except ValueError:
         raise
     except BaseException as error:
         raise ValueError(f'the {kind} {name!r} cannot be constructed ({contained(error)}): '
                          'correct its class') from error
-    if missing:
-        raise ValueError(f'the {kind} {name!r} returned a {type(made).__name__} without '
-                         f'{" and ".join(missing)}: correct its class')
-    return made
+
+
+def short_name(name: str) -> str:
+    """Return the name under which the parameters of a plug-in are declared: that of its class."""
+    return name.rpartition(':')[2]
 
 
 def own_code(value: Any) -> list[str]:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Set-point control on lifted models: pure, no ROS; imports estimation, lifting and solvers."""
+"""Set-point control on lifted models: pure, no ROS."""
 
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import (
@@ -17,9 +17,7 @@ from koopman_ros.control.hindsight import compare, Comparison, Recent, Windows
 from koopman_ros.control.law_check import check_law, LawCheck
 from koopman_ros.control.laws import averaged, Feedback, feedback, Form, LAWS, recentred, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
-from koopman_ros.control.limits import InputLimits, limit
 from koopman_ros.control.setpoint import Setpoint
-from koopman_ros.control.settings import Settings
 from koopman_ros.control.simulate import (
     at,
     Change,
@@ -36,20 +34,13 @@ from koopman_ros.control.simulate import (
     Timed,
 )
 from koopman_ros.control.state import Arrival, Mode, Report, State
-from koopman_ros.control.supervisor import (
-    HOLD,
-    LevelSettings,
-    MANUAL,
-    SAFE,
-    Supervisor,
-    SupervisorSettings,
-)
+from koopman_ros.control.supervisor import HOLD, MANUAL, SAFE, Supervisor
+from koopman_ros.tuning import InputLimits, SensorLimits, Tuning
 
 __all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Change', 'ClosedLoop', 'Comparison',
            'Controller', 'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits', 'LawCheck',
-           'LevelSettings', 'Loop', 'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant',
-           'Recent', 'Report', 'Sensor', 'Setpoint', 'SetpointRequest', 'Settings', 'Silence',
-           'Simulation', 'State', 'Supervisor', 'SupervisorSettings', 'Target', 'Timed',
-           'Weights', 'Windows', 'at', 'averaged', 'check_law', 'compare', 'exchange', 'feedback',
-           'limit', 'perfect', 'recentred', 'restart', 'run_closed_loop', 'simulate',
-           'steady_state_target']
+           'Loop', 'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant', 'Recent',
+           'Report', 'Sensor', 'SensorLimits', 'Setpoint', 'SetpointRequest', 'Silence',
+           'Simulation', 'State', 'Supervisor', 'Target', 'Timed', 'Tuning', 'Weights', 'Windows',
+           'at', 'averaged', 'check_law', 'compare', 'exchange', 'feedback', 'perfect',
+           'recentred', 'restart', 'run_closed_loop', 'simulate', 'steady_state_target']

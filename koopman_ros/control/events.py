@@ -15,10 +15,9 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.state import Mode, Report, State
 from koopman_ros.reasons import Code, Reason
-from koopman_ros.values import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Measurement:
     """A measurement that is answered."""
 
@@ -29,7 +28,7 @@ class Measurement:
     seconds: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Silence:
     """No measurement came up to a time, which is answered, too."""
 
@@ -38,7 +37,7 @@ class Silence:
     cause: Code | None = Code.NO_MEASUREMENT
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SetpointRequest:
     """The operator asks for a set-point."""
 
@@ -48,21 +47,21 @@ class SetpointRequest:
     signals: tuple[str, ...] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ManualCommand:
     """The operator commands the input in manual mode."""
 
     value: Array  #: (n_u,) in the model's units
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ModeChange:
     """The operator switches between automatic and manual mode."""
 
     mode: Mode  #: from now on
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Initialisation:
     """The controller starts from the input that is applied already."""
 
@@ -73,7 +72,7 @@ Event: TypeAlias = (
     Measurement | Silence | SetpointRequest | ManualCommand | ModeChange | Initialisation)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What an event led to."""
 

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import Measurement
-from koopman_ros.control.limits import finite
 from koopman_ros.control.state import Arrival, MeasurementReport
 from koopman_ros.estimation import Estimate
-from koopman_ros.estimation.observer import simulated
+from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.units import NANOSECONDS
 
@@ -57,7 +56,7 @@ class Recent:
         """
         if report.arrival not in (Arrival.ACCEPTED, Arrival.REJECTED):
             return
-        known = event.applied is not None and finite(event.applied)
+        known = event.applied is not None and bool(np.isfinite(event.applied).all())
         u = event.applied if known else command
         if event.stamp_ns <= self._time_ns or u is None:
             self._rows.clear()
@@ -187,7 +186,7 @@ def _predicted(controller: Controller, windows: Windows) -> Array:
         errors = []
         for k in places:
             ahead = ahead and simulated(model, ahead, inputs[k], steps[k])
-            if ahead is None or not finite(ahead.x):
+            if ahead is None or not bool(np.isfinite(ahead.x).all()):
                 break
             errors.append(windows.x[k + 1] - outputs.of(model.states.to_physical(ahead.x)))
         else:

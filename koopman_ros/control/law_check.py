@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -21,12 +21,12 @@ from koopman_ros.control.law_loops import (
     MOST_EXCESS,
     Rate,
 )
-from koopman_ros.control.laws import Law, StateDependentRiccati, Tuning, Weights
-from koopman_ros.control.limits import InputLimits
+from koopman_ros.control.laws import Law, StateDependentRiccati, Weights
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
 from koopman_ros.lifting.coordinates import MAX_TRIED_LOOPS
 from koopman_ros.solvers import solve_riccati
+from koopman_ros.tuning import InputLimits, Tuning
 
 #: Closed loops that a law is judged by.
 LOOPS = 128
@@ -54,6 +54,7 @@ _NEWTON_STEPS = 30
 _LONGEST_STEP = 0.5
 # Share of the box to which ranges are told.
 _ROUNDED = 1e-3
+_LARGEST_GAIN = 1e6  # of a law, in scaled coordinates
 _RESOLUTION = 1e-9  # what is left of a step, in scaled deviations
 
 
@@ -175,7 +176,7 @@ class LawCheck:
 
 
 def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
-              law: Callable[[LiftedModel, Tuning], Law] = StateDependentRiccati,
+              law: type[Law] = StateDependentRiccati,
               limits: InputLimits | None = None, interval: float = 0.0, loops: int = LOOPS,
               watch: Callable[[float], bool] = lambda _: False,
               backend: Backend | None = None) -> LawCheck | None:
@@ -197,7 +198,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
         and per time unit of the model; affine in the input.
     :param tuning: of all laws; by default with weights of 1 on scaled deviations.
-    :param limits: of the inputs; by default their range in the model's training box.
+    :param limits: of the inputs; by default those of the tuning.
     :param interval: seconds between samples; by default, and at least, half of the fastest
         time constant of the linear loop.
     :param loops: closed loops to run; fewer where these take many samples.
@@ -208,18 +209,18 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     """
     if model.n_u == 0:
         raise ValueError('a plant without inputs has no closed loop')
-    tuning = tuning or Tuning(Weights(np.eye(model.n_x), np.eye(model.n_u)))
-    limits = limits or InputLimits(model.inputs.lower, model.inputs.upper,
-                                   np.full(model.n_u, np.inf))
+    tuning = tuning or Tuning.for_model(model, max_gain=_LARGEST_GAIN)
+    limits = limits or tuning.limits
     plant = DriftPlant(model, rate)
     linear = plant.linearised
-    slowest, fastest = _closed_loop_rates(linear, tuning.weights)
+    slowest, fastest = _closed_loop_rates(linear, Weights.physical(
+        linear, tuning.state_weight, tuning.input_weight))
     interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
     samples = math.ceil(_DURATION / (slowest * interval))
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
-    given = Loops(plant, tuning, law, limits, interval, samples,
-                   math.ceil(_STEPS * interval * fastest))
+    given = Loops(plant, replace(tuning, limits=limits), law, interval, samples,
+                  math.ceil(_STEPS * interval * fastest))
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
         for first in range(0, max(1, len(starts)), _PART)}

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws import Law, Linear, Tuning, Weights
+from koopman_ros.control.laws import Law, Linear, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
-from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.execution import Tell
 from koopman_ros.lifting import LiftedModel, NetworkObservables
 from koopman_ros.lifting.model import NODES, WEIGHTS
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.tuning import InputLimits, Tuning
 
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in units a time unit of the model
 Rate = Callable[[Array, Array], Array]
@@ -47,24 +47,37 @@ class Loops:
 
     plant: DriftPlant
     tuning: Tuning
-    law: Callable[[LiftedModel, Tuning], Law]
-    limits: InputLimits
+    law: type[Law]
     interval: float  #: between samples, in time units of the model
     samples: int
     steps: int  #: of integration, in an interval
 
-    def laws(self, targets: Array, inputs: Array, limits: InputLimits) -> tuple[_Feedback, ...]:
+    @property
+    def weights(self) -> Weights:
+        """Of the cost, on the scaled deviations of the model."""
+        return Weights.physical(
+            self.plant.model, self.tuning.state_weight, self.tuning.input_weight)
+
+    def within(self, limits: InputLimits) -> Loops:
+        """Return the loops with other limits of the inputs."""
+        return replace(self, tuning=replace(self.tuning, limits=limits))
+
+    def laws(self, targets: Array, inputs: Array) -> tuple[_Feedback, ...]:
         """Return the law, the averaged one that knows the plant, and two linear ones."""
         model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
-        return (_called(self.law(model, self.tuning), targets, inputs, limits, seconds),
-                _informed(self.plant, targets, inputs, self.tuning, limits, self.interval),
-                *(_constant(Linear(one, self.tuning), targets, inputs, limits, seconds)
+        own = self.law(model, self.tuning, self.law.Parameters())
+        return (_called(own, targets, inputs, seconds), self.informed(targets, inputs),
+                *(_constant(Linear(one, self.tuning, None), targets, inputs, seconds)
                   for one in (self.plant.linearised, model)))
+
+    def informed(self, targets: Array, inputs: Array) -> _Feedback:
+        """Return the averaged law that knows the plant."""
+        return _informed(self.plant, targets, inputs, self.weights, self.tuning, self.interval)
 
     def run(self, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array], tell: Tell
             ) -> tuple[Array, NDArray[np.bool_]] | None:
         """Run loops under each of some laws, as :func:`_run`."""
-        return _run(self.plant, feedbacks, *cases, self.tuning.weights, self.interval,
+        return _run(self.plant, feedbacks, *cases, self.weights, self.interval,
                     self.samples, self.steps, tell)
 
 
@@ -77,8 +90,8 @@ def judge_loops(given: Loops, cases: tuple[Array, Array, Array], tell: Tell
         no gain, its cost beside that of a perfect model, and whether no law arrives.
     """
     starts, targets, inputs = cases
-    limits, m = given.limits, given.plant.model.n_u
-    ended = given.run(given.laws(targets, inputs, limits), cases, tell)
+    limits, m = given.tuning.limits, given.plant.model.n_u
+    ended = given.run(given.laws(targets, inputs), cases, tell)
     if ended is None:
         return None
     costs, no_gain = ended
@@ -86,8 +99,8 @@ def judge_loops(given: Loops, cases: tuple[Array, Array, Array], tell: Tell
         # what the limits hide
         endless = np.full(m, np.inf)
         some = starts[hopeless], targets[hopeless], inputs[hopeless]
-        ended = given.run(given.laws(*some[1:], InputLimits(-endless, endless, endless)), some,
-                          tell)
+        ended = given.run(
+            given.within(InputLimits(-endless, endless, endless)).laws(*some[1:]), some, tell)
         if ended is None:
             return None
         costs[:, hopeless], no_gain[hopeless] = ended
@@ -95,8 +108,7 @@ def judge_loops(given: Loops, cases: tuple[Array, Array, Array], tell: Tell
     ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
     if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
         some = starts[beaten], targets[beaten], inputs[beaten]
-        again = given.run([_informed(given.plant, *some[1:], given.tuning, _narrowed(limits),
-                                     given.interval)], some, tell)
+        again = given.run([given.within(_narrowed(limits)).informed(*some[1:])], some, tell)
         if again is None:
             return None
         excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
@@ -148,15 +160,14 @@ def target_of(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
     """Return a target of a model with the disturbance under which this input holds it."""
     try:
         w = -model.rate_under(v)(x_ref)
-        return steady_state_target(model, x_ref, w) if finite(w) else None
+        return steady_state_target(model, x_ref, w) if np.isfinite(w).all() else None
     except np.linalg.LinAlgError:
         return None
 
 
-def _called(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
-            ) -> _Feedback:
+def _called(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Feedback:
     """Return a law's inputs, found for one state after another."""
-    model = law.model
+    model, limits = law.model, law.tuning.limits
     targets = [target_of(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
     memory: list[object] = [None] * len(targets)
 
@@ -167,22 +178,21 @@ def _called(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seco
             if target is None:
                 continue
             w = -(target.drift + model.forcing(target.x, target.u))
-            found = law.compute(Estimate(x[k], w), target, limits, memory[k], seconds)
+            found = law.compute(Estimate(x[k], w), target, memory[k], seconds, None)
             memory[k] = found.memory
-            if found.u is not None:
-                v[k] = model.inputs.to_deviation(found.u)
+            if found.failure is None and np.isfinite(found.u).all():
+                v[k] = model.inputs.to_deviation(limits.within(found.u))
         return v
 
     return act
 
 
-def _constant(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
-              ) -> _Feedback:
+def _constant(law: Linear, setpoints: Array, inputs: Array, seconds: float) -> _Feedback:
     """Return the inputs of a law with one gain, which is read off what it does without limits."""
-    model, n = law.model, setpoints.shape[1]
+    model, limits, n = law.model, law.tuning.limits, setpoints.shape[1]
     endless = np.full(model.n_u, np.inf)
-    at_nominal = _called(law, np.zeros((n, n)), np.zeros((n, model.n_u)),
-                         InputLimits(-endless, endless, endless), seconds)
+    free = Linear(model, replace(law.tuning, limits=InputLimits(-endless, endless, endless)), None)
+    at_nominal = _called(free, np.zeros((n, n)), np.zeros((n, model.n_u)), seconds)
     gain = at_nominal(np.eye(n), np.full(n, True)).T
 
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
@@ -200,8 +210,8 @@ def _narrowed(limits: InputLimits) -> InputLimits:
     return replace(limits, lower=limits.lower + margin, upper=limits.upper - margin)
 
 
-def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, tuning: Tuning,
-              limits: InputLimits, interval: float) -> _Feedback:
+def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, weights: Weights,
+              tuning: Tuning, interval: float) -> _Feedback:
     """Return the averaged law that knows the plant: no better model of it has a better one."""
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
         v = np.full(inputs.shape, np.nan)
@@ -212,12 +222,12 @@ def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, tuning: Tuning
         A = np.tensordot(WEIGHTS, along[..., :n].reshape(len(NODES), -1, n, n), 1)
         B = plant.slope(x[rows], inputs[rows])[..., n:]
         for i, k in enumerate(rows):
-            found = solve_riccati(A[i], B[i], tuning.weights.Q, tuning.weights.R,
+            found = solve_riccati(A[i], B[i], weights.Q, weights.R,
                                   interval=interval, max_gain=tuning.max_gain,
-                                  max_residual=tuning.max_residual)
+                                  max_residual=tuning.max_riccati_residual)
             if found.status is RiccatiStatus.SOLVED:
                 u = plant.model.inputs.to_physical(inputs[k] - found.K @ e[i])
-                v[k] = plant.model.inputs.to_deviation(limits.within(u))
+                v[k] = plant.model.inputs.to_deviation(tuning.limits.within(u))
         return v
 
     return act

@@ -3,7 +3,7 @@
 
 """The set-point: requested by the operator, at once or for a later time, checked and ramped."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -12,14 +12,13 @@ from koopman_ros.arrays import Array
 from koopman_ros.lifting import Coordinates
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
-from koopman_ros.values import record
 
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS
 MAX_SCHEDULED = 1000
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Setpoint:
     """The state of the set-point."""
 
@@ -111,10 +110,6 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
     :param seconds: time since the last measurement; 0 at the first.
     :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
     """
-    if (not setpoint.scheduled and setpoint.active is setpoint.requested is not None
-            and setpoint.ramped is None):
-        # arrived, and nothing ahead
-        return setpoint
     due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
         kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
@@ -128,8 +123,7 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
     requested = active if setpoint.requested is None else overlaid(active, setpoint.requested)
     ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
     # infinity for a step, also where no time has passed
-    reach = np.full(len(ramp), np.inf)
-    np.multiply(ramp, seconds, out=reach, where=np.isfinite(ramp))
+    reach = np.where(np.isfinite(ramp), ramp * seconds, np.inf)
     ramped = np.minimum(np.maximum(requested, ramped - reach), ramped + reach)
     if lag <= 0.0:
         arrived = ramped.tolist() == requested.tolist()

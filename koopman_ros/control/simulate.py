@@ -16,7 +16,7 @@ from koopman_ros.control.events import apply, Event, Measurement, Silence
 from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.state import Report, State
-from koopman_ros.control.target import nearest_steady_state, partial_target
+from koopman_ros.control.steady_state import nearest_steady_state, partial_target
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason, Words
 from koopman_ros.signals import per_signal
@@ -76,7 +76,7 @@ def at(seconds: float, what: Event | Change) -> Timed:
 
 
 def exchange(controller: Controller) -> Change:
-    """Let another controller take over, with other settings or another model."""
+    """Let another controller take over, with another tuning or model."""
     return lambda loop: replace(
         loop, controller=controller, state=controller.hand_over(loop.controller, loop.state))
 

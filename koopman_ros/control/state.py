@@ -1,24 +1,26 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a controller remembers between two measurements, and what it reports of a step."""
+"""The state of a controller between two measurements, and the report of a step."""
 
-from dataclasses import field
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
 from enum import Enum
 import math
 
 import numpy as np
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.control.laws.base import Figures, NO_FIGURES, Plan, Target
-from koopman_ros.control.limits import Transfer
+from koopman_ros.control.bumpless import BumplessTransfer
+from koopman_ros.control.laws.base import NO_SOLUTION, Plan, SolutionInfo, Target
+from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.control.setpoint import Setpoint
-from koopman_ros.control.supervisor import Supervisor, WayBack
+from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
 from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.plugs import contained
 from koopman_ros.reasons import Reason
-from koopman_ros.values import record
 
 
 class Mode(Enum):
@@ -28,7 +30,7 @@ class Mode(Enum):
     MANUAL = 'manual'
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class State:
     """All that a controller remembers between two measurements."""
 
@@ -47,16 +49,32 @@ class State:
     estimate: Estimate | None = None
     supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
-    way_back: WayBack | None = None
+    recovery: SafeStateRecovery | None = None
     law: str | None = None  #: the level whose law gave the last command; None when none did
     law_input: Array | None = None  #: (n_u,) what that law asked for, within the range
     law_memory: object = None  #: what that law remembers
-    transfer: Transfer | None = None  #: what is added to it for a while, or None
+    transfer: BumplessTransfer | None = None  #: what is added to it for a while, or None
     #: (n_x + n_u,) steady state that was last aimed at and its input, in their units, where the
     #: next one is looked for; None at first, and where every state has a set-point
     target: Array | None = None
 
     __repr__ = brief
+
+    def without_law(self, transfer: bool = False) -> State:
+        """Return the state without an acting law; with `transfer`, also without its transfer."""
+        return replace(self, law=None, law_input=None, law_memory=None,
+                       transfer=None if transfer else self.transfer)
+
+    def restarted(self) -> State:
+        """Return the state without what may have made a calculation fail."""
+        return replace(self.without_law(transfer=True), estimate=None, recovery=None, target=None)
+
+    @property
+    def own_command(self) -> Array | None:
+        """The last command (n_u,) without the offset of a transfer; None for none."""
+        if self.command is None or self.transfer is None:
+            return self.command
+        return self.command - self.transfer.offset
 
 
 class Arrival(Enum):
@@ -69,12 +87,12 @@ class Arrival(Enum):
     MISSING = 'missing'
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class MeasurementReport:
     """The measurement that was answered."""
 
     arrival: Arrival = Arrival.MISSING  #: what came of it
-    #: its distance from the training data, in half widths; NaN when there is none
+    #: its distance from the training data, in half-ranges; NaN when there is none
     outside: float = math.nan
     predicted: Array | None = None  #: (n_y,) what was expected of it, or None
     missed: int = 0  #: measurements that should have come since the last one
@@ -86,7 +104,7 @@ class MeasurementReport:
 NOTHING_MEASURED = MeasurementReport()
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class EstimateReport:
     """The estimate in units, which it is turned into where somebody asks."""
 
@@ -136,7 +154,7 @@ class EstimateReport:
         return None if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class TargetReport:
     """Where the law goes, in units into which it is turned where somebody asks."""
 
@@ -147,7 +165,7 @@ class TargetReport:
 
     @property
     def outside(self) -> float:
-        """Its distance from the training box, in half widths."""
+        """Its distance from the training box, in half-ranges."""
         return self.controlled.violation(self.setpoint)
 
     @property
@@ -160,8 +178,7 @@ class TargetReport:
         """(n_x,) steady state that goes with it, in state units; None without a law."""
         if self.target is None:
             return None
-        every = len(self.controlled) == self.model.n_x
-        return self.setpoint if every else self.model.states.to_physical(self.target.x)
+        return self.model.states.to_physical(self.target.x)
 
     @property
     def input(self) -> Array | None:
@@ -169,24 +186,24 @@ class TargetReport:
         return None if self.target is None else self.model.inputs.to_physical(self.target.u)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CommandReport:
     """How the command came about."""
 
-    law: Figures = NO_FIGURES  #: what the law says of its solution
+    law: SolutionInfo = NO_SOLUTION  #: about the solution of the law
     transfer: Array | None = None  #: (n_u,) what a change of law or mode still adds to it, or None
-    way_back: float = 0.0  #: share of the nominal input in it on the way back from the safe one
+    recovery: float = 0.0  #: share of the nominal input in it while recovering from the safe one
     at_range: bool = False  #: whether the range of an input was active
     at_rate: bool = False  #: whether the rate limit of an input was active
     plan: Plan | None = None  #: what the law plans, where it has a horizon
-    #: its distance from the training box, in half widths; NaN where not looked at
+    #: its distance from the training box, in half-ranges; NaN where not looked at
     outside: float = math.nan
 
 
 NO_COMMAND = CommandReport()
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Report:
     """What a step did."""
 

@@ -1,25 +1,19 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Estimation of state and disturbance from outputs; imports lifting, signals and solvers."""
+"""Estimation of state and disturbance from measurements."""
 
-from collections.abc import Callable
-
-from koopman_ros.estimation.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter
-from koopman_ros.estimation.measurement import Accepted, check, FrozenCheck, SensorLimits, Verdict
-from koopman_ros.estimation.observer import (
+from koopman_ros.estimation.base import Estimate, Estimator, Innovation
+from koopman_ros.estimation.disturbance_observer import (
     DisturbanceObserver,
     equivalent_bias,
-    Estimate,
-    Estimator,
-    EstimatorTuning,
-    Innovation,
     MeasuredState,
 )
+from koopman_ros.estimation.kalman_filters import ExtendedKalmanFilter, UnscentedKalmanFilter
+from koopman_ros.estimation.sensor_checks import Accepted, check, Standstill, Verdict
 
-# By name. The Kalman filters beside the observer: that needs every state measured, and is two
-# numbers in place of a covariance.
-ESTIMATORS: dict[str, Callable[..., Estimator]] = {
+#: by name
+ESTIMATORS: dict[str, type[Estimator] | str] = {
     'disturbance_observer': DisturbanceObserver,
     'extended_kalman_filter': ExtendedKalmanFilter,
     'measured_state': MeasuredState,
@@ -27,5 +21,5 @@ ESTIMATORS: dict[str, Callable[..., Estimator]] = {
 }
 
 __all__ = ['ESTIMATORS', 'Accepted', 'DisturbanceObserver', 'Estimate', 'Estimator',
-           'EstimatorTuning', 'ExtendedKalmanFilter', 'FrozenCheck', 'Innovation', 'MeasuredState',
-           'SensorLimits', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias']
+           'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'Standstill',
+           'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias']

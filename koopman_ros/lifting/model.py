@@ -14,7 +14,6 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
-from koopman_ros.kernels import compilable, Kernels, NUMPY
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLoops
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.layout import Layout, layout_of
@@ -89,8 +88,6 @@ class LiftedModel:
     pre_feedback: Array | None = None
     #: where the law of the model was tried; None where that is not known, or it was lost nowhere
     tried_loops: TriedLoops | None = None
-    #: compiled functions that take the place of those in numpy; see :mod:`koopman_ros.kernels`
-    kernels: Kernels = field(default_factory=lambda: NUMPY, repr=False, compare=False)
 
     __repr__ = brief
 
@@ -301,7 +298,6 @@ class LiftedModel:
         return max(outside, self.training_states.distance(
             self.states.to_deviation(x), self.states.half_widths))
 
-    @compilable
     def distances(self, x: Array) -> Array:
         """Measure, as :meth:`distance`, for states (N, n_x) in scaled deviations: (N,)."""
         half, (lower, upper) = self.states.half_widths, self.states.corners

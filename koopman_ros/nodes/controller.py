@@ -4,7 +4,7 @@
 """The controller node: answers each measurement with a command."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 import gc
 import math
@@ -34,7 +34,6 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.events import Event, ModeChange, Silence
-from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, NUMPY
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.wire import (
@@ -50,7 +49,6 @@ from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.compiling import Compiling
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.model_reload import (
     load_suitable,
@@ -65,7 +63,6 @@ from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
 from koopman_ros.time_base import Advance, TimeBase
 from koopman_ros.units import display_unit, NANOSECONDS, shown
-from koopman_ros.values import record
 from koopman_ros.wire import stem
 
 # A measurement and the inputs that acted on it are stamped no further apart.
@@ -82,7 +79,7 @@ _CAUSES = {None: Code.NO_MEASUREMENT, Advance.OLD: Code.STAMPS_STAND,
 _ATTEMPTS = 2
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class _Sample:
     """A measurement that is to be answered."""
 
@@ -115,7 +112,7 @@ class ControllerNode(ManagedNode):
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
         self._signals = signals_of(
-            loaded.model, self._settings.controlled, self._settings.states)
+            loaded.model, self._settings.tuning.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded
         # (n_u,) last command before the node became inactive, which is still in force at the plant
         self._last_command: Array | None = None
@@ -137,8 +134,6 @@ class ControllerNode(ManagedNode):
                 self._recent.windows(self._settings.model_check_length)),
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
-        self._compiling = Compiling(self) if parameters.compiled else None
-        self._kernels, self._carried = NUMPY, (loaded.model, loaded.model)
         self._controller = self._built()
         self._state = State()
         self._recent = Recent()
@@ -199,8 +194,8 @@ class ControllerNode(ManagedNode):
         wall_timer(self, PERIOD, self._on_watch)
         self._records = messages.RecordPublisher(
             self._matching, lambda: records.snapshot(
-                self._state, table.values(self._settings), self._models.in_force.identity,
-                COMPILED if self._kernels else IN_NUMPY), self._lock)
+                self._state, table.values(self._settings), self._models.in_force.identity),
+            self._lock)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
@@ -233,8 +228,6 @@ class ControllerNode(ManagedNode):
         if self._watchdog is not None:
             self._watchdog.end()
             self._models.end()
-            if self._compiling is not None:
-                self._compiling.end()
 
     def _single(self, wiring: Wiring) -> dict[str, str]:
         """Return what is done on topics on which only one node may publish."""
@@ -354,8 +347,6 @@ class ControllerNode(ManagedNode):
                 'a measurement is not answered, as a control step takes longer than the watchdog '
                 'waits: choose a smaller model', throttle_duration_sec=1.0)
             return
-        if self._compiling is not None:
-            self._compiling.begin()
         report = outcome.report
         self._recent.add(
             asked, report.measurement, before.command, self._settings.model_check_length)
@@ -386,8 +377,6 @@ class ControllerNode(ManagedNode):
         self._timing.busy = False
         assert self._watchdog is not None
         self._watchdog.beat()
-        if self._compiling is not None and (kernels := self._compiling.take()) is not None:
-            self._switch(kernels)
         watched = self._watch(self._timing.silence, acting=True)
         if watched is not None:
             self._tell(*watched)
@@ -454,7 +443,7 @@ class ControllerNode(ManagedNode):
         self._timing.commanded()
         if state.command is not None:
             moved = np.abs(outcome.command - state.command)
-            limits = self._controller.settings.limits
+            limits = self._controller.tuning.limits
             self._settling = cause is None and bool(
                 (moved > _SETTLED * (limits.upper - limits.lower)).any())
         stamp = stamp_message(now_ns) if stamp is None else stamp
@@ -467,7 +456,7 @@ class ControllerNode(ManagedNode):
         state, wanted = self._state, self._state.manual_input
         return (state.mode is Mode.MANUAL and wanted is not None and state.command is not None
                 and silence * NANOSECONDS > _WATCH_STEP and not np.array_equal(
-                    self._controller.settings.limits.within(wanted), state.command))
+                    self._controller.tuning.limits.within(wanted), state.command))
 
     def _setpoint_waits(self, silence: float) -> bool:
         """Tell whether a set-point is not reached, and a measurement is overdue."""
@@ -584,7 +573,7 @@ class ControllerNode(ManagedNode):
 
     def _limited(self, asked: Array) -> str:
         """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
-        within = self._controller.settings.limits.within(asked)
+        within = self._controller.tuning.limits.within(asked)
         parts = [f'manual {stem(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
                  f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
                  for (name, unit), wanted, limit in zip(
@@ -593,20 +582,7 @@ class ControllerNode(ManagedNode):
         return ', '.join(parts)
 
     def _built(self) -> Controller:
-        given, carrier = self._models.in_force.model, self._carried[1]
-        if given is not self._carried[0] or carrier.kernels is not self._kernels:
-            # the same one as long as nothing changes: what is estimated goes by it
-            carrier = replace(given, kernels=self._kernels) if self._kernels else given
-            self._carried = given, carrier
-        return built(self._settings, carrier)
-
-    def _switch(self, kernels: Kernels) -> None:
-        """Let compiled functions answer from now on; the state stays as it is."""
-        with self._lock:
-            self._kernels = kernels
-            self._controller = self._built()
-            self._records.publish(records.NUMERICS, {records.NUMERICS: COMPILED})
-        self.get_logger().info('the control step is compiled')
+        return built(self._settings, self._models.in_force.model)
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         before = self._table.values(self._settings)

@@ -153,7 +153,7 @@ def _commands(found: Replay, names: Names) -> tuple[Place, ...]:
     values = found.parameters
     table = table_of(found.controller.model, values)
     snapshot = table.snapshot(values)
-    signals = signals_of(found.controller.model, snapshot.controlled, snapshot.states)
+    signals = signals_of(found.controller.model, snapshot.tuning.controlled, snapshot.states)
     wiring = Wiring(signals, snapshot.states, snapshot.inputs)
     return tuple(replace(place, topic=names.of(place.topic))
                  for place in wiring.commands.values())

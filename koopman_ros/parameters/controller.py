@@ -3,36 +3,21 @@
 
 """Parameters of the controller node, and of the replay: its own beside a controller's."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+import contextlib
+from dataclasses import dataclass, replace
 from functools import partial
-import math
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.control import (
-    Controller,
-    InputLimits,
-    LAWS,
-    LevelSettings,
-    Settings,
-    SupervisorSettings,
-)
-from koopman_ros.estimation import ESTIMATORS, SensorLimits
+from koopman_ros.control import Controller, LAWS
+from koopman_ros.control.laws import Law
+from koopman_ros.declaration import nested, NoParameters, of_other_states, parameter, per_signal
+from koopman_ros.estimation import Estimator, ESTIMATORS
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.table import (
-    ConfigurationError,
-    in_own_units,
-    lowest,
-    parameter,
-    ParameterTable,
-    per_signal,
-    signal_value,
-    UNBOUNDED,
-)
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.parameters.wire import (
     DEFAULT_SYSTEM,
     InputPlaces,
@@ -44,254 +29,95 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
-from koopman_ros.plugs import plug
+from koopman_ros.plugs import plug_class, short_name
 from koopman_ros.signals import Outputs
-from koopman_ros.units import conversion, display_unit, SECONDS_PER_MINUTE
-
-
-@dataclass(frozen=True)
-class StateParameters(StatePlaces):
-    """What is tuned for a measured state."""
-
-    weight: float = parameter(1.0, 'cost of its squared error', '1/({unit})^2', 0.0, 1e12)
-    setpoint_ramp: float = parameter(
-        0.0, 'fastest change of the tracked set-point; 0 for a step', '{unit}/s', 0.0, 1e9)
-    min: float = signal_value(
-        -UNBOUNDED, 'lowest value that the predictive law plans for, and leaves where it must')
-    max: float = signal_value(
-        UNBOUNDED, 'highest value that the predictive law plans for, likewise')
-    sensor_min: float = signal_value(
-        -UNBOUNDED, 'lowest value that the sensor can measure')
-    sensor_max: float = signal_value(
-        UNBOUNDED, 'highest value that the sensor can measure')
-    max_rate: float = parameter(
-        0.0, 'fastest change that is physically possible; 0 for any', '{unit}/s', 0.0, 1e9)
-    max_jump: float = parameter(
-        0.0, 'change between two measurements that is accepted beside that rate, for noise; 0 for '
-        'any', '{unit}', 0.0, 1e9)
-    pi_gain: float = parameter(
-        0.0, 'change of the command per error, of the law pi: the first signal with one moves the '
-        'first input, and so on; 0 for signals that it does not control', 'of input/({unit})',
-        -1e9, 1e9)
-    pi_time: float = parameter(
-        60.0, 'integral time of that law', 's', 0.0, 86400.0, open_minimum=True)
-    noise: float = parameter(
-        0.0, 'standard deviation of the noise of its sensor, for a Kalman filter; 0 for that of '
-        'the record that the model was learned from', '{unit}', 0.0, 1e9)
-
-
-@dataclass(frozen=True)
-class EstimatedParameters:
-    """What is tuned for a state that is not measured."""
-
-    weight: float = parameter(0.0, 'cost of its squared error', '1/({unit})^2', 0.0, 1e12)
-    min: float = signal_value(
-        -UNBOUNDED, 'lowest value that the predictive law plans for, and leaves where it must')
-    max: float = signal_value(
-        UNBOUNDED, 'highest value that the predictive law plans for, likewise')
-    initial_error: float = parameter(
-        0.0, 'how wrong the first guess of it may be, as a standard deviation; 0 for a fourth of '
-        'the trained range', '{unit}', 0.0, 1e9)
-
-
-@dataclass(frozen=True)
-class InputParameters(InputPlaces):
-    """What is tuned for an input."""
-
-    weight: float = parameter(
-        1.0, 'cost of its squared deviation from its steady value', '1/({unit})^2', 0.0, 1e12,
-        open_minimum=True)
-    min: float = signal_value(0.0, 'lowest command')
-    max: float = signal_value(0.0, 'highest command')
-    rate_limit: float = parameter(
-        0.0, 'fastest change of the command; 0 for any', '{unit}/s', 0.0, 1e9)
-    max_disturbance: float = parameter(
-        0.0, 'largest disturbance that is accepted, as a change of the input; 0 for any', '{unit}',
-        0.0, 1e9)
-    wander: float = parameter(
-        0.0, 'how far an unknown influence wanders in a minute, as a change of the input, for a '
-        'Kalman filter; 0 for what suits the model', '{unit}', 0.0, 1e9)
-    tolerance: float = parameter(
-        UNBOUNDED, 'how far the measured input may be from its command before the observer goes '
-        'by it, as at a limit of the actuator', '{unit}', 0.0, UNBOUNDED)
-    safe: float = signal_value(
-        0.0, 'what is safe whatever happened, commanded when nothing else can be; brought within '
-        'min and max')
+from koopman_ros.tuning import Tuning
+from koopman_ros.units import conversion, display_unit
 
 
 @dataclass(frozen=True)
 class ControllerParameters:
-    """Snapshot of the controller's parameters, in the units that people read."""
+    """Snapshot of the controller's parameters."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'plant that is shipped, whose model, topics and tuning are the defaults '
-        'here; any other name for none', read_only=True)
+        DEFAULT_SYSTEM, 'Name of a bundled plant, whose model, topics and tuning become the '
+        'defaults; any other name: no defaults.', read_only=True)
     model: str = parameter(
-        '', 'name of a shipped model, or path of a .safetensors model file')
+        '', 'Name of a bundled model, or path of a .safetensors model file.')
     states_measured: tuple[str, ...] = parameter(
-        ('',), 'measured signals with their units, e.g. level [m], which the model must have; its '
-        'other states are estimated; an empty name for all that it has', read_only=True)
+        ('',), 'Measured signals with their units, e.g. level [m], which the model must have; its '
+        'other states are estimated; an empty name: all states.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'inputs with their units, likewise', read_only=True)
-    controlled: tuple[str, ...] = parameter(
-        ('',), 'measured signals that have a set-point, at most as many as there are inputs; an '
-        'empty name for all', read_only=True)
+        ('',), 'Inputs with their units, likewise.', read_only=True)
     autostart: bool = parameter(
-        True, 'configure and activate itself at the start; false leaves that to a lifecycle '
-        'manager', read_only=True)
+        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        read_only=True)
     synchronisation_tolerance: float = parameter(
-        0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
+        0.0, 'Largest difference between the stamps of messages that are one measurement.', 's',
         0.0, 10.0, read_only=True)
-    setpoint_filter: float = parameter(
-        0.0, 'time constant with which the tracked set-point follows its ramp; 0 for none', 's',
-        0.0, 86400.0)
-    disturbance_bandwidth: float = parameter(
-        0.0, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
-        'noise through to the inputs; 0 switches the observer off', '1/s', 0.0, 1000.0)
-    estimator: str = parameter(
-        '', 'how states are estimated: extended_kalman_filter or unscented_kalman_filter, one of '
-        'which a state needs that is not measured; disturbance_observer; measured_state takes '
-        'measurements as they are; module:class is one of your own; empty for the one that suits',
-        code=True)
-    transfer_time: float = parameter(
-        0.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
-        'asks for', 's', 0.0, 86400.0)
-    levels: tuple[str, ...] = parameter(
-        ('sdre', 'linear'), 'laws, the best first: mpc plans ahead, within limits of the states; '
-        'sdre solves the Riccati equation; linear has one gain; pi asks nothing of the model; '
-        'module:class is one of your own', code=True)
-    law_deadline: float = parameter(
-        0.0, 'how long a law may take for a sample before the next one of the levels acts in its '
-        'place; 0 for any time', 's', 0.0, 3600.0)
-    compiled: bool = parameter(
-        False, 'let compiled functions answer in place of those in numpy, once they are there '
-        'after the first command; needs numba', read_only=True)
-    validity_margin: float = parameter(
-        0.1, 'how far outside the trained range laws act, in halves of its width, all but the '
-        'linear one; beyond, the linear law does', '', 0.0, 100.0)
-    linear_margin: float = parameter(
-        0.5, 'how far outside the trained range the linear law acts, in halves of its width; '
-        'beyond, the safe inputs are commanded', '', 0.0, 100.0)
-    hold_timeout: float = parameter(
-        60.0, 'how long the inputs are held without a usable measurement or law before they go to '
-        'their safe values', 's', 0.0, 86400.0)
-    recovery_time: float = parameter(
-        10.0, 'how long a better law must have been possible before it acts again', 's', 0.0,
-        86400.0)
+    tuning: Tuning = nested(Tuning)
     measurement_timeout: float = parameter(
-        10.0, 'plant time without a measurement whose stamp advances after which the inputs are '
-        'held and diagnostics turn to ERROR; 0 switches this off', 's', 0.0, 86400.0)
+        10.0, 'Plant time without a measurement whose stamp advances after which the inputs are '
+        'held and diagnostics turn to ERROR; 0: no timeout.', 's', 0.0, 86400.0)
     max_measurement_age: float = parameter(
-        5.0, 'age of a measurement at its arrival from which on diagnostics warn; 0 switches this '
-        'off', 's', 0.0, 86400.0)
-    frozen_timeout: float = parameter(
-        20.0, 'how long a measurement may stay bit-identical while the model moves by more '
-        'than half of its max_jump; 0 for ever', 's', 0.0, 86400.0)
-    max_gain: float = parameter(
-        1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '
-        'need a large one', '', 0.0, 1e9, open_minimum=True)
-    min_riccati_digits: float = parameter(
-        8.0, 'decimal digits to which a solution must fulfil its Riccati equation to be acted on',
-        '', 0.0, 15.0)
+        5.0, 'Age of a measurement at its arrival above which diagnostics warn; 0: no warning.',
+        's', 0.0, 86400.0)
     load_refused_model: bool = parameter(
-        False, 'load a model file although its training refused it')
+        False, 'Load a model file although its training rejected it.')
     model_check_factor: float = parameter(
-        2.0, 'how many times worse than the present model another one may predict what was '
-        'measured lately, and yet be put into the running loop; 0 for any', '', 0.0, 1e6,
+        2.0, 'A new model is rejected if its prediction error on recent measurements exceeds that '
+        'of the present model by more than this factor; 0: no check.', '', 0.0, 1e6,
         smallest=1.0)
     model_check_length: float = parameter(
-        600.0, 'how much of what was measured is kept for that', 's', 0.0, 86400.0,
+        600.0, 'Duration of the measurements that are kept for that check.', 's', 0.0, 86400.0,
         open_minimum=True)
-    states: Mapping[str, StateParameters] = per_signal(StateParameters)
-    estimated: Mapping[str, EstimatedParameters] = per_signal(EstimatedParameters)
-    inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
-
-    def settings(self, signals: Signals) -> Settings:
-        """
-        Return the tuning of the control step, in the units of the model.
-
-        What a model estimates that these are not the parameters of has their defaults.
-        """
-        def column(of: Mapping[str, Any], attribute: str,
-                   change: Callable[[float], float] = lambda value: value) -> Array:
-            return np.array([change(getattr(of[name], attribute)) for name in of])
-
-        states, inputs, own = self.states, self.inputs, signals.inputs
-        controlled = {name: states[name] for name in signals.controlled}
-        every = {name: states.get(name) or self.estimated.get(name, EstimatedParameters())
-                 for name in signals.every}
-        lower, upper = (in_own_units(every, end, signals.every) for end in ('min', 'max'))
-        for i, (name, unit) in enumerate(signals.every.items()):
-            lower[i] = lower[i] if every[name].min > lowest(display_unit(unit)) else -math.inf
-            upper[i] = upper[i] if every[name].max < UNBOUNDED else math.inf
-        limited = bool(np.any(np.isfinite([lower, upper])))
-        return Settings(
-            controlled=() if tuple(every) == signals.controlled else signals.controlled,
-            state_weight=column(every, 'weight'),
-            input_weight=column(inputs, 'weight'),
-            limits=InputLimits(in_own_units(inputs, 'min', own), in_own_units(inputs, 'max', own),
-                               column(inputs, 'rate_limit', _or_any)),
-            setpoint_ramp=column(controlled, 'setpoint_ramp', _or_any),
-            setpoint_filter=self.setpoint_filter,
-            observer_bandwidth=self.disturbance_bandwidth,
-            estimator=self.estimator,
-            noise=column(states, 'noise'),
-            wander=column(inputs, 'wander') / math.sqrt(SECONDS_PER_MINUTE),
-            initial_error=np.array([getattr(of, 'initial_error', 0.0) for of in every.values()]),
-            max_disturbance=column(inputs, 'max_disturbance', _or_any),
-            input_tolerance=column(inputs, 'tolerance'),
-            transfer_time=self.transfer_time,
-            safe_input=in_own_units(inputs, 'safe', own),
-            state_lower=lower if limited else np.zeros(0),
-            state_upper=upper if limited else np.zeros(0),
-            pi_gain=np.array([getattr(of, 'pi_gain', 0.0) for of in every.values()]),
-            pi_time=np.array([getattr(of, 'pi_time', np.inf) for of in every.values()]),
-            deadline=_or_any(self.law_deadline),
-            max_gain=self.max_gain,
-            max_residual=10.0 ** -self.min_riccati_digits,
-            sensor=SensorLimits(
-                lower=in_own_units(states, 'sensor_min', signals.states),
-                upper=in_own_units(states, 'sensor_max', signals.states),
-                rate=column(states, 'max_rate', _or_any),
-                jump=column(states, 'max_jump', _or_any),
-                frozen_timeout=_or_any(self.frozen_timeout)),
-            supervisor=SupervisorSettings(
-                tuple(LevelSettings(law, self.linear_margin if law in ('linear', 'pi')
-                                    else self.validity_margin) for law in self.levels),
-                self.hold_timeout, self.recovery_time))
+    states: Mapping[str, StatePlaces] = per_signal(StatePlaces, 'measured')
+    inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    #: names of all states that the tuning is for
+    every_state: Mapping[str, NoParameters] = per_signal(NoParameters, 'states')
 
 
 def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
     """
-    Return the controller with a model, whatever that has beside the measured signals.
+    Return the controller with a model, whatever states that has beside the measured ones.
 
     :raises ValueError: where the estimator cannot do with what is measured.
     """
-    own = signals_of(model, parameters.controlled, parameters.states)
-    return Controller(model, parameters.settings(own), Outputs(
+    own = signals_of(model, parameters.tuning.controlled, parameters.states)
+    tuning = of_other_states(parameters.tuning, tuple(parameters.every_state), model.states.names)
+    return Controller(model, replace(tuning, controlled=own.controlled), Outputs(
         tuple(own.states), tuple(own.states.values()),
         np.eye(model.n_x)[[model.states.names.index(name) for name in own.states]]))
 
 
-def _or_any(bound: float) -> float:
-    """Return a bound, of which 0 stands for none."""
-    return bound or math.inf
-
-
 def _cross_check(signals: Signals, values: ControllerParameters) -> str:
-    if values.validity_margin > values.linear_margin:
-        return (f'validity_margin = {values.validity_margin} must be at most linear_margin = '
-                f'{values.linear_margin}: change the other one first')
-    for law in values.levels:
-        try:
-            plug(law, 'law', LAWS)
-        except ValueError as error:
-            return f'levels = {list(values.levels)}: {error}'
+    tuning = values.tuning
+    if tuning.validity_margin > tuning.linear_margin:
+        return (f'validity_margin = {tuning.validity_margin} must be at most linear_margin = '
+                f'{tuning.linear_margin}: change the other one first')
     try:
-        plug(values.estimator or 'measured_state', 'estimator', ESTIMATORS)
+        for law in tuning.levels:
+            plug_class(law, 'law', LAWS, Law)
     except ValueError as error:
-        return f'estimator = {values.estimator!r}: {error}'
+        return f'levels = {list(tuning.levels)}: {error}'
+    try:
+        plug_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
+    except ValueError as error:
+        return f'estimator = {tuning.estimator!r}: {error}'
     return Wiring(signals, values.states, values.inputs).check()
+
+
+def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
+    """Return the parameter dataclasses of known plug-ins, and of those that values name."""
+    laws, estimator = given.get('levels', ()), given.get('estimator', '')
+    found: dict[str, type[Any]] = {}
+    for kind, known, base, named in (('law', LAWS, Law, laws),
+                                     ('estimator', ESTIMATORS, Estimator, (estimator,))):
+        for name in dict.fromkeys((*known, *filter(None, named))):
+            # what is no plug-in, the check of the parameters refuses
+            with contextlib.suppress(ValueError):
+                found[short_name(name)] = plug_class(name, kind, known, base).Parameters
+    return found
 
 
 def _dynamics(model: LiftedModel) -> dict[str, Any]:
@@ -314,10 +140,10 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     """
     Return the parameters of a controller with a model.
 
-    Its training box, scaling and time constants are the defaults, unless the preset of a plant
+    Its trained range, scaling and time constants are the defaults, unless the preset of a plant
     says otherwise.
 
-    :param given: what is known of the values already, of which system and signals count.
+    :param given: values that are known already, of which system, signals and plug-ins count.
     :raises ConfigurationError: for signals, given or of a preset, that the model has not.
     """
     system = system_of(given)
@@ -348,8 +174,10 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),
         (('min', 'max'), ('sensor_min', 'sensor_max')),
-        signals={'states': signals.states, 'estimated': signals.estimated,
+        signals={'states': signals.every, 'measured': signals.states,
+                 'controlled': {name: signals.states[name] for name in signals.controlled},
                  'inputs': signals.inputs},
+        plugins=_plugin_parameters({**own, **given}),
         defaults={**defaults, **own, 'system': system})
 
 

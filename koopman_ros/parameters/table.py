@@ -4,12 +4,12 @@
 """
 Parameter tables: one frozen dataclass a node gives declarations, checks, snapshot and YAML.
 
-A field made by :func:`per_signal` holds one further dataclass for each of some signals, whose
-rows are named after the signal: ``temperature.weight``.
+Rows of signals are named after the signal, ``temperature.weight``, and those of plug-ins after the
+plug-in, ``pi.temperature.gain``. See :mod:`koopman_ros.declaration`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, Field, field, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, Field, fields, replace
 import json
 import math
 import re
@@ -19,8 +19,19 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.declaration import (
+    Column,
+    group,
+    parameter,
+    per_signal,
+    signal_value,
+    UNBOUNDED,
+)
 from koopman_ros.plugs import contained
 from koopman_ros.units import conversion, display_unit, ZERO_CELSIUS
+
+__all__ = ['UNBOUNDED', 'ConfigurationError', 'ParameterTable', 'Specification', 'as_yaml',
+           'group', 'in_own_units', 'lowest', 'parameter', 'per_signal', 'signal_value']
 
 T = TypeVar('T')
 
@@ -32,10 +43,6 @@ _TYPE_WORDS = {
     tuple: ('a list of strings', '[a, b]'),
 }
 _NUMBERS = ('a list of doubles', '[1.0, 2.0]')
-
-
-#: what stands for no bound, in any unit
-UNBOUNDED = 1e9
 
 
 class ConfigurationError(ValueError):
@@ -101,40 +108,14 @@ class Specification:
         return f'{self.name} = {value!r} must be {word}, e.g. {example}'
 
 
-def parameter(default: Any, description: str, unit: str = '', minimum: float = -math.inf,
-              maximum: float = math.inf, **details: Any) -> Any:
-    """Declare a field of a parameter dataclass; the arguments are those of a specification."""
-    return field(default=default, metadata={
-        'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
-        **details})
-
-
-def signal_value(default: float, description: str, **details: Any) -> Any:
-    """Declare a value of a signal, in the unit in which people read it, that may be any."""
-    return parameter(default, description, '{shown}', -UNBOUNDED, UNBOUNDED, **details)
-
-
-def per_signal(kind: type[Any]) -> Any:
-    """
-    Declare a field with one `kind`, a parameter dataclass, for each of some signals.
-
-    ``{unit}`` in its units stands for that of a difference of the signal, ``{shown}`` for that of
-    its values, as people read them.
-    """
-    return field(default_factory=dict, metadata={'per_signal': kind})
-
-
-def group() -> Any:
-    """Declare a field with numbers by name, whose rows ``field.name`` the table is given."""
-    return field(default_factory=dict, metadata={'group': True})
-
-
 class ParameterTable(Generic[T]):
     """
     The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
 
-    :param signals: names and units of the signals, by field made with :func:`per_signal`.
+    :param signals: names and units of the signals, by field made with :func:`per_signal`, or by
+        what a column is declared for.
     :param groups: rows by field made with :func:`group`.
+    :param plugins: parameter dataclasses by the name of the plug-in.
     :param defaults: values, by name, in place of those of the dataclass; foreign ones are ignored.
     :param ordered: names of which the first must be below the second, the same for each signal.
     :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
@@ -147,55 +128,114 @@ class ParameterTable(Generic[T]):
                  ordered: tuple[tuple[str, str], ...] = (), *,
                  signals: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
                  groups: Mapping[str, Sequence[Specification]] = MappingProxyType({}),
+                 plugins: Mapping[str, type[Any]] = MappingProxyType({}),
                  defaults: Mapping[str, Any] = MappingProxyType({})) -> None:
         self.kind = kind
         self.ordered = ordered
         self.cross_check = cross_check
         self.build = build
         self.signals = signals
-        self.rows: dict[str, Specification] = {}
-        self._groups = {name: tuple(row.name for row in rows) for name, rows in groups.items()}
-        for item in fields(kind):  # type: ignore[arg-type]
-            inner = item.metadata.get('per_signal')
-            if 'group' in item.metadata:
-                self.rows |= {f'{item.name}.{row.name}': replace(
-                    row, name=f'{item.name}.{row.name}') for row in groups[item.name]}
-                continue
-            for name, row, unit in [(item.name, item, '')] if inner is None else [
-                    (f'{signal}.{row.name}', row, unit)
-                    for signal, unit in signals.get(item.name, {}).items()
-                    for row in fields(inner)]:
-                self.rows[name] = _row(name, row, unit, defaults)
+        self._groups = groups
+        self._plugins = plugins
+        rows = dict(self._declared(kind, '', defaults))
+        # a file begins with what is not of a signal or a plug-in
+        self.rows: dict[str, Specification] = dict(sorted(
+            rows.items(), key=lambda row: (row[0].count('.'), self._first(row[0]))))
+
+    def _first(self, name: str) -> int:
+        """Return the place of a row's signal or plug-in."""
+        prefixes = [*(one for names in self.signals.values() for one in names), *self._plugins]
+        prefix = name.partition('.')[0]
+        return prefixes.index(prefix) if prefix in prefixes else len(prefixes)
+
+    def _declared(self, kind: type[Any], prefix: str, defaults: Mapping[str, Any]
+                  ) -> Iterator[tuple[str, Specification]]:
+        for item in fields(kind):
+            how = item.metadata
+            if 'nested' in how:
+                yield from self._declared(how['nested'], prefix, defaults)
+            elif 'plugins' in how:
+                for name, own in self._plugins.items():
+                    yield from self._declared(own, f'{name}.', defaults)
+            elif 'group' in how:
+                for row in self._groups[item.name]:
+                    name = f'{item.name}.{row.name}'
+                    yield name, replace(row, name=name)
+            elif 'per_signal' in how:
+                for signal, unit in self._of(item).items():
+                    for row in fields(how['per_signal']):
+                        name = f'{prefix}{signal}.{row.name}'
+                        yield name, _row(name, row, unit, defaults)
+            elif 'column' in how:
+                for signal, unit in self._of(item).items():
+                    name = f'{prefix}{signal}.{_name(item)}'
+                    yield name, _row(name, item, unit, defaults)
+            else:
+                yield prefix + item.name, _row(prefix + item.name, item, '', defaults)
+
+    def _of(self, item: Field[Any]) -> Mapping[str, str]:
+        """Return names and units of the signals of a field."""
+        column = item.metadata.get('column')
+        name = column.signals if column is not None else item.metadata['signals'] or item.name
+        return self.signals.get(name, {})
 
     def snapshot(self, values: Mapping[str, Any]) -> T:
         """Return the snapshot of values by name; those that are not given are the defaults."""
-        given = {name: values.get(name, row.default) for name, row in self.rows.items()}
+        made: T = self._made(self.kind, '', {
+            name: values.get(name, row.default) for name, row in self.rows.items()})
+        return made
+
+    def _made(self, kind: type[Any], prefix: str, given: Mapping[str, Any]) -> Any:
         parts: dict[str, Any] = {}
-        for item in fields(self.kind):  # type: ignore[arg-type]
-            inner = item.metadata.get('per_signal')
-            if item.name in self._groups:
-                parts[item.name] = MappingProxyType({
-                    name: given[f'{item.name}.{name}'] for name in self._groups[item.name]})
-                continue
-            parts[item.name] = given[item.name] if inner is None else MappingProxyType({
-                signal: inner(**{row.name: given[f'{signal}.{row.name}']
-                                 for row in fields(inner)})
-                for signal in self.signals.get(item.name, {})})
-        return self.kind(**parts)
+        for item in fields(kind):
+            how, name = item.metadata, item.name
+            if 'nested' in how:
+                parts[name] = self._made(how['nested'], prefix, given)
+            elif 'plugins' in how:
+                parts[name] = MappingProxyType({
+                    plugin: self._made(own, f'{plugin}.', given)
+                    for plugin, own in self._plugins.items()})
+            elif 'group' in how:
+                parts[name] = MappingProxyType({
+                    row.name: given[f'{name}.{row.name}'] for row in self._groups[name]})
+            elif 'per_signal' in how:
+                inner = how['per_signal']
+                parts[name] = MappingProxyType({
+                    signal: inner(**{row.name: given[f'{prefix}{signal}.{row.name}']
+                                     for row in fields(inner)}) for signal in self._of(item)})
+            elif 'column' in how:
+                parts[name] = np.array([
+                    _in_code(item, given[f'{prefix}{signal}.{_name(item)}'], unit)
+                    for signal, unit in self._of(item).items()])
+            else:
+                parts[name] = given[prefix + name]
+        return kind(**parts)
 
     def values(self, snapshot: T) -> dict[str, Any]:
         """Return the values of a snapshot by name."""
-        flat: dict[str, Any] = {}
-        for item in fields(self.kind):  # type: ignore[arg-type]
-            value = getattr(snapshot, item.name)
-            if item.name in self._groups:
-                flat |= {f'{item.name}.{name}': number for name, number in value.items()}
-            elif 'per_signal' in item.metadata:
-                flat |= {f'{signal}.{row.name}': getattr(part, row.name)
-                         for signal, part in value.items() for row in fields(part)}
+        found = dict(self._flat(snapshot, ''))
+        return {name: found[name] for name in self.rows}
+
+    def _flat(self, part: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        for item in fields(part):
+            how, name, value = item.metadata, item.name, getattr(part, item.name)
+            if 'nested' in how:
+                yield from self._flat(value, prefix)
+            elif 'plugins' in how:
+                for plugin, own in value.items():
+                    yield from self._flat(own, f'{plugin}.')
+            elif 'group' in how:
+                yield from ((f'{name}.{row}', number) for row, number in value.items())
+            elif 'per_signal' in how:
+                for signal, of in value.items():
+                    yield from ((f'{prefix}{signal}.{row.name}', getattr(of, row.name))
+                                for row in fields(of))
+            elif 'column' in how:
+                for (signal, unit), number in zip(
+                        self._of(item).items(), value.tolist(), strict=True):
+                    yield f'{prefix}{signal}.{_name(item)}', _as_shown(item, number, unit)
             else:
-                flat[item.name] = value
-        return flat
+                yield prefix + name, value
 
     def amended(self, snapshot: T, **values: Any) -> T:
         """Return a snapshot with other values of some names."""
@@ -219,9 +259,9 @@ class ParameterTable(Generic[T]):
             snapshot, self.snapshot({}) if before is None else before)
 
     def _ordered_rows(self) -> list[tuple[str, str]]:
-        prefixes = ['', *(f'{name}.' for names in self.signals.values() for name in names)]
-        return [(prefix + low, prefix + high) for low, high in self.ordered
-                for prefix in prefixes if prefix + low in self.rows]
+        pairs = [(name, name.removesuffix(low) + high) for low, high in self.ordered
+                 for name in self.rows if name == low or name.endswith(f'.{low}')]
+        return [(low, high) for low, high in pairs if high in self.rows]
 
     def _unusable(self, snapshot: T, before: T) -> str:
         """Return why nothing can be built from values that fit each for itself, or ''."""
@@ -267,15 +307,49 @@ def in_own_units(tuned: Mapping[str, Any], attribute: str, units: Mapping[str, s
 
 
 def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) -> Specification:
-    own = item.metadata['unit'].replace('({unit})', unit if unit.isalpha() else f'({unit})')
+    details = dict(item.metadata)
+    column: Column | None = details.pop('column', None)
+    own = details.pop('unit').replace('({unit})', unit if unit.isalpha() else f'({unit})')
     own = own.replace('{unit}', unit).replace('{shown}', display_unit(unit))
-    default = defaults.get(name, item.default)
-    if isinstance(item.default, (float, tuple)):
+    declared = item.default if column is None else column.default
+    default = defaults.get(name, declared)
+    if isinstance(declared, (float, tuple)):
         # a file may say 1 for 1.0, and has lists
-        default = type(item.default)(default)
-    row = Specification(name, default, **{**item.metadata, 'unit': own})
+        default = type(declared)(default)
+    row = Specification(name, default, own, **details)
     return replace(row, default=max(default, lowest(own)), minimum=max(
         row.minimum, lowest(own))) if own == 'degC' and math.isfinite(row.minimum) else row
+
+
+def _name(item: Field[Any]) -> str:
+    """Return the name of a column's rows."""
+    name: str = item.metadata['column'].name
+    return name or item.name
+
+
+def _in_code(item: Field[Any], shown: float, unit: str) -> float:
+    """Return a number of a column in the unit of the model, infinity for no bound."""
+    none, is_value = item.metadata['column'].none, item.metadata['unit'] == '{shown}'
+    if none is not None and shown == _shown_none(none[0], is_value, unit):
+        return float(none[1])
+    return conversion(display_unit(unit), unit)(shown) if is_value else shown
+
+
+def _as_shown(item: Field[Any], number: float, unit: str) -> float:
+    """Return a number of a column as people read it, the shortest that stands for it."""
+    none, is_value = item.metadata['column'].none, item.metadata['unit'] == '{shown}'
+    if none is not None and number == none[1]:
+        return _shown_none(none[0], is_value, unit)
+    if not is_value or unit == display_unit(unit):
+        return number
+    shown, back = (conversion(unit, display_unit(unit))(number),
+                   conversion(display_unit(unit), unit))
+    return next((short for short in (round(shown, digits) for digits in range(16))
+                 if back(short) == number), shown)
+
+
+def _shown_none(none: float, is_value: bool, unit: str) -> float:
+    return max(none, lowest(display_unit(unit))) if is_value and none < 0.0 else none
 
 
 def lowest(unit: str) -> float:

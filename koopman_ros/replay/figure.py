@@ -90,7 +90,7 @@ def _draw_commands(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
     controller = bag.found.controller
     name, unit = 'command', ''
     if controller is not None:
-        inputs, limits = controller.model.inputs, controller.settings.limits
+        inputs, limits = controller.model.inputs, controller.tuning.limits
         name, unit = inputs.names[i], inputs.units[i]
         low, high = shown(np.array([limits.lower[i], limits.upper[i]]), unit)
         draw_limits(axes, (high, low), 'limits')

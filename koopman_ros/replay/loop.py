@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Setpoint, State
 from koopman_ros.control.events import apply, Measurement, SetpointRequest
-from koopman_ros.kernels import IN_NUMPY, Kernels, named, NUMPY
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.replay import records
 
@@ -99,11 +98,6 @@ def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Bui
     return found
 
 
-def _kernels(record: records.Record) -> Kernels:
-    """Return the functions that answered, or those in numpy where there are none here."""
-    return named(record.fields.get(records.NUMERICS, IN_NUMPY)) or NUMPY
-
-
 class _Run:
     """A run of a controller on its way through the replay."""
 
@@ -117,7 +111,6 @@ class _Run:
         self._state: State | None = None  # None while it is not known
         self._other_state = State()
         self._parameters: dict[str, Any] = {}
-        self._kernels = NUMPY
         self._controller: Controller
         self._other_controller: Controller
 
@@ -137,8 +130,6 @@ class _Run:
                 self._begin(record)
         elif self._state is None:
             self._keep(record, None, None, None)
-        elif record.event == records.NUMERICS:
-            self._switch(record)
         elif record.event in (records.PARAMETERS, records.MODEL):
             self._exchange(record, self._state)
         else:
@@ -146,7 +137,6 @@ class _Run:
 
     def _begin(self, record: records.Record) -> None:
         self._parameters = dict(record.fields['parameters'])
-        self._kernels = _kernels(record)
         model = self._model(record)
         self._controller = self._build(self._parameters, model)
         self._found.controller, self._found.parameters = self._controller, self._parameters
@@ -156,13 +146,6 @@ class _Run:
             self._other_controller = self._tuned(
                 self._controller.model if same else self._other.model)
             self._other_state = self._other_controller.hand_over(self._controller, self._state)
-
-    def _switch(self, record: records.Record) -> None:
-        """Put other functions for the same numbers in force."""
-        self._kernels = _kernels(record)
-        self._controller = self._build(self._parameters, replace(
-            self._controller.model, kernels=self._kernels))
-        self._found.controller = self._controller
 
     def _exchange(self, record: records.Record, state: State) -> None:
         """Put other parameters or another model in force."""
@@ -208,7 +191,7 @@ class _Run:
         name, digest = record.fields['model']['name'], record.fields['model']['digest']
         if name not in self._found.models:
             self._found.models.append(name)
-        return replace(self._find_model(name, digest), kernels=self._kernels)
+        return self._find_model(name, digest)
 
     def _tuned(self, model: LiftedModel) -> Controller:
         assert self._other is not None

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from koopman_ros import __version__
 from koopman_ros.control import events, Mode, State
-from koopman_ros.kernels import IN_NUMPY
 from koopman_ros.reasons import Code, Reason
 
 VERSION = 1
@@ -40,8 +39,6 @@ _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
 START, SNAPSHOT = 'start', 'snapshot'
 # Names of those by which it is exchanged for one with other parameters or another model.
 PARAMETERS, MODEL = 'parameters', 'model'
-# Name of those by which compiled functions take the place of those in numpy, and their field.
-NUMERICS = 'numerics'
 _TAG = '@'
 
 
@@ -122,11 +119,11 @@ def event_of(record: Record) -> events.Event:
     return kind(**read)
 
 
-def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str],
-             numerics: str = IN_NUMPY) -> dict[str, Any]:
+def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
+             ) -> dict[str, Any]:
     """Return the fields of a snapshot; a model is its `name` and the SHA-256 of its file."""
     return {'package': __version__, 'model': dict(model), 'parameters': dict(parameters),
-            NUMERICS: numerics, 'state': encoded(state)}
+            'state': encoded(state)}
 
 
 def state_of(record: Record) -> State:

@@ -33,7 +33,6 @@ from koopman_ros.ros.node import Level, Status, words_of
 from koopman_ros.ros.watchdog import PAUSED, Timing
 from koopman_ros.time_base import Advance
 from koopman_ros.units import display_unit, NANOSECONDS, shown
-from koopman_ros.values import record
 from koopman_ros.wire import stem
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
@@ -63,7 +62,7 @@ class Counts:
     setpoint_received: bool = False
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Situation:
     """All that a status tells of."""
 
@@ -178,7 +177,7 @@ def _control(now: Situation) -> tuple[Level, str]:
         return Level.ERROR, f'{mode.value}: {now.reason}'
     if mode is Mode.AUTOMATIC and report.depth > 0:
         level = Level.ERROR if report.level in _ACTIONS else Level.WARN
-        action = _WAY_BACK.format(now.input) if report.command.way_back else _action(now)
+        action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
         return level, f'{action}: {now.reason}'
     return Level.OK, ''
 
@@ -203,7 +202,7 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     interval = 0.0 if math.isinf(now.state.interval) else now.state.interval
     overdue = max(_PATIENCE, 3.0 * interval)
     # manual commands are also sent between two measurements
-    unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.way_back
+    unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.recovery
                   and now.timing.silence > max(1.0, 2.0 * interval))
     if report.measurement.arrival is Arrival.REPEATED or (
             now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
@@ -252,7 +251,7 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     """Say that the inputs do not suffice for the set-point as things are, or return ''."""
     if target.state is None or target.input is None:
         return ''
-    states, limits = now.controller.model.states, now.controller.settings.limits
+    states, limits = now.controller.model.states, now.controller.tuning.limits
     # where every state has a set-point, that is where it leads
     for name, wanted in () if target.state is target.setpoint else zip(
             now.signals.controlled, target.setpoint.tolist(), strict=True):

@@ -159,8 +159,7 @@ def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model without a law where the plant is or shall go."""
     controller, asked = situation.controller(model), situation.state.setpoint
-    margin = {level.law: level.margin for level in controller.settings.supervisor.levels}[
-        controller.usable.name]
+    margin = controller.usable.law.margin
     for setpoint in [value for value in (asked.active, asked.requested)
                      if value is not None and np.isfinite(value).all()] or [
                          controller.controlled.center]:

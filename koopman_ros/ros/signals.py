@@ -4,6 +4,7 @@
 """Messages to the numbers of signals and back, once, at the boundary."""
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 import inspect
 import math
@@ -19,11 +20,10 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.units import Conversion, conversion, in_steps
-from koopman_ros.values import record
 from koopman_ros.wire import Place
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Heard:
     """What a message says of some signals."""
 

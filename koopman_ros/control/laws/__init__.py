@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Laws behind one protocol, by the names under which settings choose them."""
+"""Control laws, by the names under which a tuning chooses them."""
 
-from collections.abc import Callable
-
-from koopman_ros.control.laws.base import Figures, Law, LawResult, Plan, Tuning, Weights
+from koopman_ros.control.laws.base import Law, LawResult, Weights
 from koopman_ros.control.laws.pi import ProportionalIntegral
 from koopman_ros.control.laws.riccati import (
     averaged,
@@ -16,12 +14,11 @@ from koopman_ros.control.laws.riccati import (
     recentred,
     StateDependentRiccati,
 )
-from koopman_ros.lifting import LiftedModel
 
-LAWS: dict[str, Callable[[LiftedModel, Tuning], Law] | str] = {
+#: by name; what is a text is imported when it is used
+LAWS: dict[str, type[Law] | str] = {
     'mpc': 'koopman_ros.control.laws.receding_horizon:RecedingHorizon',
     'sdre': StateDependentRiccati, 'linear': Linear, 'pi': ProportionalIntegral}
 
-__all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',
-           'Plan', 'ProportionalIntegral', 'StateDependentRiccati', 'Tuning', 'Weights',
-           'averaged', 'feedback', 'recentred']
+__all__ = ['LAWS', 'Feedback', 'Form', 'Law', 'LawResult', 'Linear', 'ProportionalIntegral',
+           'StateDependentRiccati', 'Weights', 'averaged', 'feedback', 'recentred']

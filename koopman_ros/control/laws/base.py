@@ -1,24 +1,28 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a law is: a plug that turns an estimate and a target into an input."""
+"""Control laws: the contract of a plug-in, its target and its result."""
 
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
 import math
-from typing import Protocol, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, frozen
-from koopman_ros.control.limits import InputLimits
+from koopman_ros.declaration import NoParameters
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Reason
-from koopman_ros.values import record
+from koopman_ros.tuning import Tuning
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Target:
     """A set-point with the input that holds it, in scaled deviations."""
 
@@ -30,8 +34,7 @@ class Target:
     residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
-def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None, *,
-                        known: Target | None = None) -> Target:
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
     """
     Solve f(x_ref) + B(x_ref) u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
@@ -40,18 +43,12 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
     :param x_ref: (n_x,) scaled deviation.
     :param w: (n_x,) disturbance of the state's rate, none by default.
-    :param known: a target of the same model, which saves lift and drift where x_ref is the same.
     """
-    if known is not None and (known.x is x_ref or known.x.tolist() == x_ref.tolist()):
-        x_ref, z, drift = known.x, known.z, known.drift
-    else:
-        z, drift = model.lift(x_ref), model.drift(x_ref)
+    z, drift = model.lift(x_ref), model.drift(x_ref)
     w = np.zeros(model.n_x) if w is None else w
-    load = drift + w
-    u = -model.input_inverse(x_ref).dot(load)
-    forcing = model.forcing(x_ref, u)
-    rest = load + forcing
-    return Target(x_ref, z, drift, u, forcing + w, math.sqrt(rest.dot(rest)))
+    u = -model.input_inverse(x_ref).dot(drift + w)
+    forcing = model.forcing(x_ref, u) + w
+    return Target(x_ref, z, drift, u, forcing, float(np.linalg.norm(drift + forcing)))
 
 
 @dataclass(frozen=True)
@@ -101,27 +98,8 @@ class Weights:
                 ('state', states, model.states), ('input', inputs, model.inputs))))
 
 
-@dataclass(frozen=True)
-class Tuning:
-    """What every law is built from, beside its model."""
-
-    weights: Weights  #: the cost
-    max_gain: float = 1e6  #: bound on the spectral norm of a gain in scaled coordinates
-    max_residual: float = 1e-8  #: bound on the relative residual of a Riccati equation
-    #: (n_x,) lowest states, to `state_upper` (n_x,), that a law with a horizon plans for, in
-    #: scaled deviations; infinity and nothing for none
-    state_lower: Array = field(default_factory=lambda: np.zeros(0))
-    state_upper: Array = field(default_factory=lambda: np.zeros(0))
-    #: distance outside the training data, in half widths of their box, up to which it plans
-    margin: float = math.inf
-    #: (n_x,) of a PI law, in units of the first input per unit of the first state with one, and so
-    #: on; 0 for states that it does not control, empty for none
-    pi_gain: Array = field(default_factory=lambda: np.zeros(0))
-    pi_time: Array = field(default_factory=lambda: np.zeros(0))  #: (n_x,) its integral times in s
-
-
-@record
-class Figures:
+@dataclass(frozen=True, slots=True)
+class SolutionInfo:
     """What a law says of its solution; NaN and '' for what it does not have."""
 
     form: str = ''  #: which form of the law was used, for the operator
@@ -131,10 +109,10 @@ class Figures:
     growth: float = math.nan
 
 
-NO_FIGURES = Figures()
+NO_SOLUTION = SolutionInfo()
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Plan:
     """
     What a law with a horizon expects, in units of states and inputs, and which limits it meets.
@@ -150,13 +128,14 @@ class Plan:
     at_state: Array  #: (n_x,) whether a node is at a limit of the state, or beyond
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class LawResult:
     """What a law gives, or why it gives nothing."""
 
-    u: Array | None  #: (n_u,) in input units, within the range of the limits; None with a failure
+    #: (n_u,) in input units, which the controller brings within the limits; None with a failure
+    u: Array | None
     failure: Reason | None = None  #: why it may not be used; None when it may
-    figures: Figures = NO_FIGURES  #: of the solution, as far as there is one
+    info: SolutionInfo = NO_SOLUTION  #: about the solution, as far as there is one
     memory: object = None  #: what the law wants to be given at the next sample
     plan: Plan | None = None  #: of a law with a horizon
     clipped: bool = False  #: whether the range cut it
@@ -164,30 +143,74 @@ class LawResult:
     passing: bool = False
 
 
-class Law(Protocol):
+class Law(ABC):
     """
-    A control law on a model; pure, what it remembers goes out and comes in.
+    A control law on a model: from an estimate and a target to an input.
 
-    To add one: write a class like :class:`~koopman_ros.control.laws.riccati.Linear` in any module,
-    whose constructor takes the lift and a :class:`Tuning`, and name it in the levels of the
-    settings as module:class.
+    To add one, derive a class in any module and name it in `levels` as ``module:Class``. It is
+    constructed when the controller is configured, and then called once a sample. What it has to
+    remember it returns as `memory` and is given at the next sample; it keeps nothing itself, so
+    that a replay finds the same commands. An exception is a failure: the next level acts.
+
+    Example::
+
+        @dataclass(frozen=True)
+        class Gain:
+            gain: float = parameter(2.0, 'Proportional gain.', '', 0.0, 100.0)
+
+        class Proportional(Law):
+            Parameters = Gain
+
+            def compute(self, estimate, target, memory, interval, previous):
+                u = target.u - self.parameters.gain * (estimate.x - target.x)
+                return LawResult(self.model.inputs.to_physical(u))
+
+    It is tuned by the parameter ``Proportional.gain``.
     """
+
+    #: frozen dataclass of its own parameters, see :mod:`koopman_ros.declaration`
+    Parameters: ClassVar[type[Any]] = NoParameters
+    #: whether it tracks the set-point without the model's steady state
+    model_free: ClassVar[bool] = False
+    #: whether it acts up to `linear_margin`, in place of `validity_margin`
+    extrapolates: ClassVar[bool] = False
+
+    def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
+        """
+        Prepare the law; a ValueError refuses the configuration.
+
+        :param model: the lift.
+        :param tuning: with one number for each signal of the model.
+        :param parameters: its own, of the class :attr:`Parameters`.
+        """
+        #: model in whose scaled deviations estimates and targets are given
+        self.model = model
+        self.tuning = tuning
+        self.parameters = parameters
+
+    @cached_property
+    def weights(self) -> Weights:
+        """The cost on scaled deviations."""
+        return Weights.physical(self.model, self.tuning.state_weight, self.tuning.input_weight)
 
     @property
-    def model(self) -> LiftedModel:
-        """The model in whose terms estimate and target are, in the units of the lift."""
+    def margin(self) -> float:
+        """The distance outside the training data, in half-ranges, up to which it acts."""
+        return self.tuning.linear_margin if self.extrapolates else self.tuning.validity_margin
 
-    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf, last: Array | None = None
-                ) -> LawResult:
+    def unusable(self) -> Reason | None:
+        """Return why it can never act, as for a missing package; None where it can."""
+        return None
+
+    @abstractmethod
+    def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                previous: Array | None) -> LawResult:
         """
         Find the input for an estimate.
 
-        :param estimate: in terms of :attr:`model`, as the target.
-        :param limits: of the inputs; the command is brought within them afterwards anyhow.
-        :param memory: of the result before, None at first and after another law.
+        :param estimate: in scaled deviations of :attr:`model`, as the target.
+        :param memory: of its result before; None at first and after another law.
         :param interval: seconds between samples; 0 when they are not known.
-        :param deadline: seconds that it may take; a law that iterates returns its best by then.
-        :param last: (n_u,) the command before, in input units, as far as it was the law's; None
-            at first.
+        :param previous: (n_u,) the command before, in input units, as far as it was the law's;
+            None at first.
         """

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, frozen
-from koopman_ros.values import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class _Shift:
     """Where the inputs and nodes of a plan come from in the one before."""
 

@@ -1,26 +1,36 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Proportional-integral control, which asks nothing of a model but the names of its signals."""
+"""Proportional-integral control, which needs only the names of a model's signals."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-import math
+from typing import Any, ClassVar
 
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws.base import Figures, LawResult, Target, Tuning
-from koopman_ros.control.limits import finite, InputLimits
+from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
+from koopman_ros.declaration import column, UNBOUNDED
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.tuning import Tuning
 
 
 @dataclass(frozen=True)
-class ProportionalIntegral:
+class PIParameters:
+    """Gains and integral times; the first state with a gain moves the first input, and so on."""
+
+    gain: Array = column(
+        'states', 0.0, 'Change of the command per error; the first signal with a gain moves the '
+        'first input, and so on; 0: not controlled.', 'of input/({unit})', -UNBOUNDED)
+    integral_time: Array = column(
+        'states', 60.0, 'Integral time.', 's', maximum=86400.0, open_minimum=True)
+
+
+class ProportionalIntegral(Law):
     """
     A PI law for each state with a gain; the first of them moves the first input, and so on.
 
@@ -31,42 +41,31 @@ class ProportionalIntegral:
     :raises ValueError: for more gains than inputs.
     """
 
-    model: LiftedModel  #: whose signals they are
-    tuning: Tuning  #: gains and integral times
+    Parameters = PIParameters
+    model_free: ClassVar[bool] = True
+    extrapolates: ClassVar[bool] = True
+    parameters: PIParameters
 
-    #: it goes to the set-point, wherever a model has its steady states
-    model_free = True
+    def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
+        super().__init__(model, tuning, parameters)
+        self._states = np.flatnonzero(self.parameters.gain)
+        if len(self._states) > model.n_u:
+            names = ', '.join(model.states.names[i] for i in self._states)
+            raise ValueError(f'{model.n_u} inputs for the PI laws of {names}: set the gain to 0 '
+                             'for those that are not controlled')
 
-    def __post_init__(self) -> None:
-        if len(self._places) > self.model.n_u:
-            names = ', '.join(self.model.states.names[i] for i in self._places)
-            raise ValueError(f'{self.model.n_u} inputs for the PI laws of {names}: set pi_gain to '
-                             '0 for those that are not controlled')
-
-    @cached_property
-    def _places(self) -> list[int]:
-        return np.flatnonzero(self.tuning.pi_gain).tolist()
-
-    @property
     def unusable(self) -> Reason | None:
-        """Why it never gives an input: it has no gain."""
-        return None if self._places else reason(Code.NO_PI_GAIN)
+        """Return that there is no gain."""
+        return None if len(self._states) else reason(Code.NO_PI_GAIN)
 
-    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf, last: Array | None = None
-                ) -> LawResult:
+    def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                previous: Array | None) -> LawResult:
         """Move the inputs; see :class:`~koopman_ros.control.laws.base.Law`."""
-        if self.unusable is not None:
-            return LawResult(None, self.unusable)
-        places = self._places
-        gain, time = self.tuning.pi_gain[places], self.tuning.pi_time[places]
-        error = (target.x - estimate.x)[places] * self.model.states.scale[places]
+        states = self._states
+        gain, time = self.parameters.gain[states], self.parameters.integral_time[states]
+        error = (target.x - estimate.x)[states] * self.model.states.scale[states]
         before = memory if isinstance(memory, np.ndarray) and (
             memory.shape == error.shape) else error
-        u = self.model.inputs.center.copy() if last is None else last.copy()
-        u[:len(places)] += gain * (error - before + error * interval / time)
-        if not finite(u):
-            return LawResult(None, reason(Code.COMMAND_NOT_FINITE))
-        within = limits.within(u)
-        return LawResult(within, None, Figures('proportional-integral'), error,
-                         clipped=bool((within != u).any()))
+        u = self.model.inputs.center.copy() if previous is None else previous.copy()
+        u[:len(states)] += gain * (error - before + error * interval / time)
+        return LawResult(u, info=SolutionInfo('proportional-integral'), memory=error)

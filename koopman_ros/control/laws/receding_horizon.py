@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
+from koopman_ros.control.laws.base import Law, LawResult, Plan, SolutionInfo, Target
 from koopman_ros.control.laws.intervals import Intervals, Reach
-from koopman_ros.control.laws.riccati import feedback, regulator, StateDependentRiccati
+from koopman_ros.control.laws.riccati import feedback, StateDependentRiccati
 from koopman_ros.control.laws.shooting import Horizon, program, slope_at
-from koopman_ros.control.limits import finite, InputLimits
+from koopman_ros.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
 from koopman_ros.estimation import Estimate
-from koopman_ros.lapack import lapack
-from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.tuning import InputLimits
 
 PACKAGE = 'daqp'  # the solver of quadratic programs
 
@@ -52,7 +51,24 @@ _ASTRAY = 2.0
 
 
 @dataclass(frozen=True)
-class RecedingHorizon:
+class MPCParameters:
+    """Soft limits of the states, and the time limit of the solver."""
+
+    lower: Array = value_column(
+        'states', -UNBOUNDED, 'Soft lower limit of this state.', name='min', none=NO_LOWER)
+    upper: Array = value_column(
+        'states', UNBOUNDED, 'Soft upper limit of this state.', name='max', none=NO_UPPER)
+    time_limit: float = parameter(
+        0.0, 'Time that a plan may take, after which the next level acts; 0: any.', 's', 0.0,
+        3600.0)
+
+
+def finite(value: Array) -> bool:
+    """Return whether all numbers are finite."""
+    return bool(np.isfinite(value).all())
+
+
+class RecedingHorizon(Law):
     """
     Plan the inputs of a while ahead at each sample, and give the first.
 
@@ -67,8 +83,8 @@ class RecedingHorizon:
     in optimal feedback control", SIAM J. Control Optim. 43 (2005).
     """
 
-    model: LiftedModel  #: the lift
-    tuning: Tuning  #: weights and bounds
+    Parameters = MPCParameters
+    parameters: MPCParameters
 
     @cached_property
     def _solve(self) -> Any:
@@ -78,32 +94,31 @@ class RecedingHorizon:
         except ImportError:
             return None
 
-    @property
     def unusable(self) -> Reason | None:
-        """Why it never gives an input: its solver is not installed."""
+        """Return that its solver is not installed."""
         return None if self._solve is not None else reason(
             Code.PACKAGE_MISSING, package=PACKAGE)
 
     @cached_property
     def _riccati(self) -> StateDependentRiccati:
-        return StateDependentRiccati(self.model, self.tuning)
+        return StateDependentRiccati(self.model, self.tuning, None)
 
-    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf, last: Array | None = None
-                ) -> LawResult:
+    def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                previous: Array | None) -> LawResult:
         """
         Find the input for an estimate; see :class:`~koopman_ros.control.laws.base.Law`.
 
         At the first sample, of which nobody knows for how long its input will be held, it is that
         of the Riccati equation.
         """
-        if self.unusable is not None:
-            return LawResult(None, self.unusable)
+        if self._solve is None:
+            return LawResult(None, self.unusable())
         if not interval > 0.0:
-            return self._riccati.compute(estimate, target, limits, None, interval)
+            return self._riccati.compute(estimate, target, None, interval, previous)
+        limits, deadline = self.tuning.limits, self.parameters.time_limit or math.inf
         began = time.perf_counter()
         try:
-            problem = _Problem(self, estimate, target, limits, interval, last)
+            problem = _Problem(self, estimate, target, limits, interval, previous)
             u, x = problem.begin(memory)
             for iteration in range(1, _MOST_ITERATIONS + 1):
                 found = problem.improve(u, x)
@@ -123,18 +138,16 @@ class RecedingHorizon:
         # from outside, the way back is no reason
         here, *ahead = self.model.distances(np.concatenate((x[:-1:_LOOK], x[-1:]))).tolist()
         outside = max(ahead)
-        if outside > max(self.tuning.margin, here):
+        if outside > max(self.margin, here):
             return LawResult(None, reason(
-                Code.PLAN_OUTSIDE, outside=outside, margin=self.tuning.margin))
+                Code.PLAN_OUTSIDE, outside=outside, margin=self.margin))
         wanted = self.model.inputs.to_physical(u[0])
         if not finite(wanted):
             return LawResult(None, reason(Code.COMMAND_NOT_FINITE))
         within = limits.within(wanted)
-        clipped = any(min(value - lower, upper - value) <= _EDGE * scale
-                      for value, (lower, upper, _), scale in zip(
-                          within.tolist(), limits.each, self.model.inputs.scale.tolist(),
-                          strict=True))
-        return LawResult(within, None, Figures('planned'), (u, x, problem.intervals.lengths),
+        edge = _EDGE * self.model.inputs.scale
+        clipped = bool(np.any((within <= limits.lower + edge) | (within >= limits.upper - edge)))
+        return LawResult(within, None, SolutionInfo('planned'), (u, x, problem.intervals.lengths),
                          problem.plan(u, x), clipped=clipped)
 
     def lengths(self, interval: float) -> Array:
@@ -155,10 +168,10 @@ class RecedingHorizon:
     def _intervals(self) -> Any:
         @lru_cache(maxsize=8)
         def of(interval: float) -> Intervals:
-            A, weights = self._slope, self.tuning.weights
-            found = regulator(self.model, A, self.model.B, weights.Q, weights.R,
+            A, weights = self._slope, self.weights
+            found = solve_riccati(A, self.model.B, weights.Q, weights.R,
                               interval=interval, max_gain=self.tuning.max_gain,
-                              max_residual=self.tuning.max_residual)
+                              max_residual=self.tuning.max_riccati_residual)
             horizon = _INTERVALS * interval
             closed = np.linalg.eigvals(A - self.model.B @ found.K).real
             if found.status is RiccatiStatus.SOLVED and np.all(closed < 0.0):
@@ -190,18 +203,18 @@ class RecedingHorizon:
     def _at_target(self) -> Any:
         @lru_cache(maxsize=8)
         def of(state: bytes, interval: float, inputs: bytes) -> tuple[float, Array]:
-            model, tuning = self.model, self.tuning
+            model, tuning, weights = self.model, self.tuning, self.weights
             x = np.frombuffer(state)
             A = slope_at(model, x)
             fastest = _fastest(A)
             if inputs:
                 A = A + model.forcing_jacobian(x, np.frombuffer(inputs))
-            found = regulator(model, A, model.input_matrix(x), tuning.weights.Q,
-                              tuning.weights.R, interval=interval, max_gain=tuning.max_gain,
-                              max_residual=tuning.max_residual)
+            found = solve_riccati(A, model.input_matrix(x), weights.Q,
+                              weights.R, interval=interval, max_gain=tuning.max_gain,
+                              max_residual=tuning.max_riccati_residual)
             # where the regulator has none, the horizon alone counts
             return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
-                tuning.weights.Q * float(self.lengths(interval)[-1]))
+                weights.Q * float(self.lengths(interval)[-1]))
 
         return of
 
@@ -235,9 +248,8 @@ class RecedingHorizon:
     @cached_property
     def bounds(self) -> tuple[Array, Array, list[tuple[int, float, float]]]:
         """Lowest and highest states (n_x,), and both of each one that has any, by its place."""
-        lowest, highest = (bound if len(bound) else np.full(self.model.n_x, none)
-                           for bound, none in ((self.tuning.state_lower, -math.inf),
-                                               (self.tuning.state_upper, math.inf)))
+        lowest, highest = map(self.model.states.to_deviation, (
+            self.parameters.lower, self.parameters.upper))
         return lowest, highest, [
             (i, low, high) for i, (low, high) in enumerate(zip(
                 lowest.tolist(), highest.tolist(), strict=True))
@@ -248,10 +260,7 @@ def _fastest(slope: Array) -> float:
     """Return the rate of the fastest mode of a slope (n_x, n_x) of the drift."""
     if not finite(slope.ravel()):
         raise np.linalg.LinAlgError('the drift has no slope here')
-    real, imaginary, _, _, info = lapack.dgeev(slope, compute_vl=0, compute_vr=0)
-    if info != 0:
-        raise np.linalg.LinAlgError('the slope of the drift has no eigenvalues')
-    return max(map(math.hypot, real.tolist(), imaginary.tolist()))
+    return float(np.max(np.abs(np.linalg.eigvals(slope))))
 
 
 class _Problem:
@@ -259,7 +268,7 @@ class _Problem:
 
     def __init__(self, law: RecedingHorizon, estimate: Estimate, target: Target,
                  limits: InputLimits, interval: float, last: Array | None) -> None:
-        model, tuning = law.model, law.tuning
+        model = law.model
         self._law, self._model, self._target = law, model, target
         self._x, self._w = estimate.x, estimate.w
         self._sample = interval / model.seconds_per_time_unit
@@ -268,7 +277,7 @@ class _Problem:
         at_target, terminal = law.at_target(target, self._sample)
         rate = max(law.fastest, at_target, _fastest(slope_at(model, estimate.x)))
         self._steps = min(max(math.ceil(lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
-        weights = tuning.weights
+        weights = law.weights
         self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, lengths,
                                 self._steps, weights.Q, weights.R, terminal)
         self._last = None if last is None else model.inputs.to_deviation(last)
@@ -296,8 +305,8 @@ class _Problem:
             self._model, self._target, self._law.tuning, self._reach)
         x, last, inputs, nodes = self._x, self._last, [], [self._x]
         for length, change in zip(self.intervals.lengths.tolist(), reach.change, strict=True):
-            found = feedback(model, x, target, tuning.weights, interval=length,
-                             max_gain=tuning.max_gain, max_residual=tuning.max_residual)
+            found = feedback(model, x, target, self._law.weights, interval=length,
+                             max_gain=tuning.max_gain, max_residual=tuning.max_riccati_residual)
             u = found.u if found.solved and finite(found.u) else target.u
             u = np.minimum(np.maximum(u, reach.lower), reach.upper)
             if last is not None:

@@ -3,35 +3,33 @@
 
 """Laws by Riccati equations: state-dependent, re-centred and averaged, and the linear one."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property, lru_cache
+from functools import lru_cache
 import math
+from typing import Any, ClassVar
 
 import numpy as np
+from scipy.linalg import expm
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import (
-    Figures,
+    Law,
     LawResult,
+    SolutionInfo,
     steady_state_target,
     Target,
-    Tuning,
     Weights,
 )
-from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
-from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
-from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati, transition
-from koopman_ros.values import amended, record
+from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.tuning import Tuning
 
 # Largest mismatch of a closed lift: those of plants that have one come to 2e-7 or less, others to
 # 1e-4 or more, and from there on the averaged Jacobian costs less.
 _CLOSED = 1e-5
-_OVERFLOW = 709.0  # of an exponent, near what a float64 holds
 
 
 class Form(Enum):
@@ -41,7 +39,7 @@ class Form(Enum):
     AVERAGED = 'averaged'
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Feedback:
     """The outcome of one state-dependent Riccati solution."""
 
@@ -66,69 +64,19 @@ class Feedback:
         :param interval: between samples in the model's time unit; 0 when it is not known.
         :return: 1 and more, or NaN, when the loop is predicted not to be stable.
         """
-        if len(self.drift) == 1:
-            a, action = float(self.drift[0, 0]), float(self.action[0, 0])
-            if not interval > 0.0:
-                return float(np.exp(a + action))
-            if not a * interval < _OVERFLOW:
-                return math.nan if math.isnan(a) else math.inf
-            # expm1(a t) / a is the integral of exp(a s), also for a small a
-            held = interval if a == 0.0 else math.expm1(a * interval) / a
-            return abs(math.exp(a * interval) + held * action)
-        if not (np.all(np.isfinite(self.drift)) and np.all(np.isfinite(self.action))):
-            return np.nan
+        loop = self.drift + self.action
+        if not np.isfinite(loop).all():
+            return math.nan
         if not interval > 0.0:
-            return float(np.exp(np.max(np.linalg.eigvals(self.drift + self.action).real)))
-        n = len(self.drift)
-        step = transition(self.drift, self.action, interval)
-        closed = np.eye(n) + step[:, :n] + step[:, n:]
+            return float(np.exp(np.max(np.linalg.eigvals(loop).real)))
+        n = len(loop)
+        held = np.zeros((2 * n, 2 * n))
+        held[:n, :n], held[:n, n:] = self.drift, self.action
+        step = expm(interval * held)[:n]
+        closed = step[:, :n] + step[:, n:]
         if not np.isfinite(closed).all():
             return math.inf
         return float(np.max(np.abs(np.linalg.eigvals(closed))))
-
-
-@compilable
-def regulator(model: LiftedModel, A: Array, B: Array, Q: Array, R: Array, *, interval: float,
-              max_residual: float, max_gain: float) -> RiccatiSolution:
-    """Solve the Riccati equation of (A, B); see :func:`koopman_ros.solvers.solve_riccati`."""
-    return solve_riccati(A, B, Q, R, interval=interval, max_residual=max_residual,
-                         max_gain=max_gain)
-
-
-@compilable
-def growth(model: LiftedModel, found: Feedback, interval: float) -> float:
-    """Predict how the error changes from sample to sample; see :meth:`Feedback.growth`."""
-    return found.growth(interval)
-
-
-@record
-class Answer:
-    """What a command is made of."""
-
-    u: Array  #: (n_u,) in scaled deviations; not to be used unless solved
-    figures: Figures  #: of the solution; its growth NaN unless solved
-    status: RiccatiStatus  #: whether `u` may be used
-
-    @staticmethod
-    def of(model: LiftedModel, found: Feedback, interval: float) -> 'Answer':
-        """Return that of a feedback for an interval in the model's time unit."""
-        riccati = found.riccati
-        return Answer(found.u, Figures(
-            found.form.value, riccati.residual, riccati.gain,
-            growth(model, found, interval) if found.solved else math.nan), riccati.status)
-
-
-@compilable
-def answer(model: LiftedModel, x: Array, target: Target, tuning: Tuning, interval: float
-           ) -> Answer:
-    """
-    Evaluate the law that suits the model, and how the error grows; see :func:`feedback`.
-
-    :param interval: for which the input will be held, in the model's time unit.
-    """
-    return Answer.of(model, feedback(
-        model, x, target, tuning.weights, interval=interval, max_gain=tuning.max_gain,
-        max_residual=tuning.max_residual), interval)
 
 
 def closed(model: LiftedModel) -> bool:
@@ -163,7 +111,6 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     return averaged(model, x, target, weights, **how)
 
 
-@compilable
 def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
               interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8
               ) -> Feedback:
@@ -198,7 +145,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         C = np.linalg.pinv(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     # dot takes a third of the time of @ here
-    riccati = regulator(model, A, J.dot(B), Q, weights.R, interval=interval,
+    riccati = solve_riccati(A, J.dot(B), Q, weights.R, interval=interval,
                         max_gain=max_gain, max_residual=max_residual)
     drift = (model.onto_states(J, model.A.dot(M) + H) if model.readout is None
              else _averaged_jacobian(model, x, target, D))
@@ -206,7 +153,6 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
                     drift, -B.dot(riccati.K.dot(M)))
 
 
-@compilable
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
              interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
@@ -221,7 +167,7 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     A = _averaged_jacobian(model, x, target, _input_secant(model, x, target))
     B = model.input_matrix(x)
-    riccati = regulator(model, A, B, weights.Q, weights.R, interval=interval,
+    riccati = solve_riccati(A, B, weights.Q, weights.R, interval=interval,
                         max_gain=max_gain, max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
                     A, -B @ riccati.K)
@@ -238,75 +184,59 @@ def _averaged_jacobian(model: LiftedModel, x: Array, target: Target, D: Array | 
     return A if D is None else A + D
 
 
-@dataclass(frozen=True)
-class StateDependentRiccati:
+class StateDependentRiccati(Law):
     """The law of the paper: the Riccati equation solved with J_N(x) B at each sample."""
 
-    model: LiftedModel  #: the lift
-    tuning: Tuning  #: weights and bounds
-
-    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf, last: Array | None = None
-                ) -> LawResult:
+    def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                previous: Array | None) -> LawResult:
         """Solve the equation at the estimate; see :class:`~koopman_ros.control.laws.base.Law`."""
-        model = self.model
+        within = interval / self.model.seconds_per_time_unit
         try:
-            return checked(model, answer(
-                model, estimate.x, target, self.tuning, interval / model.seconds_per_time_unit),
-                limits, interval)
+            return _result(self.model, feedback(
+                self.model, estimate.x, target, self.weights, interval=within,
+                max_gain=self.tuning.max_gain, max_residual=self.tuning.max_riccati_residual),
+                interval)
         except np.linalg.LinAlgError as error:
             return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
 
 
-def checked(model: LiftedModel, found: Answer, limits: InputLimits, interval: float
-            ) -> LawResult:
-    """Return the command of a law, unless it must not be used; see :meth:`Law.compute`."""
-    figures = found.figures
-    if found.status is not RiccatiStatus.SOLVED:
-        return LawResult(None, reason(Code(found.status.value)), figures)
-    if not figures.growth < 1.0:
-        return LawResult(None, reason(Code.PREDICTED_UNSTABLE, interval=interval), figures)
-    u = model.inputs.to_physical(found.u)
-    if not finite(u):
-        return LawResult(None, reason(Code.COMMAND_NOT_FINITE), figures)
-    within = limits.within(u)
-    return LawResult(within, None, figures, clipped=within.tolist() != u.tolist())
+class Linear(Law):
+    """One gain for all states, of the model linearised at its nominal point (LQR)."""
 
+    extrapolates: ClassVar[bool] = True
 
-@dataclass(frozen=True)
-class Linear:
-    """One gain for all states, of the Riccati equation of the linearised model."""
-
-    lift: LiftedModel  #: that is linearised
-    tuning: Tuning  #: weights and bounds
-
-    @property
-    def model(self) -> LiftedModel:
-        """The lift linearised at its nominal point."""
-        return self.lift.linearised
-
-    @cached_property
-    def _at_nominal(self) -> Callable[[float], tuple[Array, Answer]]:
-        origin = np.zeros(self.model.n_x)
-        target = steady_state_target(self.model, origin)
-
+    def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
+        super().__init__(model.linearised, tuning, parameters)
         # where samples are equally far apart, one solution does for all of them
-        @lru_cache(maxsize=4)
-        def held_for(interval: float) -> tuple[Array, Answer]:
-            within = interval / self.model.seconds_per_time_unit
-            found = feedback(self.model, origin, target, self.tuning.weights, interval=within,
-                             max_gain=self.tuning.max_gain, max_residual=self.tuning.max_residual)
-            return found.riccati.K, Answer.of(self.model, found, within)
+        self._at_nominal = lru_cache(maxsize=4)(self._solved)
 
-        return held_for
+    def _solved(self, interval: float) -> tuple[Feedback, float]:
+        """Return the feedback at the nominal point, and how the error grows in a sample."""
+        origin = np.zeros(self.model.n_x)
+        found = feedback(
+            self.model, origin, steady_state_target(self.model, origin), self.weights,
+            interval=interval, max_gain=self.tuning.max_gain,
+            max_residual=self.tuning.max_riccati_residual)
+        return found, found.growth(interval)
 
-    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf, last: Array | None = None
-                ) -> LawResult:
+    def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                previous: Array | None) -> LawResult:
         """Apply the gain; see :class:`~koopman_ros.control.laws.base.Law`."""
-        try:
-            K, found = self._at_nominal(interval)
-            return checked(self.model, amended(
-                found, u=target.u - K.dot(estimate.x - target.x)), limits, interval)
-        except np.linalg.LinAlgError as error:
-            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
+        found, growth = self._at_nominal(interval / self.model.seconds_per_time_unit)
+        u = target.u - found.riccati.K.dot(estimate.x - target.x)
+        return _result(self.model, found, interval, u, growth)
+
+
+def _result(model: LiftedModel, found: Feedback, interval: float, u: Array | None = None,
+            growth: float | None = None) -> LawResult:
+    """Return the input of a feedback, or (n_u,) of its gain, unless it must not be used."""
+    riccati = found.riccati
+    info = SolutionInfo(found.form.value, riccati.residual, riccati.gain)
+    if not found.solved:
+        return LawResult(None, reason(Code(riccati.status.value)), info)
+    if growth is None:
+        growth = found.growth(interval / model.seconds_per_time_unit)
+    info = SolutionInfo(found.form.value, riccati.residual, riccati.gain, growth)
+    if not growth < 1.0:
+        return LawResult(None, reason(Code.PREDICTED_UNSTABLE, interval=interval), info)
+    return LawResult(model.inputs.to_physical(found.u if u is None else u), info=info)

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.values import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Horizon:
     """What a plan of one sample goes by; all in scaled deviations and the model's time unit."""
 
@@ -30,7 +28,7 @@ class Horizon:
     terminal: Array  #: (n_x, n_x) cost of the error at the end
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Program:
     """The cost of a change v (N n_u,) of a plan's inputs, v' H v / 2 + f' v, and what moves."""
 
@@ -40,13 +38,11 @@ class Program:
     f: Array  #: (N n_u,)
 
 
-@compilable
 def slope_at(model: LiftedModel, x: Array) -> Array:
     """Return the Jacobian (n_x, n_x) of the drift at a state (n_x,)."""
     return model.drift_and_jacobian(x)[1]
 
 
-@compilable
 def program(model: LiftedModel, horizon: Horizon, u: Array, x: Array) -> Program | None:
     """
     Set up the program about a course of inputs (N, n_u) and nodes (N + 1, n_x).

@@ -3,19 +3,26 @@
 
 """Nonlinear Kalman filters on the model's drift: states that are not measured, disturbances."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 import math
+from typing import Any
 
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.estimation.observer import BoundedDisturbance, Estimate, Innovation
-from koopman_ros.kernels import compilable
+from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.signals import Outputs
 from koopman_ros.solvers import runge_kutta_step
-from koopman_ros.values import record
+from koopman_ros.tuning import Tuning
+from koopman_ros.units import SECONDS_PER_MINUTE
 
+# Where the tuning does not say how uncertain the plant is: noise as a share of half the trained
+# range, the random walk as a share of the inputs', over the slowest time constant, and the first
+# estimate.
+_NOISE, _WANDER, _GUESS = 1e-3, 0.1, 0.5
+_LONGEST = 86400.0  # s, of time constants
 # One step of integration spans at most this share of the drift's fastest time constant.
 _STEP_SHARE = 0.5
 _MAX_STEPS = 40
@@ -31,55 +38,67 @@ _NO_VARIANCE = 1e-14  # likewise of a covariance
 _LOST = 10.0
 
 
-@dataclass(frozen=True)
-class ExtendedKalmanFilter(BoundedDisturbance):
+def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
+                ) -> tuple[Array, Array, Array]:
+    """
+    Return noise, random walk and error of the first estimate: as tuned, or derived from the model.
+
+    The noise of an output that is a state is that of the record that the model was learned from,
+    where there was one.
+
+    :return: (n_y,) in the outputs' units, (n_u,) in scaled deviations per square root of a
+        second, and (n_x,) in scaled deviations.
+    """
+    metrics, names = model.provenance.metrics, model.states.names
+    recorded = np.array([metrics.get(
+        f'noise_{name}' if len(names) > 1 else 'noise', 0.0) if name in names else 0.0
+        for name in outputs.names])
+    half = 0.5 * (model.states.upper - model.states.lower)
+    slowest = float(np.min(np.abs(np.linalg.eigvals(
+        model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
+    per_minute = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
+        SECONDS_PER_MINUTE * max(slowest, 1.0 / _LONGEST))
+    noise, wander, error = (
+        np.where(own > 0.0, own, default) for own, default in (
+            (tuning.noise, np.where(recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half)),
+            (tuning.wander, per_minute), (tuning.initial_error, _GUESS * half)))
+    return (noise, wander / (math.sqrt(SECONDS_PER_MINUTE) * model.inputs.scale),
+            error / model.states.scale)
+
+
+class ExtendedKalmanFilter(Estimator):
     """
     The extended Kalman filter of state and disturbance: dx/dt = f(x) + B u + w, y = C x + noise.
 
-    There is one disturbance for each output, which wanders: where there are as many inputs, it
+    There is one disturbance for each output, a random walk: where there are as many inputs, it
     acts like a change of them, otherwise on the outputs' own rates. It is what leaves no offset
     (G. Pannocchia, J. B. Rawlings, AIChE J. 49 (2003)). Prediction is by Runge-Kutta steps with
     their variational equations, correction in the form of Joseph. See A. H. Jazwinski,
     *Stochastic Processes and Filtering Theory* (1970), section 8.3.
 
-    :raises ValueError: where the outputs leave states or disturbances open, or noise, wander or
-        initial error is not given.
+    :raises ValueError: where the outputs leave states or disturbances open.
     """
 
-    def __post_init__(self) -> None:
-        model, tuning = self.model, self.tuning
-        n_y = len(tuning.outputs.names)
-        for name, size in (('noise', n_y), ('wander', model.n_u), ('initial_error', model.n_x)):
-            value = getattr(tuning, name)
-            if value.shape != (size,) or not np.all(np.isfinite(value) & (value > 0.0)):
-                raise ValueError(f'{name} must be {size} finite numbers above 0, got '
-                                 f'{value.tolist()}')
-        # what cannot be built is refused now
-        assert self._intensity.size
+    def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
+                 ) -> None:
+        super().__init__(model, outputs, tuning, parameters)
+        self._noise, self._wander, self._initial_error = uncertainty(model, outputs, tuning)
+        #: (n_y, n_x) outputs, in their units, of scaled deviations
+        self._H = outputs.C * model.states.scale
+        self._R = np.diag(self._noise ** 2)
+        self._slope = model.drift_jacobian(np.zeros(model.n_x))
+        #: (n_x,) sizes of the eigenvalues of the drift at the nominal point, in 1/time unit
+        self._rates = np.abs(np.linalg.eigvals(self._slope))
+        directions = self._directions()
+        #: (n_x, n_x) by which the covariance of the disturbance grows in a second
+        self._intensity = directions @ directions.T
+        #: (n_x, n_x) projection on what disturbances can be
+        self._onto_directions = directions @ np.linalg.pinv(directions)
 
-    @cached_property
-    def _H(self) -> Array:
-        """(n_y, n_x) outputs, in their units, of scaled deviations."""
-        return self.tuning.outputs.C * self.model.states.scale
-
-    @cached_property
-    def _R(self) -> Array:
-        return np.diag(self.tuning.noise ** 2)
-
-    @cached_property
-    def _slope(self) -> Array:
-        return self.model.drift_jacobian(np.zeros(self.model.n_x))
-
-    @cached_property
-    def _rates(self) -> Array:
-        """(n_x,) sizes of the eigenvalues of the drift at the nominal point, in 1/time unit."""
-        return np.abs(np.linalg.eigvals(self._slope))
-
-    @cached_property
     def _directions(self) -> Array:
         """(n_x, n_y) rates of the state that each disturbance adds to, as far as it wanders."""
         model, H = self.model, self._H
-        by_input = model.B * self.tuning.wander
+        by_input = model.B * self._wander
         # an output that no input moves at once wanders as the others do, each in its own size
         sizes = np.linalg.norm(H, axis=1)
         moved = np.max(np.abs(H @ by_input), axis=1)
@@ -91,7 +110,7 @@ class ExtendedKalmanFilter(BoundedDisturbance):
         for found in (*candidates, by_output):
             if self._determined(found):
                 return found
-        names = ', '.join(self.tuning.outputs.names)
+        names = ', '.join(self.outputs.names)
         raise ValueError(f'{names}, measured, do not determine the states '
                          f'{", ".join(model.states.names)} and a disturbance for each: measure '
                          'another signal')
@@ -113,16 +132,6 @@ class ExtendedKalmanFilter(BoundedDisturbance):
         return True
 
     @cached_property
-    def _intensity(self) -> Array:
-        """(n_x, n_x) by which the covariance of the disturbance grows in a second."""
-        return self._directions @ self._directions.T
-
-    @cached_property
-    def _onto_directions(self) -> Array:
-        """(n_x, n_x) projection on what disturbances can be."""
-        return self._directions @ np.linalg.pinv(self._directions)
-
-    @cached_property
     def initial_covariance(self) -> Array:
         """(2 n_x, 2 n_x) of a first guess."""
         n = self.model.n_x
@@ -130,7 +139,7 @@ class ExtendedKalmanFilter(BoundedDisturbance):
         since = min(_A_DAY, _WANDERED * self.model.seconds_per_time_unit / slowest
                     if slowest > 0.0 else _A_DAY)
         P = np.zeros((2 * n, 2 * n))
-        P[:n, :n] = np.diag(self.tuning.initial_error ** 2)
+        P[:n, :n] = np.diag(self._initial_error ** 2)
         P[n:, n:] = since * self._intensity
         return P
 
@@ -138,7 +147,7 @@ class ExtendedKalmanFilter(BoundedDisturbance):
     def _lost(self) -> Array:
         """(n_x,) variances from which on a prediction of the state is worth nothing."""
         return (_LOST * np.maximum(
-            self.tuning.initial_error, self.model.states.half_widths)) ** 2
+            self._initial_error, self.model.states.half_widths)) ** 2
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model, and the covariance with it; see :class:`Estimator`."""
@@ -159,16 +168,42 @@ class ExtendedKalmanFilter(BoundedDisturbance):
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:
         """Return state and covariance after so many steps of h, in time units."""
-        return propagated(self.model, x, w, P, u, h, steps)
+        model = self.model
+        n = model.n_x
+        forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
+        # x and its derivatives by what x and w were
+        whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
+
+        def rate(whole: Array) -> Array:
+            x = whole[:, 0]
+            f, J = model.drift_and_jacobian(x)
+            if model.input_terms is not None:
+                J = J + model.forcing_jacobian(x, u)
+            return np.concatenate(((f + model.forcing(x, u) + w)[:, None],
+                                   J @ whole[:, 1:] + forced), axis=1)
+
+        for _ in range(steps):
+            whole = runge_kutta_step(rate, whole, h)
+        F = np.eye(2 * n)
+        F[:n] = whole[:, 1:]
+        return whole[:, 0].copy(), F @ P @ F.T
 
     def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
         """Take the outputs of a state (n_x,) into account, in the form of Joseph."""
         n, H = self.model.n_x, self._H
         P = self.initial_covariance if predicted.covariance is None else predicted.covariance
-        found = corrected(self.model, H, self._R, P, x - predicted.x)
+        innovation = H.dot(x - predicted.x)
+        PH = P[:, :n] @ H.T
+        S = H @ PH[:n] + self._R
+        gain = np.linalg.solve(S, PH.T).T
+        keep = np.eye(2 * n)
+        keep[:, :n] -= gain @ H
+        P = keep @ P @ keep.T + gain @ self._R @ gain.T
+        step = gain.dot(innovation)
+        square = float(innovation.dot(np.linalg.solve(S, innovation))) / len(innovation)
         return Estimate(
-            predicted.x + found.step[:n], self.bounded(predicted.w + found.step[n:]),
-            found.covariance, _averaged(predicted.innovation, found))
+            predicted.x + step[:n], self.bounded(predicted.w + step[n:]), 0.5 * (P + P.T),
+            _averaged(predicted.innovation, innovation / np.sqrt(np.diag(S)), square))
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
         """Start from a state (n_x,) with the measured outputs; see the observer's."""
@@ -187,7 +222,6 @@ class ExtendedKalmanFilter(BoundedDisturbance):
         return replace(estimate, w=self.bounded(w))
 
 
-@dataclass(frozen=True)
 class UnscentedKalmanFilter(ExtendedKalmanFilter):
     """
     The same by sigma points in place of derivatives.
@@ -218,71 +252,9 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         return mean[:n], (weights[:, None] * deviation).T @ deviation
 
 
-@compilable
-def propagated(model: LiftedModel, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
-               ) -> tuple[Array, Array]:
-    """
-    Return state and covariance after so many steps of h, in time units.
-
-    :param x: (n_x,) and w (n_x,), of which P (2 n_x, 2 n_x) is the covariance.
-    :param u: (n_u,) input.
-    """
-    n = model.n_x
-    forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
-    # x and its derivatives by what x and w were
-    whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
-
-    def rate(whole: Array) -> Array:
-        x = whole[:, 0]
-        f, J = model.drift_and_jacobian(x)
-        if model.input_terms is not None:
-            J = J + model.forcing_jacobian(x, u)
-        return np.concatenate(((f + model.forcing(x, u) + w)[:, None],
-                               J @ whole[:, 1:] + forced), axis=1)
-
-    for _ in range(steps):
-        whole = runge_kutta_step(rate, whole, h)
-    F = np.eye(2 * n)
-    F[:n] = whole[:, 1:]
-    return whole[:, 0].copy(), F @ P @ F.T
-
-
-@record
-class Correction:
-    """What outputs (n_y,) add to a prediction."""
-
-    step: Array  #: (2 n_x,) of state and disturbance
-    covariance: Array  #: (2 n_x, 2 n_x) of both afterwards
-    innovation: Array  #: (n_y,) what was measured less what was expected
-    deviation: Array  #: (n_y,) its standard deviations
-    square: float  #: its square, weighed by its covariance
-
-
-@compilable
-def corrected(model: LiftedModel, H: Array, R: Array, P: Array, difference: Array) -> Correction:
-    """
-    Take a measured difference (n_x,) from a prediction into account, in the form of Joseph.
-
-    :param H: (n_y, n_x) outputs, of noise with covariance R (n_y, n_y).
-    :param P: (2 n_x, 2 n_x) covariance of state and disturbance.
-    """
-    n = len(difference)
-    innovation = H.dot(difference)
-    PH = P[:, :n] @ H.T
-    S = H @ PH[:n] + R
-    gain = np.linalg.solve(S, PH.T).T
-    keep = np.eye(2 * n)
-    keep[:, :n] -= gain @ H
-    P = keep @ P @ keep.T + gain @ R @ gain.T
-    return Correction(gain.dot(innovation), 0.5 * (P + P.T), innovation, np.sqrt(np.diag(S)),
-                      float(innovation.dot(np.linalg.solve(S, innovation))))
-
-
-def _averaged(before: Innovation | None, found: Correction) -> Innovation:
-    square = found.square / len(found.innovation)
-    normalised = found.innovation / found.deviation
+def _averaged(before: Innovation | None, normalised: Array, square: float) -> Innovation:
     if before is None:
         return Innovation(normalised, square, 1)
-    count = min(before.count + 1, Innovation.WINDOW)
+    count = min(before.count + 1, INNOVATION_WINDOW)
     return Innovation(
         normalised, before.mean_square + (square - before.mean_square) / count, count)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether an input within its range can hold a set-point, and the nearest one that can be held."""
+"""Feasibility of a set-point: whether an input within its range holds it, and the nearest one."""
 
 from __future__ import annotations
 
@@ -9,48 +9,31 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from koopman_ros.arrays import Array
+from koopman_ros.control.fallback import Level
 from koopman_ros.control.laws.base import Target
-from koopman_ros.control.levels import Level
-from koopman_ros.control.limits import InputLimits
-from koopman_ros.control.target import nearest_steady_state, resting_state
+from koopman_ros.control.steady_state import nearest_steady_state, resting_state
 from koopman_ros.lifting import Coordinates
 from koopman_ros.reasons import Code, Reason, reason
 
 _HALVINGS = 24  # to 1e-7 of the way
 _MOST_MOVES = 10
 _SINGULAR = 1e9  # condition from which on a model has no steady state for each input
-_SWEEPS = 100
-# What rounding may add to an input, in scaled deviations, and to a state, in half widths.
+# What rounding may add to an input, in scaled deviations, and to a state, in half-ranges.
 _SLACK = 1e-6
 # With fewer inputs than controlled states a set-point counts as held where a steady state is so
-# near, in half widths of the training box: nobody states one to all its digits.
+# near, in half-ranges of the training box: nobody states one to all its digits.
 _NEAR = 0.01
 
 
-def bounded_least_squares(G: Array, y: Array, lower: Array, upper: Array) -> Array:
-    """
-    Minimise the sum of squares of G v - y over lower <= v <= upper, one coordinate after another.
-
-    :param G: (n, m), and y (n,); the bounds are (m,), around 0.
-    :return: v (m,), which few sweeps bring near enough for few coordinates.
-    """
-    sizes, v = (G * G).sum(axis=0), np.zeros(G.shape[1])
-    for _ in range(_SWEEPS):
-        for j in np.flatnonzero(sizes):
-            wanted = v[j] + G[:, j].dot(y - G.dot(v)) / sizes[j]
-            v[j] = min(max(wanted, lower[j]), upper[j])
-    return v
-
-
 @dataclass(frozen=True)
-class Holding:
-    """What a level can hold under a disturbance."""
+class Feasibility:
+    """Set-points that a level can hold under a disturbance."""
 
     level: Level  #: whose model tells
-    limits: InputLimits  #: whose ranges count
-    margin: float  #: distance outside the training box, in half widths, that is allowed
+    margin: float  #: distance outside the training box, in half-ranges, that is allowed
     w: Array  #: (n_x,) disturbance of the state's rate, scaled
     start: Array | None  #: (n_x + n_u,) where the steady state is looked for, in units
 
@@ -59,7 +42,7 @@ class Holding:
         """The controlled states."""
         return self.level.controlled_states
 
-    def refusal(self, goal: Array, others: Iterable[Array | None], command: Array | None,
+    def infeasibility(self, goal: Array, others: Iterable[Array | None], command: Array | None,
                 whole: bool) -> Reason | None:
         """
         Return why a set-point (n_c,), in state units, cannot be held, or None.
@@ -70,12 +53,12 @@ class Holding:
         :param command: (n_u,) input that holds another one, in input units, or None.
         :param whole: whether every signal was asked for: else the others are to stay.
         """
-        known = np.isfinite(goal)
-        if not known.all():
-            kept = tuple(name for name, is_known in zip(self.box.names, known, strict=True)
-                         if is_known)
+        given = np.isfinite(goal)
+        if not given.all():
+            kept = tuple(name for name, is_given in zip(self.box.names, given, strict=True)
+                         if is_given)
             some = replace(self, level=self.level.controlling(kept))
-            return some.refusal(goal[known], (), command, whole)
+            return some.infeasibility(goal[given], (), command, whole)
         cause = self._cause(self._target(goal))
         if cause is None:
             return None
@@ -93,12 +76,12 @@ class Holding:
                       held=tuple(zip(self.box.names, nearest.tolist(), strict=True)))
 
     def _target(self, setpoint: Array) -> Target | None:
-        return self.level.target(setpoint, self.w, self.limits, self.start)
+        return self.level.target(setpoint, self.w, self.start)
 
     def _under(self, command: Array | None) -> Array | None:
         """Return what (n_c,) is held by a command (n_u,), or by the nominal input."""
         model = self.level.model
-        u = self.limits.within(model.inputs.center if command is None else command)
+        u = self.level.limits.within(model.inputs.center if command is None else command)
         start = np.zeros(model.n_x) if self.start is None else (
             model.states.to_deviation(self.start[:model.n_x]))
         x = resting_state(model, model.inputs.to_deviation(u), self.w, start)
@@ -126,7 +109,8 @@ class Holding:
     def _nearer(self, held: Array, goal: Array) -> Array:
         """Move the inputs within their range for the least squares of what is left to a goal."""
         model, half = self.level.model, 0.5 * (self.box.upper - self.box.lower)
-        lower, upper = map(model.inputs.to_deviation, (self.limits.lower, self.limits.upper))
+        lower, upper = (model.inputs.to_deviation(end) for end in (
+            self.level.limits.lower, self.level.limits.upper))
         for _ in range(_MOST_MOVES):
             target, left = self._target(held), (goal - held) / half
             assert target is not None  # it is held
@@ -136,8 +120,8 @@ class Holding:
             gain = model.states.scale[:, None] * -np.linalg.solve(
                 slope, model.input_matrix(target.x))
             gain = np.array([self.level.controlled_of(column) for column in gain.T]).T
-            move = bounded_least_squares(gain / half[:, None], left, lower - target.u,
-                                         upper - target.u)
+            move = lsq_linear(gain / half[:, None], left, (lower - target.u, upper - target.u),
+                              method='bvls').x
             for halving in range(_MOST_MOVES):
                 x = resting_state(model, target.u + 0.5 ** halving * move, self.w, target.x)
                 if x is None:
@@ -163,7 +147,7 @@ class Holding:
         model = self.level.model
         u, slack = model.inputs.to_physical(target.u), _SLACK * model.inputs.scale
         for i, name in enumerate(model.inputs.names):
-            lower, upper = self.limits.lower[i], self.limits.upper[i]
+            lower, upper = self.level.limits.lower[i], self.level.limits.upper[i]
             if not lower - slack[i] <= u[i] <= upper + slack[i]:
                 return reason(Code.INPUT_NEEDED, signal=name, value=float(u[i]),
                               lower=float(lower), upper=float(upper))

@@ -1,26 +1,22 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The steady state of a model that goes with a set-point for some of its states."""
+"""Steady states of a model, and the target of a set-point for some of its states."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Target
-from koopman_ros.control.limits import finite
-from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 
-MOST_STEPS = 30
+_MOST_STEPS = 30
 # A step is no longer than this, in scaled deviations: Newton's method far out overshoots.
-LONGEST_STEP = 0.5
+_LONGEST_STEP = 0.5
 # Solved is what is left of the rate when it is worth so little of a deviation.
-RESOLUTION = 1e-9
+_RESOLUTION = 1e-9
 # With inputs to spare the nearest solution is found when a step is no longer than this.
 _STILL = 1e-6
 _SLACK = 1e-6  # of what rounding may add to an input, in scaled deviations
@@ -28,7 +24,6 @@ _SLACK = 1e-6  # of what rounding may add to an input, in scaled deviations
 _REACH = 1e3
 
 
-@compilable
 def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.bool_],
                 anchor: Array, reach: Array) -> Array | None:
     """
@@ -49,18 +44,18 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
     anchor, reach = anchor[free], reach[free]
     try:
         rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
-        for _ in range(MOST_STEPS):
+        for _ in range(_MOST_STEPS):
             J = np.concatenate((model.drift_jacobian(y[:n]) + model.forcing_jacobian(y[:n], y[n:]),
                                 model.input_matrix(y[:n])), axis=1)[:, free]
-            if not (finite(J.ravel()) and finite(rate)):
+            if not (np.isfinite(J).all() and np.isfinite(rate).all()):
                 return None
             wanted = J.dot(y[free] - anchor) - rate
             step = anchor + reach * np.linalg.lstsq(J * reach, wanted, rcond=None)[0] - y[free]
-            length = max(map(abs, step.tolist()), default=0.0)
+            length = float(np.max(np.abs(step), initial=0.0))
             y = y.copy()
-            y[free] += step * min(1.0, LONGEST_STEP / length) if length > 0.0 else step
+            y[free] += step * min(1.0, _LONGEST_STEP / length) if length > 0.0 else step
             rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
-            if math.sqrt(rate.dot(rate)) <= RESOLUTION * math.sqrt(float((J * J).sum())) and (
+            if np.linalg.norm(rate) <= _RESOLUTION * np.linalg.norm(J) and (
                     length <= _STILL or not settles):
                 return y
     except np.linalg.LinAlgError:
@@ -165,5 +160,4 @@ def held_at(model: LiftedModel, x: Array, held: NDArray[np.bool_]) -> Array | No
 def _target(model: LiftedModel, y: Array, w: Array) -> Target:
     x, u = y[:model.n_x], y[model.n_x:]
     drift, forcing = model.drift(x), model.forcing(x, u) + w
-    rest = drift + forcing
-    return Target(x, model.lift(x), drift, u, forcing, math.sqrt(rest.dot(rest)))
+    return Target(x, model.lift(x), drift, u, forcing, float(np.linalg.norm(drift + forcing)))

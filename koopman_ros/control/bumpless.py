@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Saturation, rate limiting and bumpless transfer, between a law and its command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.tuning import InputLimits
+
+# In input units; what is left then is below the resolution of any actuator.
+_NEGLIGIBLE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class LimitedInput:
+    """A command within its limits."""
+
+    u: Array  #: (n_u,) command
+    at_range: bool  #: whether the range was active
+    at_rate: bool  #: whether the rate was active
+
+
+def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: float
+          ) -> LimitedInput:
+    """
+    Bring a command within its range, and within its rate where a previous command is known.
+
+    A previous command from outside the range, which was tightened since, is left at the rate.
+
+    :param wanted: (n_u,) the law's command.
+    :param previous: (n_u,) command `seconds` ago, or None at the first.
+    """
+    command = within = limits.within(wanted)
+    if previous is not None:
+        # 0 s times infinity is no number
+        reach = np.where(np.isinf(limits.rate), np.inf, 0.0)
+        np.multiply(limits.rate, max(0.0, seconds), out=reach, where=np.isfinite(limits.rate))
+        command = np.minimum(np.maximum(within, previous - reach), previous + reach)
+    command.setflags(write=False)
+    return LimitedInput(command, bool(np.any(within != wanted)), bool(np.any(command != within)))
+
+
+@dataclass(frozen=True, slots=True)
+class BumplessTransfer:
+    """
+    An offset to the command that fades with d (1 + t/T) exp(-t/T), flat at first.
+
+    Steps add up: after a second change the rest of the first fades on.
+    """
+
+    offset: Array  #: (n_u,) now, in input units
+    feed: Array  #: (n_u,) what it follows, which fades exponentially
+
+    def after(self, seconds: float, time_constant: float) -> BumplessTransfer | None:
+        """Return what is left after seconds, None for nothing; T = 0 s ends it at once."""
+        if seconds > 100.0 * time_constant:
+            return None
+        share = seconds / time_constant if time_constant > 0.0 else 0.0
+        fading = math.exp(-share)
+        left = BumplessTransfer(fading * (self.offset + share * self.feed), fading * self.feed)
+        size = np.max(np.abs(left.offset)) + np.max(np.abs(left.feed))
+        return left if size > _NEGLIGIBLE else None
+
+
+def with_step(transfer: BumplessTransfer | None, by: Array) -> BumplessTransfer:
+    """Return a transfer, or none, with a further step (n_u,)."""
+    return BumplessTransfer(by, by) if transfer is None else BumplessTransfer(
+        transfer.offset + by, transfer.feed + by)

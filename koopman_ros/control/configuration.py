@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The configuration of a control loop: a model, its tuning, and what follows from both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from koopman_ros.arrays import Array, brief, kept
+from koopman_ros.control.estimates import StateEstimation
+from koopman_ros.control.fallback import build_levels, Level
+from koopman_ros.control.supervisor import FallbackOrder
+from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.signals import Outputs
+from koopman_ros.tuning import Tuning
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """
+    A model with its tuning.
+
+    :raises ValueError: when the tuning does not fit the model's signals, or the estimator cannot
+        do with what is measured.
+    """
+
+    model: LiftedModel  #: the lift
+    tuning: Tuning  #: with one number for each signal
+    outputs: Outputs | None = None  #: what is measured; every state by default
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'tuning', self.tuning.for_signals(
+            self.model, self.measured.names))
+        # what cannot be built is refused now, and what was built is kept
+        assert self.order
+
+    @cached_property
+    def measured(self) -> Outputs:
+        """What is measured: y = C x."""
+        states = self.model.states
+        return self.outputs or Outputs(states.names, states.units, np.eye(self.model.n_x))
+
+    @cached_property
+    def levels(self) -> dict[str, Level]:
+        """The levels with a law, by name, best first."""
+        return build_levels(self.model, self.measured, self.tuning)
+
+    @cached_property
+    def order(self) -> FallbackOrder:
+        """The order of all levels."""
+        return FallbackOrder(
+            tuple(self.levels), tuple(level.law.margin for level in self.levels.values()),
+            self.tuning.hold_timeout, self.tuning.recovery_time)
+
+    @cached_property
+    def best(self) -> Level:
+        """The first level."""
+        return next(iter(self.levels.values()))
+
+    @property
+    def controlled(self) -> Coordinates:
+        """The states with a set-point."""
+        return self.best.controlled_states
+
+    @cached_property
+    def estimation(self) -> StateEstimation:
+        """The estimators of the levels."""
+        return StateEstimation(self.model, self.measured, self.tuning, self.levels)
+
+    @cached_property
+    def safe_input(self) -> Array:
+        """What is commanded when no law can act, (n_u,) in input units."""
+        return kept(self.tuning.limits.within(self.tuning.safe))
+
+    @cached_property
+    def nominal_input(self) -> Array:
+        """The nominal input (n_u,) within its limits, in input units."""
+        return kept(self.tuning.limits.within(self.model.inputs.center))
+
+    @cached_property
+    def ranges(self) -> tuple[tuple[str, float, float], ...]:
+        """(name, lower, upper) of the states' trained ranges."""
+        states = self.model.states
+        return tuple(zip(states.names, states.lower.tolist(), states.upper.tolist(), strict=True))

@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""State estimation in the loop: sensor checks, the estimator of the acting level, hand-over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.fallback import Level
+from koopman_ros.control.state import State
+from koopman_ros.control.steady_state import held_at
+from koopman_ros.estimation import check, Estimate, Standstill, Verdict
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code
+from koopman_ros.signals import Outputs
+from koopman_ros.tuning import Tuning
+from koopman_ros.units import NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """A measurement as it was taken into account."""
+
+    verdict: Verdict  #: whether it is accepted
+    expected: Array | None  #: (n_y,) what was expected of it; None when nothing was
+    x: Array  #: (n_x,) state that it is taken for, in state units
+    outside: float  #: its distance from the training data, in half-ranges
+
+
+# After so many time constants without an accepted measurement the state is not known.
+_LOST = 2.0
+# So many intervals between measurements are a gap.
+_GAP = 1.5
+
+
+@dataclass(frozen=True)
+class StateEstimation:
+    """
+    The estimators of all levels behind the checks of the measurements.
+
+    While another level acts its model takes the better one's place, and the disturbance makes up
+    for the difference, so that the plant's estimated rate stays.
+    """
+
+    model: LiftedModel  #: the lift
+    outputs: Outputs  #: what is measured of its states
+    tuning: Tuning  #: for these signals
+    levels: dict[str, Level]  #: by name, best first
+
+    def level(self, state: State) -> Level:
+        """Return the level in terms of whose model the estimate is: without a law, the last."""
+        name = state.supervisor.settled
+        if name is None:
+            return next(iter(self.levels.values()))
+        found = self.levels.get(name)
+        return self.levels[next(reversed(self.levels))] if found is None else found
+
+    def applied(self, state: State, measured: Array | None = None) -> tuple[Array, bool]:
+        """
+        Return the input that has acted since the last command, as far as it is known.
+
+        That is the command, unless a measurement (n_u,) of the input says that it was not
+        reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences
+        below `tolerance` count for nothing: a bias would come into the loop.
+
+        :return: (n_u,) in scaled deviations, and whether it follows the command.
+        """
+        if state.command is None:
+            return np.zeros(self.model.n_u), True
+        u, tolerance = state.command, self.tuning.tolerance
+        if measured is None or not np.isfinite(measured).all():
+            return self.model.inputs.to_deviation(u), True
+        u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
+        return self.model.inputs.to_deviation(u), bool((u == state.command).all())
+
+    def observe(self, state: State, y: Array, time_ns: int, elapsed: float, u: Array
+                ) -> tuple[State, Observation]:
+        """
+        Check a measurement (n_y,) and take it into account.
+
+        :param elapsed: seconds since the last command.
+        :param u: (n_u,) what has acted since then, in scaled deviations.
+        :return: the state with measurement, time and estimate, and what became of the measurement.
+        """
+        before, last = state.estimate, state.accepted
+        predicted = self.predict(state, elapsed, u)
+        x = self.position(predicted, y)
+        outside = self.model.distance(x)
+        w = np.zeros(self.model.n_x) if before is None else before.w
+
+        def travel(then: Standstill) -> Array:
+            if outside > 0.0 or state.recovery is not None:
+                # what the model says of its motion is worth little; under the safe input even a
+                # plant that it does not expect to may rest there
+                return np.zeros_like(y)
+            if before is None:
+                return np.zeros_like(y)
+            moved = self.predict(replace(state, estimate=replace(before, w=then.w)), elapsed, u)
+            assert moved is not None
+            return self.outputs.of((moved.x - before.x) * self.model.states.scale)
+
+        verdict = check(self.tuning.sensor, self.outputs, last, y, time_ns, w, travel)
+        expected = None if predicted is None else self.outputs.of(
+            self.model.states.to_physical(predicted.x))
+        if verdict.fault is None:
+            far = outside > max(level.law.margin for level in self.levels.values())
+            predicted = self._corrected(
+                state, predicted, verdict, x, elapsed, far or self._lost(state, time_ns))
+            if not isinstance(predicted, Estimate):
+                raise TypeError(f'the estimator returned {type(predicted).__name__}, '
+                                'not Estimate')
+            if not self.outputs.determine_state:
+                # the measurement has changed what it leaves open, too
+                x = self.position(predicted, y)
+                outside = self.model.distance(x)
+        elif verdict.fault.code is Code.FROZEN and predicted is not None and last is not None:
+            # what the observer made of a sensor that does not move is no disturbance
+            predicted = replace(predicted, w=last.standstill.w)
+        return replace(
+            state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted
+        ), Observation(verdict, expected, x, outside)
+
+    def position(self, known: Estimate | None, y: Array) -> Array:
+        """
+        Return the state (n_x,), in state units, that goes with a measurement (n_y,).
+
+        What the measurement leaves open is as it is known, or where it may rest.
+        """
+        outputs, states = self.outputs, self.model.states
+        if outputs.determine_state:
+            return outputs.state(y, states.center)
+        if known is not None:
+            return outputs.state(y, states.to_physical(known.x))
+        return self._resting(outputs.state(y, states.center))
+
+    def _resting(self, x: Array) -> Array:
+        """Return the steady state with the outputs of a state (n_x,), or that state."""
+        measured = np.any(self.outputs.C != 0.0, axis=0)
+        if np.count_nonzero(measured) == len(self.outputs.C) and np.isfinite(x).all():
+            found = held_at(self.model, self.model.states.to_deviation(x), measured)
+            if found is not None:
+                return self.model.states.to_physical(found)
+        return x
+
+    def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
+                   elapsed: float, lost: bool) -> Estimate:
+        """
+        Return the estimate with a measurement that is accepted.
+
+        :param lost: whether the model's prediction is worth nothing, after so long or so far out.
+        """
+        xi, estimator = self.model.states.to_deviation(x), self.level(state).estimator
+        if predicted is None:
+            # the last command, it is assumed, held the plant where it is
+            return estimator.restart(None, xi, None if state.command is None else (
+                self.model.inputs.to_deviation(state.command)))
+        if verdict.moved or not elapsed > 0.0 or lost:
+            return estimator.restart(predicted, xi, None)
+        return estimator.correct(predicted, xi, elapsed)
+
+    def _lost(self, state: State, time_ns: int) -> bool:
+        """Tell whether no measurement was accepted for so long that the state is not known."""
+        if state.accepted is None:
+            return False
+        seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS
+        # where measurements are always that rare, they are all there is
+        return seconds * self.tuning.disturbance_bandwidth > _LOST and (
+            seconds > _GAP * state.interval)
+
+    def predict(self, state: State, elapsed: float, u: Array) -> Estimate | None:
+        """
+        Predict the estimate without a measurement; arguments as in :meth:`observe`.
+
+        Where the model does not reach that far, the state is as uncertain as at first, and the
+        disturbance is kept.
+        """
+        if state.estimate is None or state.command is None or not elapsed > 0.0:
+            return state.estimate
+        try:
+            predicted = self.level(state).estimator.predict(state.estimate, u, elapsed)
+        except np.linalg.LinAlgError:
+            predicted = None  # so far out that the model gives no rate
+        return predicted if predicted is not None and predicted.finite else replace(
+            state.estimate, covariance=None)
+
+    def rebase(self, estimate: Estimate, before: Level, now: Level) -> Estimate:
+        """Transfer an estimate from the model of one level to that of another."""
+        if before is now or not now.estimator.remembers:
+            return estimate
+        return now.estimator.rebased(estimate, before.model.drift(estimate.x))
+
+    def inherit(self, predecessor: StateEstimation, state: State) -> State:
+        """Carry an estimate over from other settings or another model."""
+        estimate, old, new = state.estimate, predecessor.model, self.model
+        if estimate is None:
+            return state
+        estimator = self.level(state).estimator
+        if not estimator.remembers:
+            estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
+        if old is new:
+            return replace(state, estimate=estimate)
+        x = old.states.to_physical(estimate.x)
+        if old.states.names != new.states.names:
+            # of what is not measured the new model has a view of its own
+            x = self.position(None, predecessor.outputs.of(x))
+            return replace(state, accepted=None, recovery=None, estimate=estimator.restart(
+                None, new.states.to_deviation(x), _command(new, state)))
+        # the rates that the old model estimated, per second, which all models share
+        rate = estimate.w + predecessor.level(state).model.drift(estimate.x) + (
+            old.forcing(estimate.x, _command(old, state)))
+        factor = (old.states.scale / old.seconds_per_time_unit
+                  / (new.states.scale / new.seconds_per_time_unit))
+        x_new = new.states.to_deviation(x)
+        covariance = estimate.covariance
+        if covariance is not None:
+            change = np.concatenate((old.states.scale / new.states.scale, factor))
+            covariance = covariance * change * change[:, None]
+        moved = Estimate(
+            x_new, factor * rate - new.forcing(x_new, _command(new, state)), covariance)
+        moved = estimator.rebased(moved, np.zeros_like(moved.w))
+        # what it holds of the disturbance is in the old model's units, and distances from its data
+        return replace(state, estimate=moved, accepted=None, recovery=None)
+
+
+def _command(model: LiftedModel, state: State) -> Array:
+    """Return the last command in a model's scaled deviations; the nominal one at first."""
+    if state.command is None:
+        return np.zeros(model.n_u)
+    return model.inputs.to_deviation(state.command)

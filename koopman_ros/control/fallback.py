@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The control levels: a law and an estimator each, which fall back to the next one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.laws import LAWS
+from koopman_ros.control.laws.base import (
+    Law,
+    LawResult,
+    Plan,
+    SolutionInfo,
+    steady_state_target,
+    Target,
+)
+from koopman_ros.control.steady_state import partial_target, reachable_target
+from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
+from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.plugs import contained, plug_in
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.signals import Outputs
+from koopman_ros.tuning import InputLimits, Tuning
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level."""
+
+    name: str  #: of its law
+    law: Law  #: with its model
+    estimator: Estimator  #: on the same model
+    controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
+
+    @property
+    def model(self) -> LiftedModel:
+        """The model of law and estimator."""
+        return self.law.model
+
+    @property
+    def limits(self) -> InputLimits:
+        """Range and rate of the inputs."""
+        return self.law.tuning.limits
+
+    @cached_property
+    def unusable(self) -> Reason | None:
+        """Why its law can never act; None where it can."""
+        try:
+            return self.law.unusable()
+        except BaseException as error:
+            return reason(Code.LAW_RAISED, error=contained(error))
+
+    @property
+    def controls_all(self) -> bool:
+        """Whether every state has a set-point."""
+        return len(self.controlled) == self.model.n_x
+
+    @cached_property
+    def controlled_states(self) -> Coordinates:
+        """The states with a set-point."""
+        return self.model.states.only(self.controlled)
+
+    @cached_property
+    def _indices(self) -> NDArray[np.intp]:
+        return np.array([self.model.states.names.index(name) for name in self.controlled],
+                        dtype=np.intp)
+
+    def controlled_of(self, x: Array) -> Array:
+        """Return the part (n_c,) of a state (n_x,) that has a set-point."""
+        return x[self._indices]
+
+    def controlling(self, names: tuple[str, ...]) -> Level:
+        """Return the level with set-points for these states alone."""
+        return replace(self, controlled=names)
+
+    def target(self, setpoint: Array, w: Array, start: Array | None) -> Target | None:
+        """
+        Find the steady state of a set-point (n_c,), in state units, under a disturbance (n_x,).
+
+        :param start: (n_x + n_u,) where a steady state is looked for, in units; the nominal point
+            by default.
+        :return: None where there is no steady state.
+        """
+        model, inputs, n = self.model, self.model.inputs, self.model.n_x
+        goal = self.controlled_states.to_deviation(setpoint)
+        if self.law.model_free:
+            x, none = np.zeros(n), np.zeros(n)
+            x[self._indices] = goal
+            return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
+        if self.controls_all:
+            return steady_state_target(model, goal, w)
+        y = np.zeros(n + model.n_u) if start is None else np.concatenate(
+            (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
+        return partial_target(
+            model, self._indices, goal, w, inputs.to_deviation(self.limits.lower),
+            inputs.to_deviation(self.limits.upper), y)
+
+    def compute(self, setpoint: Array, estimate: Estimate, memory: object, interval: float,
+                start: Array | None, previous: Array | None
+                ) -> tuple[Target | None, LawResult]:
+        """
+        Evaluate the law towards a target, see :meth:`target`, for an estimate of its model.
+
+        This is the one place where an exception of a law, or a result that is none, becomes a
+        failure with a reason.
+        """
+        target = None
+        try:
+            target = self.target(setpoint, estimate.w, start)
+            if target is None:
+                return None, LawResult(None, reason(Code.NO_STEADY_STATE))
+            target = self._within_reach(target, estimate.w)
+            return target, self._checked(
+                self.law.compute(estimate, target, memory, interval, previous))
+        except BaseException as error:
+            return target, LawResult(None, reason(Code.LAW_RAISED, error=contained(error)))
+
+    def _checked(self, result: Any) -> LawResult:
+        """Return a law's result within the range if its input, or its failure, can be used."""
+        for value, kind in ((result, LawResult), (result.info, SolutionInfo),
+                            (result.plan, Plan | None), (result.failure, Reason | None)):
+            if not isinstance(value, kind):
+                raise TypeError(f'it returned {type(value).__name__}, where {kind} is expected')
+        if result.failure is not None:
+            return replace(result, u=None)
+        u = np.asarray(result.u, dtype=np.float64)
+        if u.shape != (self.model.n_u,):
+            raise ValueError(f'it returned an input of shape {u.shape}, not ({self.model.n_u},)')
+        if not np.isfinite(u).all():
+            return LawResult(None, reason(Code.COMMAND_NOT_FINITE), result.info)
+        within = self.limits.within(u)
+        return replace(result, u=within, clipped=bool(result.clipped or np.any(within != u)))
+
+    def _within_reach(self, target: Target, w: Array) -> Target:
+        """Return the target, or what is nearest to it where the inputs do not suffice."""
+        model, limits = self.model, self.limits
+        # a single one at its end goes there by itself
+        if self.law.model_free or model.n_u == 1 or len(self.controlled) > model.n_u:
+            return target
+        u = model.inputs.to_physical(target.u)
+        if ((u >= limits.lower) & (u <= limits.upper)).all():
+            return target
+        return reachable_target(
+            model, self._indices, target, w, model.inputs.to_deviation(limits.lower),
+            model.inputs.to_deviation(limits.upper)) or target
+
+
+def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[str, Level]:
+    """
+    Build the levels that a tuning names, best first.
+
+    :raises ValueError: for a law or an estimator that there is not, or one that cannot do with
+        what is measured.
+    """
+    name = tuning.estimator or (
+        'extended_kalman_filter' if not outputs.determine_state else
+        'disturbance_observer' if tuning.disturbance_bandwidth > 0.0 else 'measured_state')
+    levels = {}
+    for law_name in tuning.levels:
+        law = plug_in(law_name, 'law', LAWS, Law, model, tuning)
+        estimator = plug_in(name, 'estimator', ESTIMATORS, Estimator, law.model, outputs, tuning)
+        levels[law_name] = Level(law_name, law, estimator, tuning.controlled)
+    return levels

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recovery from the safe input, where that keeps the plant outside the training data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.units import NANOSECONDS
+
+# The input is ahead of the plant by this share of the way from the safe input to the nominal
+# one; a sensor that stands still out there brings it no further.
+_LEAD = 0.25
+# Moved is what changes its distance from the middle of the training box by this share of it.
+_MOVED = 0.03
+# At rest is what has not moved for so many times as a better level is waited for.
+_REST = 3.0
+# A model is followed in steps of this share of its box and of the time in which its rate changes,
+# until less than a share of the box is left of its way.
+_STEP, _STEP_SHARE, _AT_REST = 0.02, 0.2, 1e-5
+_MAX_STEPS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class SafeStateRecovery:
+    """
+    How far a plant under the safe input has come back, by its distance from the training data.
+
+    Where the safe input itself keeps the plant outside, no law may act, and waiting does not
+    help. The input then moves towards the nominal one: by :data:`_LEAD`, and by the share of the
+    distance that the plant has left behind already. No model is asked how the plant moves out
+    there. One that does not follow, or a sensor that does not, stops the input where it is.
+    """
+
+    farthest: float  #: where it rested under the safe input, in half-ranges of the training box
+    nearest: float  #: smallest distance since then
+    since_ns: int  #: from when it has rested
+    led: bool = False  #: whether the input has begun to move
+
+    def moved(self, outside: float, time_ns: int, recovery_time: float
+              ) -> SafeStateRecovery | None:
+        """
+        Take a distance in half-ranges into account; None where the safe input led it back.
+
+        A plant that still moves under the safe input is waited for; one that moves further out
+        than where the way began starts it again.
+        """
+        if not (outside > 0.0 or self.led):
+            return None
+        change, still = outside - self.farthest, _MOVED * (1.0 + self.farthest)
+        if change > still or (change < -still and not self.led):
+            return SafeStateRecovery(outside, outside, time_ns)
+        led = self.led or (time_ns - self.since_ns) / NANOSECONDS >= _REST * recovery_time
+        return SafeStateRecovery(self.farthest, min(self.nearest, outside), self.since_ns, led)
+
+    @property
+    def share(self) -> float:
+        """The share of the nominal input in the command, from 0 to 1."""
+        return min(1.0, _LEAD + 1.0 - self.nearest / self.farthest) if self.led else 0.0
+
+
+def moves_toward_nominal(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> bool:
+    """
+    Tell whether the nominal input pushes a state towards the nominal one, beside the safe input.
+
+    On the other side, as that of a runaway, it is the safe input that does. State (n_x,) and
+    inputs (n_u,) are in their units.
+    """
+    difference = model.inputs.to_deviation(nominal) - model.inputs.to_deviation(safe)
+    deviation = model.states.to_deviation(x)
+    return bool(deviation @ model.forcing(deviation, difference) < 0.0)
+
+
+@dataclass(frozen=True)
+class RestState:
+    """Where the safe input leads the plant, according to its model."""
+
+    #: (n_x,) in state units; where it leaves what the model knows, a linear extrapolation from
+    #: there, and NaN where that does not come to rest
+    x: Array
+    outside: float  #: its distance from the training data in half-ranges, NaN likewise
+    #: (n_u,) input that would keep the plant where it leaves what the model knows, in input units;
+    #: None where it comes to rest before
+    holding: Array | None = None
+
+
+def rest_under(model: LiftedModel, u: Array, known: float) -> RestState:
+    """
+    Follow the model from its nominal state under an input until it rests, or is too far out.
+
+    :param u: (n_u,) in input units.
+    :param known: distance outside the training data, in half-ranges, up to which it is followed.
+    """
+    try:
+        with np.errstate(all='ignore'):
+            return _followed(model, u, known)
+    except np.linalg.LinAlgError:
+        # a model that gives no numbers: what it is to do in the loop fails likewise
+        return RestState(np.full(model.n_x, np.nan), np.nan)
+
+
+def _followed(model: LiftedModel, u: Array, known: float) -> RestState:
+    v = model.inputs.to_deviation(u)
+    rate_at = model.rate_under(v)
+    x = np.zeros(model.n_x)
+    rate = rate_at(x)
+    # of the deviations: steps of a fraction of the box, and of the time in which the rate changes
+    width = float(np.min((model.states.upper - model.states.lower) / model.states.scale))
+    time = np.inf
+    for _ in range(_MAX_STEPS):
+        speed = float(np.linalg.norm(rate))
+        if speed == 0.0 or speed * time < _AT_REST * width:
+            break
+        before, rate_before = x, rate
+        x = x + min(_STEP * width / speed, _STEP_SHARE * time) * rate
+        rate = rate_at(x)
+        if not model.distance(model.states.to_physical(x)) <= known:
+            return _beyond(model, x, v, rate)
+        change = float(np.linalg.norm(rate - rate_before))
+        time = float(np.linalg.norm(x - before)) / change if change > 0.0 else np.inf
+    place = model.states.to_physical(x)
+    return RestState(place, model.distance(place))
+
+
+def _beyond(model: LiftedModel, x: Array, u: Array, rate: Array) -> RestState:
+    """Extrapolate from a state (n_x,) moving at a rate (n_x,) under (n_u,), all scaled."""
+    slope = model.drift_jacobian(x) + model.forcing_jacobian(x, u)
+    place, outside = np.full(model.n_x, np.nan), np.nan
+    if np.all(np.isfinite(slope)) and np.all(np.linalg.eigvals(slope).real < 0.0):
+        place = model.states.to_physical(x - np.linalg.solve(slope, rate))
+        outside = model.distance(place)
+    return RestState(place, outside, model.inputs.to_physical(
+        -model.input_inverse(x) @ model.drift(x)))

@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The control step: one pure function of state, measurement and time, replayable bit for bit.
+
+check the measurement -> estimate -> set-point -> level -> law -> transfer -> limits -> report
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from koopman_ros.arrays import Array, kept
+from koopman_ros.control import setpoint as setpoints
+from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
+from koopman_ros.control.configuration import Configuration
+from koopman_ros.control.fallback import Level
+from koopman_ros.control.laws.base import LawResult, Target
+from koopman_ros.control.recovery import moves_toward_nominal, SafeStateRecovery
+from koopman_ros.control.state import (
+    Arrival,
+    CommandReport,
+    EstimateReport,
+    MeasurementReport,
+    Mode,
+    NO_COMMAND,
+    NOTHING_MEASURED,
+    Report,
+    State,
+    TargetReport,
+)
+from koopman_ros.control.supervisor import HOLD, MANUAL, Requested, SAFE, Supervisor
+from koopman_ros.control.timing import afresh, StepTime, time_of_measurement, time_of_silence
+from koopman_ros.estimation import Estimate, Verdict
+from koopman_ros.plugs import contained
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.signals import numbers
+from koopman_ros.units import LATE_NANOSECONDS
+
+
+@dataclass(frozen=True)
+class ControlStep(Configuration):
+    """The step of a configured loop; every method is pure and returns a new state."""
+
+    def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
+             countable: float | None = None) -> tuple[State, Array, Report]:
+        """
+        Answer one measurement.
+
+        A repeated stamp and one out of order, earlier by at most a second, return the last
+        command again; a still earlier stamp starts time afresh. After a gap in the measurements
+        ramp and rate limit count twice the interval before it, not the gap. Stamps that return to
+        where they were before they went back count from the newest of those.
+
+        :param y: (n_y,) measured, in the signals' units.
+        :param applied: (n_u,) measured input at that time, or None; see
+            :meth:`StateEstimation.applied`.
+        :param countable: largest number of seconds since the last stamp that ramp and rate limit
+            count, from another clock; None for any.
+        :return: the new state, the command (n_u,) in input units, always finite and within the
+            limits, and the report.
+        :raises ValueError: for a measurement or an input of another size.
+        """
+        y = numbers('measurement', y, self.measured.names)
+        if applied is not None:
+            applied = numbers('applied input', applied, self.model.inputs.names)
+        ahead = 1 if state.time_ns is None else time_ns - state.time_ns
+        if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
+            arrival = Arrival.LATE if ahead < 0 else Arrival.REPEATED
+            return state, state.command, self._report(
+                state, state.supervisor.reason, MeasurementReport(
+                    arrival, self._outside(state.estimate, y)))
+        back = ahead < 0
+        if back:
+            state = afresh(state)
+        state, time, missed = time_of_measurement(state, time_ns, countable)
+
+        def calculate() -> tuple[State, Array, Report]:
+            u, follows = self.estimation.applied(state, applied)
+            now, seen = self.estimation.observe(state, y, time_ns, time.elapsed, u)
+            accepted = seen.verdict.fault is None
+            if accepted:
+                now = self._advanced(now, seen.x, time)
+            return self._command(now, seen.verdict, MeasurementReport(
+                Arrival.ACCEPTED if accepted else Arrival.REJECTED,
+                seen.outside if accepted else self._outside(state.estimate, y), seen.expected,
+                missed, back, follows), time)
+
+        return self._contained(
+            calculate, replace(state, time_ns=time_ns),
+            MeasurementReport(Arrival.ACCEPTED, np.nan, missed=missed, clock_went_back=back),
+            time)
+
+    def hold(self, state: State, time_ns: int, cause: Code | None = Code.NO_MEASUREMENT
+             ) -> tuple[State, Array | None, Report]:
+        """
+        Command without a measurement: hold, and later go to the safe input.
+
+        :param time_ns: up to which nothing came, in the time of the measurements' stamps; before
+            the first of them, in that of any clock.
+        :param cause: why the command is held; None to command from the estimate, which the model
+            predicts.
+        :return: as :meth:`step`; the command is None before the first.
+        """
+        if state.command is None:
+            return state, None, self._report(state, None)
+        time = time_of_silence(state, time_ns)
+
+        def calculate() -> tuple[State, Array, Report]:
+            now = replace(state, estimate=self.estimation.predict(
+                state, time.elapsed, self.estimation.applied(state)[0]))
+            if cause is not None or state.mode is Mode.MANUAL:
+                fault = None if cause is None else reason(cause)
+                return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
+            if now.estimate is None or now.setpoint.active is None:
+                assert now.command is not None
+                now = replace(now, commanded_ns=time.command_ns)
+                return now, now.command, self._report(now, now.supervisor.reason)
+            x = self.model.states.to_physical(now.estimate.x)
+            return self._command(
+                self._advanced(now, x, time), Verdict(now.accepted),
+                MeasurementReport(outside=self.model.distance(x)), time)
+
+        return self._contained(calculate, state, NOTHING_MEASURED, time)
+
+    def _contained(self, calculate: Callable[[], tuple[State, Array, Report]], before: State,
+                   measured: MeasurementReport, time: StepTime) -> tuple[State, Array, Report]:
+        """
+        Return the result of a calculation; where it fails the command is held, later the safe one.
+
+        This is the one place where a failure of an estimator, or of anything else that a step
+        calculates, is caught; that of a law is a reason for the next level (:class:`Level`).
+
+        :param before: the state to hold from; its estimate restarts from the next measurement.
+        """
+        try:
+            # a measurement of 1e300 may overflow on its way; the result is checked and limited
+            with np.errstate(all='ignore'):
+                state, command, report = calculate()
+            if not np.isfinite(command).all():
+                raise FloatingPointError(f'the command would be {command.tolist()}')
+            if state.estimate is not None:
+                state.estimate.check(self.model.n_x)
+            return state, command, report
+        except BaseException as error:
+            fault = reason(Code.CALCULATION_FAILED, error=contained(error))
+            return self._command(
+                before.restarted(), Verdict(before.accepted, fault), measured, time)
+
+    def _advanced(self, state: State, x: Array, time: StepTime) -> State:
+        """Return the state with the set-point of now; `x` (n_x,) is what it begins from."""
+        return replace(state, setpoint=setpoints.advance(
+            state.setpoint, self.best.controlled_of(x), self.controlled,
+            self.tuning.setpoint_ramp, time.now_ns, time.counted, self.tuning.setpoint_filter))
+
+    def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
+                 time: StepTime) -> tuple[State, Array, Report]:
+        """Choose a level, and bring its input within the limits."""
+        transfer = state.transfer and state.transfer.after(
+            time.elapsed, self.tuning.transfer_time)
+        target = None
+        if state.mode is Mode.MANUAL:
+            state = state.without_law(transfer=True)
+            wanted = state.manual_input if state.manual_input is not None else (
+                self._last_command(state))
+            done, why = NO_COMMAND, verdict.fault
+        else:
+            supervisor, target, result = self._choose(state, verdict, measured.outside, time)
+            state = self._supervised(state, supervisor, verdict, measured.outside, time)
+            state, wanted, done = self._act(state, result, transfer)
+            why = state.supervisor.reason
+            if target is not None and not self.best.controls_all:
+                state = replace(state, target=kept(np.concatenate((
+                    self.model.states.to_physical(target.x),
+                    self.model.inputs.to_physical(target.u)))))
+        limited = limit(self.tuning.limits, wanted, state.command, time.counted)
+        done = replace(
+            done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
+            outside=self.model.inputs.violation(limited.u))
+        state = replace(state, command=limited.u, commanded_ns=time.command_ns)
+        return state, limited.u, self._report(state, why, measured, target, done)
+
+    def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime
+                ) -> tuple[Supervisor, Target | None, LawResult | None]:
+        """Find the level that acts; also give target and result of the last law tried, if any."""
+        if verdict.fault is not None:
+            requested = Requested(HOLD, verdict.fault, passing=True)
+        else:
+            requested = state.supervisor.allowed(self.order, outside, self.ranges)
+            while (level := self.levels.get(requested.level)) and level.unusable is not None:
+                requested = self._failed(level, level.unusable)
+        target, result = None, None
+        while True:
+            supervisor = state.supervisor.at(self.order, requested, time.now_ns)
+            level = self.levels.get(supervisor.level or '')
+            if level is None or state.estimate is None or state.setpoint.active is None:
+                return supervisor, target, result
+            estimate = self.estimation.rebase(
+                state.estimate, self.estimation.level(state), level)
+            memory = state.law_memory if state.law == level.name else None
+            target, result = level.compute(
+                state.setpoint.active, estimate, memory, time.spacing, state.target,
+                state.own_command)
+            if result.failure is not None:
+                requested = self._failed(level, result.failure, result.passing)
+                continue
+            # a poor law is better than none
+            below = self.order.below(level.name)
+            if below not in self.levels or target is None or not level.model.lost_at(
+                    estimate.x, target.x):
+                return supervisor, target, result
+            requested = Requested(below, reason(Code.LOST_HERE, level=level.name))
+
+    def _failed(self, level: Level, why: Reason, passing: bool = False) -> Requested:
+        return Requested(self.order.below(level.name), reason(
+            Code.LAW_FAILED, level=level.name, cause=why), passing)
+
+    def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
+                    time: StepTime) -> State:
+        """Take over the supervisor's new state, and the estimate in terms of its level."""
+        before = self.estimation.level(state)
+        state = replace(state, supervisor=supervisor, recovery=self._recovery(
+            state, supervisor, verdict, outside, time.now_ns))
+        return replace(state, estimate=None if state.estimate is None else self.estimation.rebase(
+            state.estimate, before, self.estimation.level(state)))
+
+    def _recovery(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
+                  time_ns: int) -> SafeStateRecovery | None:
+        """Return how far the plant has come back where the safe input keeps it outside."""
+        if supervisor.level != SAFE or verdict.fault is not None or verdict.accepted is None:
+            return None
+        if outside > 0.0 and not moves_toward_nominal(
+                self.model, self.estimation.position(state.estimate, verdict.accepted.value),
+                self.safe_input, self.nominal_input):
+            return None
+        if state.recovery is not None:
+            return state.recovery.moved(outside, time_ns, self.order.recovery_time)
+        # where laws failed, or one may act soon, it is not the distance that keeps them off
+        kept_out = supervisor.bad_since_ns is None and supervisor.better_since_ns is None
+        return SafeStateRecovery(outside, outside, time_ns) if kept_out and outside > 0.0 else None
+
+    def _act(self, state: State, result: LawResult | None, transfer: BumplessTransfer | None
+             ) -> tuple[State, Array, CommandReport]:
+        """Return the state with the acting law, the command before limits, and its report."""
+        level, held = state.supervisor.level, self._last_command(state)
+        if result is None or result.u is None:
+            done = NO_COMMAND if result is None else CommandReport(
+                replace(result.info, form=''), at_range=result.clipped, plan=result.plan)
+            if level == SAFE:
+                share = 0.0 if state.recovery is None else state.recovery.share
+                wanted = self.safe_input + share * (self.nominal_input - self.safe_input)
+                return state.without_law(transfer=True), wanted, replace(done, recovery=share)
+            passing = state.supervisor.resumes is not None
+            return state if passing else state.without_law(), held, done
+        if state.law != level and state.command is not None and self.tuning.transfer_time:
+            # the command was not this law's so far
+            transfer = with_step(None, held - result.u)
+        offset = None if transfer is None else transfer.offset
+        state = replace(state, law=level, law_input=result.u, law_memory=result.memory,
+                        transfer=transfer)
+        return state, result.u if offset is None else result.u + offset, CommandReport(
+            result.info, offset, at_range=result.clipped, plan=result.plan)
+
+    def _last_command(self, state: State) -> Array:
+        return self.model.inputs.center if state.command is None else state.command
+
+    def _outside(self, known: Estimate | None, y: Array) -> float:
+        """Return how far a measurement is from the training data; NaN when it is none."""
+        try:
+            return self.model.distance(
+                self.estimation.position(known, y)) if np.isfinite(y).all() else np.nan
+        except np.linalg.LinAlgError:
+            return np.nan
+
+    def _report(self, state: State, why: Reason | None,
+                measured: MeasurementReport = NOTHING_MEASURED, target: Target | None = None,
+                command: CommandReport = NO_COMMAND) -> Report:
+        active, manual = state.setpoint.active, state.mode is Mode.MANUAL
+        depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
+        return Report(
+            state.mode, MANUAL if manual else self.order.levels[depth], depth, why, measured,
+            None if state.estimate is None else EstimateReport(
+                state.estimate, self.estimation.level(state).estimator),
+            None if active is None else TargetReport(active, self.controlled, self.model, target),
+            command)

@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Times of a step: gaps, bursts and clocks that are set back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+from koopman_ros.control.state import State
+from koopman_ros.control.supervisor import HOLD
+from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
+
+# s that the rate limit counts at most between two commands without a measurement, unless
+# measurements are usually further apart.
+_LONGEST_WATCH = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class StepTime:
+    """The times of a step."""
+
+    now_ns: int  #: stamp of the measurement, or up to which there was none
+    command_ns: int  #: of the command
+    elapsed: float  #: seconds since the last command
+    counted: float  #: of these, seconds that count for ramp and rate limit
+    spacing: float = 0.0  #: seconds between samples; 0 when they are not known
+
+
+def usual_interval(state: State) -> float:
+    """Return the usual seconds between measurements; 0 before the second."""
+    return 0.0 if math.isinf(state.interval) else state.interval
+
+
+def afresh(state: State) -> State:
+    """Return the state after the clock was set back: what was timed by it has lost its meaning."""
+    supervisor = replace(state.supervisor, bad_since_ns=None, better_since_ns=None)
+    newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
+        state.time_ns, state.former_ns)
+    return replace(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
+                   supervisor=supervisor, recovery=None,
+                   setpoint=replace(state.setpoint, scheduled=()))
+
+
+def time_of_measurement(state: State, time_ns: int, countable: float | None
+                         ) -> tuple[State, StepTime, int]:
+    """Return the state with its usual interval, the times of the step, and what was missed."""
+    since_ns = state.commanded_ns
+    ahead_of_stamps = since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS
+    if ahead_of_stamps:
+        # what was commanded in silence was timed by a clock that these stamps do not follow
+        since_ns = state.time_ns
+    elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
+    # neither a gap nor a burst is the spacing of the samples, nor the first of them
+    spacing = min(usual_interval(state), elapsed)
+    counted, missed = 0.0, 0
+    if state.time_ns is not None and elapsed > 0.0:
+        since_ns = state.time_ns
+        if state.former_ns is not None and since_ns < state.former_ns < time_ns:
+            # two sources would count each other's time, but for this
+            since_ns = state.former_ns
+        since = (time_ns - since_ns) / NANOSECONDS
+        if math.isfinite(state.interval):
+            missed = max(0, round(since / state.interval) - 1)
+        # the plant stood under the old command all through a gap
+        seconds = min(since, 2.0 * state.interval)
+        # a burst of measurements does not make the next regular one a gap
+        state = replace(state, interval=max(seconds, 0.5 * usual_interval(state)))
+        counted = min(seconds, elapsed)
+    if ahead_of_stamps and state.supervisor.level != HOLD:
+        # the command has moved in that time already
+        counted = 0.0
+    if countable is not None:
+        counted = min(counted, countable)
+    return state, StepTime(time_ns, time_ns, elapsed, counted, spacing), missed
+
+
+def time_of_silence(state: State, time_ns: int) -> StepTime:
+    """Return the times of a step without a measurement up to a time."""
+    since_ns = time_ns if state.commanded_ns is None else state.commanded_ns
+    elapsed, spacing = max(0.0, (time_ns - since_ns) / NANOSECONDS), usual_interval(state)
+    # the command stood still all through a longer silence
+    counted = min(elapsed, max(_LONGEST_WATCH, 2.0 * spacing))
+    return StepTime(time_ns, max(time_ns, since_ns), elapsed, counted, spacing)

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""State estimators: the contract of a plug-in, and the estimate."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from functools import cached_property
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.declaration import NoParameters
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.signals import Outputs
+from koopman_ros.tuning import Tuning
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """
+    Differences between measurements and their predictions, over their standard deviations.
+
+    See Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with Applications to Tracking and
+    Navigation* (2001), section 5.4, on tests of consistency.
+    """
+
+    normalised: Array  #: (n_y,) of the last measurement, in its standard deviations
+    #: mean of the squares, weighed by the covariance and per output, of the last ones; 1 where the
+    #: estimator is consistent
+    mean_square: float
+    count: int  #: of measurements in that mean, at most :data:`INNOVATION_WINDOW`
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """The range that holds the mean square in 998 of 1,000 cases."""
+        from scipy.special import chdtri
+
+        # a fading mean is worth as many as twice its window
+        independent = self.count if self.count < INNOVATION_WINDOW else (
+            2 * INNOVATION_WINDOW - 1)
+        freedom = len(self.normalised) * independent
+        lower, upper = (float(chdtri(freedom, p)) / freedom for p in (0.999, 0.001))
+        return lower, upper
+
+
+#: Measurements over which the squares of an innovation are averaged; more fade.
+INNOVATION_WINDOW = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """
+    State and disturbance of the plant, in scaled deviations and the model's time unit.
+
+    dx/dt = f(x) + B u + w with f the model's drift, the same that the target is
+    calculated from: any difference between the two would be left as an offset.
+    """
+
+    x: Array  #: (n_x,) state
+    w: Array  #: (n_x,) disturbance of its rate, taken as constant
+    #: (2 n_x, 2 n_x) of the errors of both, or None where it is not known, or as at first
+    covariance: Array | None = None
+    innovation: Innovation | None = None  #: of the last measurement, or None likewise
+
+    @property
+    def finite(self) -> bool:
+        """Whether state, disturbance and covariance are finite numbers."""
+        return all(np.all(np.isfinite(value)) for value in (self.x, self.w, self.covariance)
+                   if value is not None)
+
+    def check(self, n_x: int) -> None:
+        """Raise a TypeError or ValueError unless it is one of so many states, and finite."""
+        P = self.covariance
+        shapes = (np.shape(self.x), np.shape(self.w), None if P is None else np.shape(P))
+        if shapes not in (((n_x,), (n_x,), None), ((n_x,), (n_x,), (2 * n_x, 2 * n_x))):
+            raise ValueError(f'the estimator returned x, w and covariance of shapes {shapes} for '
+                             f'{n_x} states')
+        if not isinstance(self.innovation, Innovation | None):
+            raise TypeError(f'the estimator returned {type(self.innovation).__name__} as the '
+                            'innovation')
+        if not self.finite:
+            raise ValueError('the estimate is not finite')
+
+
+class Estimator(ABC):
+    """
+    From measurements to an estimate of state and disturbance; pure, without memory of its own.
+
+    To add one, derive a class in any module and name it in `estimator` as ``module:Class``.
+    Measurements are given as a state that has the measured outputs and is otherwise the predicted
+    one. An exception holds the command, and the next measurement restarts the estimate.
+    """
+
+    #: frozen dataclass of its own parameters, see :mod:`koopman_ros.declaration`
+    Parameters: ClassVar[type[Any]] = NoParameters
+    #: whether an estimate depends on more than the last measurement
+    remembers: ClassVar[bool] = True
+
+    def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
+                 ) -> None:
+        """
+        Prepare the estimator; a ValueError refuses the configuration.
+
+        :param model: whose drift predicts.
+        :param outputs: what is measured of the state.
+        :param tuning: with one number for each signal of the model.
+        :param parameters: its own, of the class :attr:`Parameters`.
+        """
+        self.model = model
+        self.outputs = outputs
+        self.tuning = tuning
+        self.parameters = parameters
+
+    @abstractmethod
+    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """
+        Predict an estimate under a constant input.
+
+        :param u: (n_u,) applied input, in scaled deviations.
+        :return: the estimate then, or None after so long that nothing is known any more.
+        """
+
+    @abstractmethod
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Correct by a measurement (n_x,), in scaled deviations, so long after the last one."""
+
+    @abstractmethod
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """
+        Start from a measurement (n_x,) alone, as at first, and where no prediction is valid.
+
+        :param predicted: whose disturbance is kept, or None where nothing is known.
+        :param u: (n_u,) input that is assumed to hold the plant there, or None.
+        """
+
+    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+        """
+        Take over an estimate from another model, so that the plant's estimated rate stays.
+
+        :param rate: (n_x,) the other model's drift there, in this model's terms.
+        """
+        w = estimate.w + rate - self.model.drift(estimate.x)
+        return replace(estimate, w=self.bounded(w))
+
+    def as_input(self, w: Array) -> Array:
+        """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
+        return self.model.input_inverse().dot(w)
+
+    def at_bound(self, w: Array) -> bool:
+        """Return whether a disturbance is at `max_disturbance`, but for rounding."""
+        return self._share(w) >= 1.0 - 1e-9
+
+    def bounded(self, w: Array) -> Array:
+        """Return a disturbance within `max_disturbance`; none where it is not finite."""
+        share = self._share(w)
+        if share <= 1.0:
+            return w
+        return w / share if math.isfinite(share) else np.zeros_like(w)
+
+    def _share(self, w: Array) -> float:
+        """Return the largest share of its bound that a disturbance has as an input."""
+        return float(np.max(np.abs(self.as_input(w)) / self._max_disturbance, initial=0.0))
+
+    @cached_property
+    def _max_disturbance(self) -> Array:
+        return self.tuning.max_disturbance / self.model.inputs.scale

@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The disturbance observer, and the measured state itself, where all states are measured."""
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.estimation.base import Estimate, Estimator
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.signals import Outputs
+from koopman_ros.tuning import Tuning
+
+# One step of integration spans at most this share of the model's fastest time constant.
+_STEP_SHARE = 0.1
+_MAX_STEPS = 20
+_CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
+
+
+def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+    """Integrate the model by Heun's method, as :meth:`Estimator.predict`; None for too long."""
+    duration = seconds / model.seconds_per_time_unit
+    steps = max(1, math.ceil(duration * model.linearised.fastest_rate / _STEP_SHARE))
+    if steps > _MAX_STEPS:
+        return None
+    x, h, rate = estimate.x, duration / steps, model.rate_under(u, estimate.w)
+    for _ in range(steps):
+        slope = rate(x)
+        x = x + (0.5 * h) * (slope + rate(x + h * slope))
+    return Estimate(x, estimate.w)
+
+
+class DisturbanceObserver(Estimator):
+    """
+    Two equal poles for each state, set by `disturbance_bandwidth`; every state is measured.
+
+    With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
+    prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
+    p where the model's own motion within a sample is small.
+
+    :raises ValueError: where the outputs leave a state open.
+    """
+
+    def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
+                 ) -> None:
+        super().__init__(model, outputs, tuning, parameters)
+        if not outputs.determine_state:
+            raise ValueError(f'{", ".join(outputs.names)}, measured, do not determine all '
+                             f'{model.n_x} states: measure as many, or take a Kalman filter as '
+                             'the estimator')
+
+    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Integrate the model under input and disturbance."""
+        return simulated(self.model, estimate, u, seconds)
+
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Divide the innovation between state and disturbance."""
+        p = math.exp(-self.tuning.disturbance_bandwidth * seconds)
+        duration = seconds / self.model.seconds_per_time_unit
+        difference = x - predicted.x
+        w = predicted.w + ((1.0 - p) ** 2 / duration) * difference
+        return Estimate(predicted.x + (1.0 - p * p) * difference, self.bounded(w))
+
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """Keep a known disturbance; else take the one under which `u` holds the plant."""
+        if predicted is not None:
+            return Estimate(x, predicted.w)
+        if u is None:
+            return Estimate(x, np.zeros_like(x))
+        return Estimate(x, self.bounded(-self.model.rate_under(u)(x)))
+
+
+class MeasuredState(DisturbanceObserver):
+    """Every measurement is the state, and there is no disturbance, as in the paper."""
+
+    remembers: ClassVar[bool] = False
+
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Take the measurement as it is."""
+        return Estimate(x, np.zeros_like(x))
+
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """Take the measurement as it is."""
+        return Estimate(x, np.zeros_like(x))
+
+    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+        """Keep the state."""
+        return Estimate(estimate.x, np.zeros_like(estimate.w))
+
+
+def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
+    """
+    Return the error of the measurement that would explain a disturbance just as well.
+
+    One measured state cannot tell a biased sensor from a changed plant. Solves
+    f(x - bias) = f(x) + w; what comes out is NaN where the drift does not reach that far.
+
+    :return: (n_x,) in scaled deviations.
+    """
+    wanted = model.drift(estimate.x) + estimate.w
+    bias = np.zeros_like(estimate.x)
+    with np.errstate(all='ignore'):
+        for _ in range(20):
+            x = estimate.x - bias
+            try:
+                step = np.linalg.solve(model.drift_jacobian(x), model.drift(x) - wanted)
+            except np.linalg.LinAlgError:
+                break
+            bias = bias + step
+            # steps shrink by their square: the next one would be below rounding
+            if not np.all(np.abs(bias) < 1e3) or np.all(np.abs(step) < _CONVERGED):
+                break
+        solved = np.all(np.abs(bias) < 1e3) and np.allclose(
+            model.drift(estimate.x - bias), wanted, rtol=0.0, atol=1e-6)
+    return bias if solved else np.full_like(bias, np.nan)

@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Checks of measurements against range, jumps and stuck sensors, by their own stamps alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.signals import Outputs
+from koopman_ros.tuning import SensorLimits
+from koopman_ros.units import NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True)
+class Standstill:
+    """Since when each signal has been bit-identical, and how far the model has moved since."""
+
+    since_ns: tuple[int, ...]  #: (n_y,) stamps of the first of the identical measurements
+    travel: Array  #: (n_y,) predicted since then, in the signals' units
+    #: (n_x,) disturbance that was estimated when all signals last changed: what an observer makes
+    #: of a sensor that does not move is no disturbance
+    w: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The last measurement that was accepted."""
+
+    value: Array  #: (n_y,) in the signals' units
+    time_ns: int  #: its stamp
+    standstill: Standstill
+    jumped: bool = False  #: whether a later one was rejected as a jump
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The outcome of the check of a measurement."""
+
+    accepted: Accepted | None  #: to be remembered; None as long as none was accepted
+    fault: Reason | None = None  #: why it is rejected; None when it is accepted
+    moved: bool = False  #: whether it is accepted although the plant has jumped there
+
+
+def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Array, time_ns: int,
+          w: Array, travel: Callable[[Standstill], Array]) -> Verdict:
+    """
+    Accept or reject a measurement (n_y,), in the signals' units.
+
+    :param last: what is remembered, or None before the first.
+    :param time_ns: its stamp, later than those before.
+    :param w: (n_x,) disturbance that is estimated now.
+    :param travel: predicts how far (n_y,) the signals have moved since the last measurement,
+        under the disturbance that is remembered.
+    """
+    fault = _out_of_range(limits, outputs, y)
+    if fault is not None:
+        return Verdict(last, fault)
+    changed = Standstill((time_ns,) * len(y), np.zeros(len(y)), w)
+    if last is None:
+        return Verdict(Accepted(y, time_ns, changed))
+    seconds = (time_ns - last.time_ns) / NANOSECONDS
+    change = np.abs(y - last.value)
+    excess = change / (limits.jump + limits.rate * seconds)
+    i = int(np.argmax(excess))
+    if excess[i] > 1.0:
+        return Verdict(replace(last, jumped=True), reason(
+            Code.JUMPED, signal=outputs.names[i], before=float(last.value[i]), value=float(y[i]),
+            seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
+    # back after a jump, and further than noise brings it
+    moved = last.jumped and bool(np.any(change > limits.jump))
+    still = change == 0.0
+    if not still.any():
+        return Verdict(Accepted(y, time_ns, changed), moved=moved)
+    before = last.standstill
+    stuck = Standstill(
+        tuple(since if same else time_ns
+              for since, same in zip(before.since_ns, still, strict=True)),
+        np.where(still, before.travel + travel(before), 0.0), before.w)
+    accepted = Accepted(y, time_ns, stuck)
+    should_move = still & (np.abs(stuck.travel) > 0.5 * limits.jump)
+    stood = np.where(should_move, (time_ns - np.array(stuck.since_ns)) / NANOSECONDS, 0.0)
+    i = int(np.argmax(stood))
+    if stood[i] > limits.frozen_timeout > 0.0:
+        return Verdict(accepted, reason(
+            Code.FROZEN, signal=outputs.names[i], value=float(y[i]),
+            timeout=limits.frozen_timeout, change=0.5 * float(limits.jump[i])))
+    return Verdict(accepted, moved=moved)
+
+
+def _out_of_range(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | None:
+    for name, value, lower, upper in zip(
+            outputs.names, y.tolist(), limits.lower.tolist(), limits.upper.tolist(), strict=True):
+        if not np.isfinite(value):
+            return reason(Code.NOT_FINITE, signal=name, value=value)
+        if not lower <= value <= upper:
+            return reason(Code.OUTSIDE_SENSOR, signal=name, value=value, lower=lower, upper=upper)
+    return None

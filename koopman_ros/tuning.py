@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The tuning of a controller: one object, one row per parameter."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from koopman_ros.arrays import Array, brief
+from koopman_ros.declaration import (
+    ANY,
+    column,
+    for_signals,
+    nested,
+    NO_LOWER,
+    NO_UPPER,
+    parameter,
+    plugin_parameters,
+    UNBOUNDED,
+    value_column,
+)
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plugs import short_name
+
+
+@dataclass(frozen=True)
+class InputLimits:
+    """Range and rate limits of the inputs, in input units."""
+
+    lower: Array = value_column('inputs', 0.0, 'Smallest command.', name='min')
+    upper: Array = value_column('inputs', 0.0, 'Largest command.', name='max')
+    rate: Array = column(
+        'inputs', 0.0, 'Fastest change of the command; 0: any.', '{unit}/s', name='rate_limit',
+        none=ANY)
+
+    def within(self, u: Array) -> Array:
+        """Return the input (n_u,) of the range that is nearest."""
+        return np.minimum(np.maximum(u, self.lower), self.upper)
+
+
+@dataclass(frozen=True)
+class SensorLimits:
+    """What the sensors can measure and their plant can do, one number per measured signal."""
+
+    lower: Array = value_column(
+        'measured', -UNBOUNDED, 'Lower end of the range of the sensor.', name='sensor_min',
+        none=NO_LOWER)
+    upper: Array = value_column(
+        'measured', UNBOUNDED, 'Upper end of the range of the sensor.', name='sensor_max',
+        none=NO_UPPER)
+    rate: Array = column(
+        'measured', 0.0, 'Fastest change that is physically possible; 0: any.', '{unit}/s',
+        name='max_rate', none=ANY)
+    jump: Array = column(
+        'measured', 0.0, 'Change between two measurements that noise alone may bring; 0: any.',
+        name='max_jump', none=ANY)
+    frozen_timeout: float = parameter(
+        0.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
+        'than half of max_jump; 0: for ever.', 's', 0.0, 86400.0)
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """
+    What an engineer tunes, in the units of the model's signals.
+
+    Field and parameter have one name, but for columns whose row says another one: a row
+    ``weight`` of a state is the parameter ``<state>.weight``.
+    """
+
+    state_weight: Array = column(
+        'states', 0.0, 'Cost of the squared error of this state.', '1/({unit})^2', maximum=1e12,
+        name='weight')
+    input_weight: Array = column(
+        'inputs', 1.0, 'Cost of the squared deviation of this input from its steady value.',
+        '1/({unit})^2', maximum=1e12, open_minimum=True, name='weight')
+    limits: InputLimits = nested(InputLimits)
+    sensor: SensorLimits = nested(SensorLimits)
+    controlled: tuple[str, ...] = parameter(
+        ('',), 'Measured signals with a set-point, at most as many as there are inputs; an empty '
+        'name: all measured signals.', read_only=True)
+    setpoint_ramp: Array = column(
+        'controlled', 0.0, 'Fastest change of the tracked set-point; 0: steps.', '{unit}/s',
+        none=ANY)
+    setpoint_filter: float = parameter(
+        0.0, 'Time constant with which the tracked set-point follows its ramp; 0: none.', 's',
+        0.0, 86400.0)
+    estimator: str = parameter(
+        '', 'State estimator: disturbance_observer or measured_state where all states are '
+        'measured; extended_kalman_filter or unscented_kalman_filter; module:class for one of '
+        'your own; empty: chosen by what is measured.', code=True)
+    disturbance_bandwidth: float = parameter(
+        0.0, 'Bandwidth of the disturbance observer. Higher removes offsets sooner and passes '
+        'more noise to the inputs. 0: no observer.', '1/s', 0.0, 1000.0)
+    max_disturbance: Array = column(
+        'inputs', 0.0, 'Largest estimated disturbance, as an equivalent change of this input; 0: '
+        'any.', none=ANY)
+    tolerance: Array = column(
+        'inputs', UNBOUNDED, 'Deviation of the measured input from its command above which the '
+        'estimator takes the measured one.')
+    noise: Array = column(
+        'measured', 0.0, 'Standard deviation of the measurement noise, for a Kalman filter; 0: '
+        'that of the training record.')
+    wander: Array = column(
+        'inputs', 0.0, 'Random walk of the input disturbance in a minute, as a standard '
+        'deviation, for a Kalman filter; 0: derived from the model.')
+    initial_error: Array = column(
+        'states', 0.0, 'Standard deviation of the first estimate of this state, for a Kalman '
+        'filter; 0: a fourth of the trained range.')
+    levels: tuple[str, ...] = parameter(
+        ('sdre', 'linear'), 'Control laws, the best first: mpc (model predictive), sdre '
+        '(state-dependent Riccati equation), linear (LQR), pi; module:class for one of your own.',
+        code=True)
+    validity_margin: float = parameter(
+        0.1, 'Distance outside the trained range, in half-ranges, up to which the nonlinear laws '
+        'act; beyond it the linear one acts.', '', 0.0, 100.0)
+    linear_margin: float = parameter(
+        0.5, 'Distance outside the trained range, in half-ranges, up to which the laws linear and '
+        'pi act; beyond it the safe inputs are commanded.', '', 0.0, 100.0)
+    safe: Array = value_column(
+        'inputs', 0.0, 'Safe value: commanded when no law can act; brought within min and max.')
+    hold_timeout: float = parameter(
+        60.0, 'Time without a usable measurement or law after which the safe inputs are '
+        'commanded.', 's', 0.0, 86400.0)
+    recovery_time: float = parameter(
+        10.0, 'Time for which a better law must have been possible before it acts again.', 's',
+        0.0, 86400.0)
+    transfer_time: float = parameter(
+        0.0, 'Time constant of the bumpless transfer between laws, models, tunings and modes.',
+        's', 0.0, 86400.0)
+    max_gain: float = parameter(
+        1000.0, 'Largest norm of a Riccati gain, in scaled coordinates, that a law may use.', '',
+        0.0, 1e9, open_minimum=True)
+    max_riccati_residual: float = parameter(
+        1e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
+        0.0, 1.0, open_minimum=True)
+    #: own parameters of laws and estimators, by name
+    plugins: Mapping[str, Any] = plugin_parameters()
+
+    __repr__ = brief
+
+    def of_plugin(self, name: str, kind: type[Any]) -> Any:
+        """Return the own parameters of a plug-in by its name; those of `kind` by default."""
+        found = self.plugins.get(short_name(name))
+        return kind() if found is None else found
+
+    def for_signals(self, model: LiftedModel, measured: Sequence[str]) -> Self:
+        """
+        Return the tuning with one number for each signal.
+
+        :param measured: names of the signals that are measured.
+        :raises ValueError: naming what does not fit.
+        """
+        states, inputs = model.states.names, model.inputs.names
+        controlled = tuple(filter(None, self.controlled)) or states
+        if list(controlled) != [name for name in states if name in controlled]:
+            raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
+                             f'once and in this order, got {", ".join(controlled)}')
+        if len(inputs) < len(controlled) < len(states):
+            raise ValueError(f'{len(inputs)} inputs cannot hold {len(controlled)} signals '
+                             f'({", ".join(controlled)}): name at most {len(inputs)} in '
+                             'controlled, or leave it empty for a compromise between all states')
+        signals = {'states': states, 'measured': measured, 'controlled': controlled,
+                   'inputs': inputs}
+        made = for_signals(replace(self, controlled=controlled), signals)
+        made = replace(made, plugins={
+            name: for_signals(own, signals) for name, own in self.plugins.items()})
+        if not np.any(made.state_weight > 0.0):
+            raise ValueError('state_weight must not be 0 for all states')
+        for limits, kind in ((made.limits, 'input'), (made.sensor, 'sensor')):
+            if not np.all(limits.lower < limits.upper):
+                raise ValueError(f'{kind} limits must be lower < upper, got '
+                                 f'{limits.lower.tolist()} and {limits.upper.tolist()}')
+        if not np.all(np.isfinite(made.safe)):
+            raise ValueError(f'safe must be finite, got {made.safe.tolist()}')
+        if not made.levels or len(set(made.levels)) != len(made.levels):
+            raise ValueError(f'levels must be one law or more, each once, got {made.levels}')
+        return made
+
+    @classmethod
+    def for_model(cls, model: LiftedModel, measured: Sequence[str] = (), **given: Any) -> Self:
+        """
+        Return a tuning whose weights, ranges and safe inputs are a model's, but for what is given.
+
+        The weights are 1 on deviations scaled by the model, the inputs' limits their trained
+        range, and the safe inputs the nominal ones.
+
+        :param measured: names of the signals that are measured; all states by default.
+        """
+        inputs = model.inputs
+        return cls(**{
+            'state_weight': 1.0 / model.states.scale ** 2,
+            'input_weight': 1.0 / inputs.scale ** 2,
+            'limits': InputLimits(inputs.lower, inputs.upper), 'safe': inputs.center, **given}
+        ).for_signals(model, measured or model.states.names)
