@@ -95,7 +95,7 @@ unknown = np.full(2, np.nan)
 plant = Plant('two tanks', LEVELS, ('m', 'm'), PUMPS, ('V', 'V'), 's', nominal_state=unknown,
               nominal_input=unknown, B=None)
 found = identify(plant, [episode], degrees=(1, 2, 3),
-                 methods=[WeakForm(WeakFormParameters((20,)))])
+                 methods={'weak form': WeakForm(WeakFormParameters((20,)))})
 print(f'drift of degree {found.drift.degree}, found by {found.method}')
 print(f'noise: {1e3 * found.noise.round(6)} mm, in truth {1e3 * NOISE} mm')
 print(f'B:\n{found.drift.input_matrix.round(6)}, in truth\n{truth.B.round(6)} m/(V s)')

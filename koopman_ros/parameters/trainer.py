@@ -4,7 +4,8 @@
 """Parameters of the trainer node, which records bags, and of the player, which plays them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+import contextlib
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.declaration import plugin_parameters
 from koopman_ros.execution import scheduler_refusal
 from koopman_ros.experiment import Experiment
+from koopman_ros.identification_methods import parameters_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
@@ -36,6 +39,7 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
+from koopman_ros.plugs import short_name
 from koopman_ros.units import conversion, display_unit
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
@@ -165,6 +169,11 @@ class TrainerParameters:
     input_matrix_degree: int = parameter(
         0, 'degree of the polynomial in the states that a learned B is, where what an input does '
         'depends on them; 0 for a constant B', '', 0, 5)
+    identification_methods: tuple[str, ...] = parameter(
+        ('weak_form', 'total_variation'), 'methods that estimate the drift where all states are '
+        'measured, of which held-out segments choose: weak_form, total_variation, or module:Class',
+        code=True)
+    methods: Mapping[str, Any] = plugin_parameters()
     hidden_states: int = parameter(
         0, 'most states of the plant that are not measured, which a lift is learned with; 0 where '
         'all are', '', 0, 4)
@@ -247,6 +256,9 @@ class TrainerParameters:
                 'input_matrix_degree': self.input_matrix_degree,
                 'hidden_states': self.hidden_states, 'equations': self.equations,
                 'constants': named_ranges(self.constants_estimated),
+                'methods': self.identification_methods,
+                'method_parameters': {name: asdict(own) for name, own in self.methods.items()
+                                      if name in map(short_name, self.identification_methods)},
                 'margin': self.gate_margin, 'condition': self.gate_condition,
                 'scheduler': self.scheduler, 'device': self.device}
 
@@ -278,9 +290,14 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
                              f'{name}.{high}': shown(float(box.upper[i]))}
                 if box is present.inputs:
                     defaults[f'{name}.safe'] = shown(float(box.center[i]))
+    methods: dict[str, type[Any]] = {}
+    for names in ((), given.get('identification_methods', ())):
+        # what is no method, the check of the parameters refuses
+        with contextlib.suppress(ValueError):
+            methods |= parameters_of(tuple(filter(None, names)))
     return ParameterTable(
         TrainerParameters, partial(_cross_check, signals), partial(_plan, signals),
-        signals={'states': signals.states, 'inputs': signals.inputs},
+        signals={'states': signals.states, 'inputs': signals.inputs}, plugins=methods,
         defaults={**defaults, **own, 'system': system})
 
 
@@ -326,6 +343,10 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
     if reason := scheduler_refusal(values.scheduler):
         return reason
+    try:
+        parameters_of(values.identification_methods)
+    except ValueError as error:
+        return f'identification_methods = {list(values.identification_methods)}: {error}'
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
     n_x, n_u = len(signals.states), len(signals.inputs)

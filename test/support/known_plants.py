@@ -32,9 +32,10 @@ def box(state_lower, state_upper, input_lower, input_upper) -> Box:
                                               ('u', input_lower, input_upper))), 's')
 
 
-def methods(*windows: int) -> list[IdentificationMethod]:
+def methods(*windows: int) -> dict[str, IdentificationMethod]:
     """Return few methods to choose from: the weak form with some windows, total variation."""
-    return [WeakForm(WeakFormParameters(windows)), TotalVariation()]
+    return {'weak_form': WeakForm(WeakFormParameters(windows)),
+            'total_variation': TotalVariation()}
 
 
 @dataclass(frozen=True)

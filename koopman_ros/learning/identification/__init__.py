@@ -8,6 +8,7 @@ Training needs states with their derivatives; sensors give states with noise. He
 dx/dt = f(x) + B u is found from the measurements first; the lift is then learned from that drift.
 """
 
+from koopman_ros.identification_methods import WeakFormParameters
 from koopman_ros.learning.identification.base import (
     DriftEstimate,
     DriftProblem,
@@ -27,7 +28,6 @@ from koopman_ros.learning.identification.identify import (
     EstimatedConstant,
     Identified,
     identify,
-    METHODS,
     methods_of,
     Score,
     Standing,
@@ -40,34 +40,12 @@ from koopman_ros.learning.identification.total_variation import (
     TotalVariation,
 )
 from koopman_ros.learning.identification.unmeasured_states import identify_hidden
-from koopman_ros.learning.identification.weak_form import weak_form, WeakForm, WeakFormParameters
+from koopman_ros.learning.identification.weak_form import weak_form, WeakForm
 
 __all__ = [
-    'METHODS',
-    'Drift',
-    'DriftEstimate',
-    'DriftModel',
-    'DriftProblem',
-    'EstimatedConstant',
-    'IdentificationMethod',
-    'Identified',
-    'Score',
-    'Segments',
-    'Standing',
-    'Stopped',
-    'TotalVariation',
-    'WeakForm',
-    'WeakFormParameters',
-    'box_of',
-    'fitted_starts',
-    'identify',
-    'identify_grey',
-    'identify_hidden',
-    'longest_step',
-    'methods_of',
-    'noise_level',
-    'output_error',
-    'prediction_error',
-    'total_variation',
-    'weak_form',
+    'Drift', 'DriftEstimate', 'DriftModel', 'DriftProblem', 'EstimatedConstant',
+    'IdentificationMethod', 'Identified', 'Score', 'Segments', 'Standing', 'Stopped',
+    'TotalVariation', 'WeakForm', 'WeakFormParameters', 'box_of', 'fitted_starts', 'identify',
+    'identify_grey', 'identify_hidden', 'longest_step', 'methods_of', 'noise_level',
+    'output_error', 'prediction_error', 'total_variation', 'weak_form',
 ]

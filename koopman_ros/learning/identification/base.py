@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from koopman_ros.arrays import Array, brief
+from koopman_ros.declaration import NoParameters
 from koopman_ros.learning.identification.drift import DriftModel
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Episode
@@ -39,19 +40,14 @@ class DriftEstimate:
     variant: str = ''  #: e.g. ``'40 samples'``
 
 
-@dataclass(frozen=True)
-class NoParameters:
-    """The parameters of a method that has none of its own."""
-
-
 class IdentificationMethod(ABC):
     """
     An estimate of a drift from noisy samples.
 
-    A class of one's own is named as ``module:Class`` in the parameter `identification_methods`::
+    A class of one's own is named as ``module:Class`` in the parameter `identification_methods`;
+    its own parameters are then ``Class.<parameter>``::
 
         class Finest(IdentificationMethod):
-            name = 'finest'
             Parameters = FinestParameters
 
             def estimate(self, problem):
@@ -61,8 +57,8 @@ class IdentificationMethod(ABC):
     :param parameters: of the class `Parameters`, by default its defaults.
     """
 
-    name: ClassVar[str]  #: for reports and as the prefix of its parameters
-    Parameters: ClassVar[type[Any]] = NoParameters  #: a frozen dataclass
+    #: a frozen dataclass of the method's own parameters, see :mod:`koopman_ros.declaration`
+    Parameters: ClassVar[type[Any]] = NoParameters
 
     def __init__(self, parameters: Any = None) -> None:
         self.parameters = self.Parameters() if parameters is None else parameters

@@ -15,6 +15,7 @@ import numpy as np
 
 from koopman_ros.arrays import brief
 from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
 from koopman_ros.learning.identification.drift import (
     box_of,
@@ -26,16 +27,12 @@ from koopman_ros.learning.identification.drift import (
 )
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.output_error import output_error
-from koopman_ros.learning.identification.total_variation import noise_level, TotalVariation
-from koopman_ros.learning.identification.weak_form import WeakForm
+from koopman_ros.learning.identification.total_variation import noise_level
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, cut, Episode, Plant
-from koopman_ros.plugs import contained, plug
+from koopman_ros.plugs import contained, plug_class, short_name
 
-#: By name; one that needs a rough B comes after one that estimates it.
-METHODS: Mapping[str, type[IdentificationMethod]] = {
-    method.name: method for method in (WeakForm, TotalVariation)}
 DEGREES = (1, 2, 3, 4, 5, 6)
 # Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
 # minutes for more, and an hour does not determine them.
@@ -150,7 +147,7 @@ class Identified:
 
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
-             methods: Sequence[IdentificationMethod] | None = None, seed: int = 0,
+             methods: Mapping[str, IdentificationMethod] | None = None, seed: int = 0,
              watch: Watch = lambda *_: False, backend: Backend | None = None) -> Identified:
     """
     Estimate dx/dt = f(x) + B(x) u from sampled, noisy measurements.
@@ -164,7 +161,8 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     :param plant: names, units, and B where it is known, or the degree of the B(x) to learn.
     :param degrees: of f that are tried, rising, the first one 1; by default those whose drift has
         few enough coefficients for so many states.
-    :param methods: in the order in which they pass a rough B on; all of ``METHODS`` by default.
+    :param methods: by name, in the order in which they pass a rough B on; all of ``METHODS`` by
+        default.
     :param seed: of the split.
     :param backend: where the degrees are estimated, each by itself; this process by default.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
@@ -183,7 +181,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     inputs = InputModel.of(plant, box, np.concatenate([part.x for part in parts]))
     known = inputs.weights
     if methods is None:
-        methods = [method() for method in METHODS.values()]
+        methods = methods_of(tuple(METHODS), {})
     scores: list[Score] = []
     failures: dict[str, None] = {}
     best: dict[int, tuple[DriftModel, Score]] = {}
@@ -235,7 +233,7 @@ class _Given:
     box: Box
     known: Array | None  # B as DriftModel has it
     input_degree: int  # of the B(x) to estimate
-    methods: Sequence[IdentificationMethod]
+    methods: Mapping[str, IdentificationMethod]
 
 
 @dataclass(frozen=True)
@@ -309,12 +307,12 @@ def _estimates(given: _Given, degree: int
     """Return the estimates of all methods by name, and why methods failed unexpectedly."""
     found: list[tuple[str, DriftModel]] = []
     failures = []
-    for method in given.methods:
+    for name, method in given.methods.items():
         rough = found[-1][1].B if found else given.known
         try:
             for estimate in method.estimate(DriftProblem(
                     given.fit, given.box, degree, given.known, rough, given.input_degree)):
-                words = [method.name.replace('_', ' '), estimate.variant]
+                words = [name.replace('_', ' '), estimate.variant]
                 if not np.all(np.isfinite(estimate.model.coefficients)):
                     raise ValueError('its coefficients are not finite')
                 found.append((', '.join(filter(None, words)), estimate.model))
@@ -322,28 +320,26 @@ def _estimates(given: _Given, degree: int
             # as on short segments
             continue
         except Exception as error:
-            failures.append(f'the method {method.name} failed: {contained(error)}')
+            failures.append(f'the method {name} failed: {contained(error)}')
     return found, tuple(failures)
 
 
 def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
-               ) -> list[IdentificationMethod]:
+               ) -> dict[str, IdentificationMethod]:
     """
-    Return methods of identification.
+    Return methods of identification by name.
 
     :param names: of ``METHODS``, or ``module:Class`` for one of your own.
     :param parameters: fields of its `Parameters` by the name of the method.
     :raises ValueError: for a name without a method, a class that does not fulfil the contract, or
         parameters that it does not have.
     """
-    found: list[IdentificationMethod] = []
+    found: dict[str, IdentificationMethod] = {}
     for name in names:
-        kind = plug(name, 'identification method', METHODS)
-        if not (isinstance(kind, type) and issubclass(kind, IdentificationMethod)):
-            raise ValueError(f'the identification method {name!r} is no class derived from '
-                             'IdentificationMethod: derive it')
+        kind = plug_class(name, 'identification method', METHODS, IdentificationMethod)
+        short = short_name(name)
         try:
-            found.append(kind(kind.Parameters(**parameters.get(kind.name, {}))))
+            found[short] = kind(kind.Parameters(**parameters.get(short, {})))
         except Exception as error:
             raise ValueError(f'the identification method {name!r} cannot be configured: '
                              f'{contained(error)}') from error

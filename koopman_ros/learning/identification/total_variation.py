@@ -27,8 +27,6 @@ _SHORTEST = 8
 class TotalVariation(IdentificationMethod):
     """Derivatives by total variation, with B of an earlier method taken off."""
 
-    name = 'total_variation'
-
     def estimate(self, problem: DriftProblem) -> Sequence[DriftEstimate]:
         """Return one estimate, see :func:`total_variation`."""
         return [DriftEstimate(total_variation(

@@ -4,11 +4,11 @@
 """Estimates of a drift by linear least squares: the weak form (weak SINDy)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
+from koopman_ros.identification_methods import WeakFormParameters
 from koopman_ros.learning.identification.base import (
     DriftEstimate,
     DriftProblem,
@@ -20,7 +20,7 @@ from koopman_ros.plant_data import Array, Episode
 
 # Exponent of the test functions (1 - s^2)^p, which are zero at the first and at the last sample.
 _POWER = 3
-_NARROWEST = 4
+_NARROWEST = 4  # samples of a window
 # On [0, 1].
 _NODES, _WEIGHTS = 0.5 * np.add(leggauss(3), [[1.0], [0.0]])
 
@@ -50,28 +50,22 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
     return DriftModel(box, degree, solution[:m], solution[m:].T if B is None else B)
 
 
-@dataclass(frozen=True)
-class WeakFormParameters:
-    """Parameters of the weak form."""
-
-    windows: tuple[int, ...] = (10, 20, 40, 80)  #: samples of the windows that are tried
-
-    def __post_init__(self) -> None:
-        if min(self.windows, default=0) < _NARROWEST:
-            raise ValueError(f'windows = {list(self.windows)} must hold at least {_NARROWEST} '
-                             'samples each')
-
-
 class WeakForm(IdentificationMethod):
     """The weak form with windows of several lengths; the widest one knows B best."""
 
-    name = 'weak_form'
     Parameters = WeakFormParameters
+
+    def __init__(self, parameters: WeakFormParameters | None = None) -> None:
+        super().__init__(parameters)
+        windows = self.parameters.windows
+        if not all(window >= _NARROWEST for window in windows):
+            raise ValueError(f'windows = {list(windows)} must hold at least {_NARROWEST} samples '
+                             'each')
 
     def estimate(self, problem: DriftProblem) -> Sequence[DriftEstimate]:
         """Return an estimate for each window that the segments are long enough for."""
         found, refusal = [], ''
-        for window in self.parameters.windows:
+        for window in map(int, self.parameters.windows):
             try:
                 found.append(DriftEstimate(weak_form(
                     problem.episodes, problem.box, problem.degree, problem.B, window,
@@ -96,9 +90,6 @@ def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | Non
     :param input_degree: of the polynomial B(x) that is learned.
     :raises ValueError: when the window or the episodes are too short.
     """
-    if window < _NARROWEST:
-        raise ValueError(f'a window of {window} samples is too short, at least {_NARROWEST} are '
-                         'needed')
     n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
     shape = DriftModel(box, degree, np.empty(0), np.empty((n_x, n_u)) if B is None else B)
     input_degree = input_degree if B is None else shape.input_degree

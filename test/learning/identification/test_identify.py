@@ -117,7 +117,6 @@ class OneWindow:
 
 
 class Own(IdentificationMethod):
-    name = 'own'
     Parameters = OneWindow
 
     def estimate(self, problem):
@@ -126,14 +125,12 @@ class Own(IdentificationMethod):
 
 
 class Raising(IdentificationMethod):
-    name = 'raising'
-
     def estimate(self, problem):
         return 1 // 0
 
 
 class Unfinished(IdentificationMethod):
-    name = 'unfinished'
+    pass
 
 
 def function():
@@ -150,22 +147,23 @@ def own_module(tmp_path, monkeypatch):
 @pytest.mark.usefixtures('own_module')
 def test_a_method_of_ones_own_has_its_own_parameters(noisy):
     """One that raises is a reason, and the others go on."""
-    own = methods_of(['own_methods:Own', 'own_methods:Raising'], {'own': {'window': 12}})
+    own = methods_of(['own_methods:Own', 'own_methods:Raising'], {'Own': {'window': 12}})
     found = identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1, 3), methods=own)
-    assert {score.method for score in found.scores} == {'own, 12', 'output error from own, 12'}
+    assert {score.method for score in found.scores} == {'Own, 12', 'output error from Own, 12'}
     (warning,) = found.warnings
-    assert 'raising' in warning
+    assert 'Raising' in warning
     assert 'ZeroDivisionError' in warning
-    with pytest.raises(ValueError, match=r'no drift fits the episodes: .*raising.*ZeroDivision'):
-        identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1,), methods=own[1:])
+    with pytest.raises(ValueError, match=r'no drift fits the episodes: .*Raising.*ZeroDivision'):
+        identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1,),
+                 methods={'Raising': own['Raising']})
 
 
 @pytest.mark.usefixtures('own_module')
 @pytest.mark.parametrize(('name', 'parameters', 'words'), [
-    ('own_methods:Unfinished', {}, 'abstract'),
-    ('own_methods:function', {}, 'no class derived from IdentificationMethod'),
-    ('own_methods:Own', {'own': {'window': 3}}, 'window must be at least 5'),
-    ('own_methods:Own', {'own': {'size': 3}}, 'size'),
+    ('own_methods:Unfinished', {}, 'lacks estimate'),
+    ('own_methods:function', {}, 'no subclass of'),
+    ('own_methods:Own', {'Own': {'window': 3}}, 'window must be at least 5'),
+    ('own_methods:Own', {'Own': {'size': 3}}, 'size'),
     ('own_methods:Absent', {}, 'Absent'), ('weak', {}, 'choose one of weak_form, total_variation'),
     ('weak_form', {'weak_form': {'windows': (3,)}}, 'at least 4')])
 def test_methods_are_checked_when_configured(name, parameters, words):
