@@ -8,7 +8,7 @@ Nodes start ``python -m koopman_ros.learning``.
 """
 
 from koopman_ros.learning.acceptance import decide, Decision, Thresholds
-from koopman_ros.learning.drift_samples import compare_classes, drift_samples, learn_lift
+from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
 from koopman_ros.learning.fleet import Outcome, retrain_fleet
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.edmd import Edmd, Linearisation

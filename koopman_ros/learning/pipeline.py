@@ -19,7 +19,7 @@ from koopman_ros.bags import Account
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import decide, Decision, shortfalls, Thresholds
 from koopman_ros.learning.downsampling import coverage
-from koopman_ros.learning.drift_samples import compare_classes
+from koopman_ros.learning.drift_sampling import compare_classes
 from koopman_ros.learning.identification import (
     DriftModel,
     Identified,

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from koopman_ros.control.law_check import LawCheck
 from koopman_ros.learning import decide, learn_lift, Thresholds
 from koopman_ros.learning.acceptance import shortfalls
-from koopman_ros.learning.drift_samples import _spread, drift_samples
+from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.identification import (
     DriftModel,
     identify,

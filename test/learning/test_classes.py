@@ -13,13 +13,13 @@ from koopman_ros.execution.training import class_lines, scalars
 from koopman_ros.learning import (
     compare_classes,
     decide,
+    drift_sampling,
     Growth,
     NeuralDrift,
     retrain,
     Thresholds,
     TrainingTask,
 )
-from koopman_ros.learning import drift_samples as drift_samples_module
 from koopman_ros.learning.identification import identify, Stopped
 from koopman_ros.lifting import load
 from koopman_ros.model_classes import BEST, CLASSES
@@ -37,7 +37,7 @@ GATE = Thresholds()
 def small_networks():
     """Learn small networks; that of the identity lift is the task's own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drift_samples_module, 'usual_recipes', lambda _: {
+        patch.setattr(drift_sampling, 'usual_recipes', lambda _: {
             'neural drift': NeuralDrift(3, max_iterations=60), 'identity lift': Growth(2),
             'free lift': Growth(1, identity=False, hidden_first=3, max_iterations=60)})
         yield

@@ -14,13 +14,13 @@ from scipy.optimize import root
 
 from koopman_ros import control, plants
 from koopman_ros.arrays import Array
-from koopman_ros.estimation import DisturbanceObserver, EstimatorTuning
+from koopman_ros.estimation import DisturbanceObserver
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import table_of
-from koopman_ros.parameters.wire import signals_of
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.reasons import Words
 from koopman_ros.replay.records import encoded
 from koopman_ros.signals import Outputs
+from koopman_ros.tuning import Tuning
 from koopman_ros.units import Displays
 from koopman_ros.units import NANOSECONDS as SECOND
 
@@ -41,9 +41,10 @@ def shipped(name: str) -> LiftedModel:
 def observing(model: LiftedModel, bandwidth: float, bound: float = np.inf) -> DisturbanceObserver:
     """Return an observer of all states, its bandwidth in 1/s, one bound for all inputs."""
     states = model.states
-    return DisturbanceObserver(model, EstimatorTuning(
-        Outputs(states.names, states.units, np.eye(model.n_x)), bandwidth,
-        np.full(model.n_u, bound)))
+    return DisturbanceObserver(
+        model, Outputs(states.names, states.units, np.eye(model.n_x)), Tuning.for_model(
+            model, disturbance_bandwidth=bandwidth, max_disturbance=bound * model.inputs.scale),
+        None)
 
 
 def steady_state(system: plants.ControlAffineSystem, u: list[float], guess: list[float]
@@ -72,23 +73,15 @@ def run_reactor(model: LiftedModel, law: Law, R: float, minutes: float) -> tuple
 EPOCH = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
 SAFE = LOWER
-USUAL = table_of(shipped('reactor_nz4')).snapshot({}).settings(
-    signals_of(shipped('reactor_nz4')))
+USUAL = built(table_of(shipped('reactor_nz4')).snapshot({}), shipped('reactor_nz4')).tuning
 
 
-def controller(model: Any = 'reactor_nz4', *, supervisor: Mapping[str, float] | None = None,
-               sensor: Mapping[str, Any] | None = None, **changes: Any) -> control.Controller:
+def controller(model: Any = 'reactor_nz4', *, sensor: Mapping[str, Any] | None = None,
+               **changes: Any) -> control.Controller:
     """Return a controller with the default parameters of its node."""
     model = shipped(model) if isinstance(model, str) else model
     return control.Controller(model, replace(
-        USUAL, sensor=replace(USUAL.sensor, **(sensor or {})),
-        supervisor=supervisor_settings(**(supervisor or {})), **changes))
-
-
-def supervisor_settings(learned: float = 0.1, linear: float = 0.5, **times: float
-                        ) -> control.SupervisorSettings:
-    return control.SupervisorSettings(
-        (control.LevelSettings('sdre', learned), control.LevelSettings('linear', linear)), **times)
+        USUAL, sensor=replace(USUAL.sensor, **(sensor or {})), **changes))
 
 
 say = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}))

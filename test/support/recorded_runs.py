@@ -14,11 +14,10 @@ import numpy as np
 
 from koopman_ros import plants
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
-from koopman_ros.control import Controller, Settings, State
+from koopman_ros.control import Controller, State
 from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
-from koopman_ros.lifting import load_with_digest
-from koopman_ros.parameters.controller import table_of
-from koopman_ros.parameters.wire import signals_of
+from koopman_ros.lifting import LiftedModel, load_with_digest
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.plant_data import Episode
 from koopman_ros.replay import records
 from koopman_ros.resources import model_path
@@ -124,17 +123,16 @@ class Recorded:
     def __init__(self, name: str = 'reactor_nz4', run: str = 'a', **parameters: float) -> None:
         self.run, self.now = run, 0
         self.parameters = {**TABLE.values(TABLE.snapshot({})), 'model': name, **parameters}
-        self.controller = Controller(MODELS[name][0], self.settings)
+        self.controller = self.built(MODELS[name][0])
         self.state = State()
         self.texts: list[str] = []
         self.answers: list[tuple[int, float, float]] = []  # stamp in ns, measured and command in K
         self.commands: list[np.ndarray] = []
         self.snapshot(records.START)
 
-    @property
-    def settings(self) -> Settings:
-        """The tuning that the parameters stand for, of every one of the models."""
-        return TABLE.snapshot(self.parameters).settings(signals_of(MODELS['reactor_nz4'][0]))
+    def built(self, model: LiftedModel) -> Controller:
+        """Return the controller that the parameters stand for, with any of the models."""
+        return built(TABLE.snapshot(self.parameters), model)
 
     def write(self, event: str, fields: Mapping[str, object]) -> None:
         self.texts.append(records.Record(self.run, len(self.texts), event, fields).text())
@@ -170,7 +168,7 @@ class Recorded:
             model = load_with_digest(model_path(name))[0]
             fields['model'] = {'name': name, 'digest': MODELS[name][1]}
         predecessor = self.controller
-        self.controller = Controller(model, self.settings)
+        self.controller = self.built(model)
         self.state = self.controller.hand_over(predecessor, self.state)
         event = records.PARAMETERS if len(parameters) > ('model' in parameters) else records.MODEL
         self.write(event, fields)

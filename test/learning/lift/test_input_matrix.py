@@ -16,7 +16,7 @@ from koopman_ros.control.hindsight import Windows
 from koopman_ros.control.law_check import check_law
 from koopman_ros.estimation import Estimate
 from koopman_ros.learning import Edmd, fit, Growth, NeuralDrift, roll_out, train
-from koopman_ros.learning.drift_samples import learn_lift
+from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.lifting import Box, load, save
