@@ -200,7 +200,8 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
     return tuple(warnings)
 
 
-def shortfalls(states: Coordinates, wanted: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
+def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float]]
+                        ) -> tuple[str, ...]:
     """
     Say which set-points that are wanted a trained range leaves out.
 

@@ -30,7 +30,7 @@ _SHORTEST = 10  # means of a segment
 
 
 @dataclass
-class Survey:
+class RecordStatistics:
     """Range and pace of a record, seen episode by episode; of constant size."""
 
     lower: Array  #: (n,) lowest value of each state and input
@@ -41,7 +41,7 @@ class Survey:
     errors: Array = field(default_factory=lambda: np.zeros((2, len(_GROUPS), 1)))
 
     @classmethod
-    def empty(cls, n_x: int, n_u: int) -> Survey:
+    def empty(cls, n_x: int, n_u: int) -> RecordStatistics:
         """Return that of nothing."""
         return cls(np.full(n_x + n_u, np.inf), np.full(n_x + n_u, -np.inf), 0,
                    np.zeros((2, len(_GROUPS), n_x)))
@@ -62,10 +62,11 @@ class Survey:
             self.errors[:, g] += [np.sum(weights * errors, axis=0),
                                   np.sum(weights * own.mean(axis=1), axis=0)]
 
-    def merged(self, other: Survey) -> Survey:
+    def merged(self, other: RecordStatistics) -> RecordStatistics:
         """Return that of both."""
-        return Survey(np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper),
-                      self.count + other.count, self.errors + other.errors)
+        return RecordStatistics(
+            np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper),
+            self.count + other.count, self.errors + other.errors)
 
     def group(self, most: int) -> int:
         """Return how many samples are averaged so that `most` are left, or nearly; 1 for none."""

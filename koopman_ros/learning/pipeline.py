@@ -17,15 +17,15 @@ import numpy as np
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account
 from koopman_ros.execution import Backend, backend_of
-from koopman_ros.learning.acceptance import decide, Decision, shortfalls, Thresholds
+from koopman_ros.learning.acceptance import decide, Decision, Thresholds, uncovered_setpoints
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import compare_classes
 from koopman_ros.learning.identification import (
     DriftModel,
+    estimate_parameters,
     Identified,
     identify,
-    identify_grey,
-    identify_hidden,
+    identify_unmeasured,
     methods_of,
     Stopped,
 )
@@ -221,10 +221,10 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
         return on_progress(_at('estimate', done / total), f'estimating: {text}')
 
     if task.equations:
-        found = identify_grey(plant, episodes, plant_class(task.equations), task.constants,
+        found = estimate_parameters(plant, episodes, plant_class(task.equations), task.constants,
                               seed=task.seed, watch=estimating)
     elif task.hidden_states:
-        found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
+        found = identify_unmeasured(plant, episodes, task.hidden_states, seed=task.seed,
                                 watch=estimating, backend=backend)
     else:
         found = identify(plant, episodes, methods=methods, seed=task.seed, watch=estimating,
@@ -267,7 +267,7 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     decision = replace(decision, warnings=(
-        *decision.warnings, *warnings, *shortfalls(learned.model.states, task.setpoints),
+        *decision.warnings, *warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'it is not compared with the present model {task.model}, which has other states'
           ] * bool(task.model and current is None)))

@@ -23,7 +23,7 @@ from koopman_ros.bags import (
 )
 from koopman_ros.bags.episodes import distinct
 from koopman_ros.execution import Backend, Serial, Tell
-from koopman_ros.learning.downsampling import SEGMENT, Selection, Survey
+from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
 from koopman_ros.plant_data import Episode
 
 # Segments of a record with states that are not measured are longer by this: a filter has to find
@@ -121,7 +121,7 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
             for _, result in results:
                 yield result
 
-    survey = Survey.empty(n_x, n_u)
+    survey = RecordStatistics.empty(n_x, n_u)
     for part, own in each(partial(_surveyed, source)):
         survey = survey.merged(part)
         account.add(own)
@@ -156,9 +156,9 @@ def _streamed(source: Source, bag: str, account: Account, tick: Tick) -> Iterabl
         yield episode
 
 
-def _surveyed(source: Source, numbered: _Numbered, tick: Tick) -> tuple[Survey, Account]:
+def _surveyed(source: Source, numbered: _Numbered, tick: Tick) -> tuple[RecordStatistics, Account]:
     """Look through one bag."""
-    account, survey = Account(), Survey.empty(len(source.states), len(source.inputs))
+    account, survey = Account(), RecordStatistics.empty(len(source.states), len(source.inputs))
     for episode in _streamed(source, numbered[1], account, tick):
         survey.add(episode)
     return survey, account

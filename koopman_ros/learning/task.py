@@ -50,8 +50,8 @@ class TrainingTask:
     input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
     input_matrix_degree: int = 0
-    #: most states that are not in the bags, see :func:`identify_hidden`; the new lift is then not
-    #: compared with the present one, which has other states
+    #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
+    #: not compared with the present one, which has other states
     hidden_states: int = 0
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
     #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.

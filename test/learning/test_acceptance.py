@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from koopman_ros.control.law_check import LawCheck
 from koopman_ros.learning import decide, learn_lift, Thresholds
-from koopman_ros.learning.acceptance import shortfalls
+from koopman_ros.learning.acceptance import uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.identification import (
     DriftModel,
@@ -268,7 +268,7 @@ def test_noise_that_is_coloured_is_named(found, trained, shipped):
                                        'set-points are wanted from 32.85 degC to 56.35 degC',)),
     ({'temperature': (290.0, 326.0)}, ('temperature was trained from',))])
 def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, words):
-    said = shortfalls(shipped.states, wanted)
+    said = uncovered_setpoints(shipped.states, wanted)
     assert len(said) == len(words)
     assert all(text.startswith(word) for text, word in zip(said, words, strict=True))
 

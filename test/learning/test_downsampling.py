@@ -6,7 +6,13 @@
 import numpy as np
 import pytest
 
-from koopman_ros.learning.downsampling import CELLS, cells_of, extremes, Selection, Survey
+from koopman_ros.learning.downsampling import (
+    CELLS,
+    cells_of,
+    extremes,
+    RecordStatistics,
+    Selection,
+)
 from koopman_ros.plant_data import averaged, Episode
 
 
@@ -45,8 +51,8 @@ def test_too_few_to_average() -> None:
         averaged(episode(np.zeros(15)), 8)
 
 
-def survey(*episodes: Episode) -> Survey:
-    found = Survey.empty(episodes[0].x.shape[1], episodes[0].u.shape[1])
+def survey(*episodes: Episode) -> RecordStatistics:
+    found = RecordStatistics.empty(episodes[0].x.shape[1], episodes[0].u.shape[1])
     for one in episodes:
         found.add(one)
     return found

@@ -16,7 +16,7 @@ from koopman_ros.bags import BagWriter, message_definition, RecordedInput, Recor
 from koopman_ros.execution.training import constant_lines, scalars
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
-from koopman_ros.learning.identification import identify, identify_hidden
+from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.task import known
 from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plant_data import Episode, Plant
@@ -173,8 +173,8 @@ def test_measured_input_tells_what_the_command_hides(lagging):
 
 def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monkeypatch):
     """Tank 1 flows into tank 2, so that what it holds shows there."""
-    monkeypatch.setattr(task_module, 'identify_hidden',
-                        partial(identify_hidden, highest_degree=2))
+    monkeypatch.setattr(task_module, 'identify_unmeasured',
+                        partial(identify_unmeasured, highest_degree=2))
     found = retrain(TrainingTask((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1],
                                  INPUTS, model_class='polynomial', hidden_states=1))
     assert found.reasons == ()

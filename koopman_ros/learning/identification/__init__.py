@@ -23,14 +23,14 @@ from koopman_ros.learning.identification.drift import (
     prediction_error,
     Segments,
 )
-from koopman_ros.learning.identification.grey_box import identify_grey
+from koopman_ros.learning.identification.grey_box import estimate_parameters
 from koopman_ros.learning.identification.identify import (
     EstimatedConstant,
+    EstimateStatus,
     Identified,
     identify,
     methods_of,
     Score,
-    Standing,
     Stopped,
 )
 from koopman_ros.learning.identification.output_error import output_error
@@ -39,13 +39,34 @@ from koopman_ros.learning.identification.total_variation import (
     total_variation,
     TotalVariation,
 )
-from koopman_ros.learning.identification.unmeasured_states import identify_hidden
+from koopman_ros.learning.identification.unmeasured_states import identify_unmeasured
 from koopman_ros.learning.identification.weak_form import weak_form, WeakForm
 
 __all__ = [
-    'Drift', 'DriftEstimate', 'DriftModel', 'DriftProblem', 'EstimatedConstant',
-    'IdentificationMethod', 'Identified', 'Score', 'Segments', 'Standing', 'Stopped',
-    'TotalVariation', 'WeakForm', 'WeakFormParameters', 'box_of', 'fitted_starts', 'identify',
-    'identify_grey', 'identify_hidden', 'longest_step', 'methods_of', 'noise_level',
-    'output_error', 'prediction_error', 'total_variation', 'weak_form',
+    'Drift',
+    'DriftEstimate',
+    'DriftModel',
+    'DriftProblem',
+    'EstimateStatus',
+    'EstimatedConstant',
+    'IdentificationMethod',
+    'Identified',
+    'Score',
+    'Segments',
+    'Stopped',
+    'TotalVariation',
+    'WeakForm',
+    'WeakFormParameters',
+    'box_of',
+    'estimate_parameters',
+    'fitted_starts',
+    'identify',
+    'identify_unmeasured',
+    'longest_step',
+    'methods_of',
+    'noise_level',
+    'output_error',
+    'prediction_error',
+    'total_variation',
+    'weak_form',
 ]

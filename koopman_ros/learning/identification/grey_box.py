@@ -16,12 +16,12 @@ from koopman_ros.learning.identification.data_split import Record
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.learning.identification.identify import (
     EstimatedConstant,
+    EstimateStatus,
     Identified,
     INNOVATIONS_FORM,
     OUTPUT_ERROR,
     Score,
     stage_by_stage,
-    Standing,
     Watch,
 )
 from koopman_ros.learning.identification.innovations_form import Predictor
@@ -46,7 +46,7 @@ _SINGULAR = 1e-12  # a direction with so small a share of the information has no
 _INVOLVED = 1e-3  # a constant with such a share of such a direction is not told by the record
 
 
-def identify_grey(plant: Plant, episodes: Sequence[Episode], equations: Any,
+def estimate_parameters(plant: Plant, episodes: Sequence[Episode], equations: Any,
                   ranges: Mapping[str, tuple[float, float] | None] | None = None, *,
                   seed: int = 0, watch: Watch = lambda *_: False) -> Identified:
     """
@@ -184,11 +184,11 @@ def _estimates(sought: Sequence[Sought], refined: Refined[Equations]
     deviations[inside] = np.sqrt(np.diag(covariance)[:int(np.sum(inside))])
     found = []
     for one, share, deviation in zip(sought, shares.tolist(), deviations.tolist(), strict=True):
-        standing = Standing.ESTIMATED
+        standing = EstimateStatus.ESTIMATED
         if np.isnan(deviation):
-            standing = Standing.AT_LOWER_END if share < 0.0 else Standing.AT_UPPER_END
+            standing = EstimateStatus.AT_LOWER_END if share < 0.0 else EstimateStatus.AT_UPPER_END
         elif not deviation < _UNKNOWN:
-            standing = Standing.NOT_IDENTIFIABLE
+            standing = EstimateStatus.NOT_IDENTIFIABLE
         found.append(EstimatedConstant(
             one.name, one.unit, one.value(share), deviation * one.slope(share), one.lower,
             one.upper, standing))

@@ -93,7 +93,7 @@ class Score:
     cost: float  #: mean squared error in units of the states' scale, by which estimates compare
 
 
-class Standing(Enum):
+class EstimateStatus(Enum):
     """How the estimate of a constant is to be taken; the value is what to tell the user."""
 
     ESTIMATED = ''
@@ -118,10 +118,11 @@ class EstimatedConstant:
     standard_error: float
     lower: float  #: lowest value that was looked at
     upper: float  #: highest likewise
-    standing: Standing
+    standing: EstimateStatus
 
     def __str__(self) -> str:
-        error = f' +- {self.standard_error:.2g}' if self.standing is Standing.ESTIMATED else ''
+        error = '' if self.standing is not EstimateStatus.ESTIMATED else (
+            f' +- {self.standard_error:.2g}')
         said = f' ({self.standing.value})' if self.standing.value else ''
         return f'{self.value:.6g}{error} {self.unit}{said}'
 

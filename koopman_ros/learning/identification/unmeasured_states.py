@@ -64,7 +64,7 @@ class _Candidate:
         return f'{INNOVATIONS_FORM}, {count} {"state" if count == 1 else "states"} not measured'
 
 
-def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
+def identify_unmeasured(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
                     highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
                     watch: Watch = lambda *_: False, backend: Backend | None = None
                     ) -> Identified:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from koopman_ros.learning.lift.incremental import Grown, Monitor
+from koopman_ros.learning.lift.incremental import Monitor, TrainedLift
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, MinimumStatus
 from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
@@ -54,8 +54,8 @@ class Algorithm1:
             raise ValueError(f'n_z = {self.n_z} is too small for {n_x} states')
         return (self.n_z,)
 
-    def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
-              monitor: Monitor | None = None) -> Grown:
+    def start(self, data: ScaledSamples, n_z: int, parent: TrainedLift | None, seed: int,
+              monitor: Monitor | None = None) -> TrainedLift:
         """Run the algorithm once, as :meth:`Growth.start`; `parent` has no part in it."""
         layout = Layout(data.x.shape[1], n_z, self.hidden, self.identity,
                         0 if data.u is None else data.u.shape[1], self.decoder)
@@ -78,4 +78,4 @@ class Algorithm1:
             if moved <= self.tolerance:
                 status = MinimumStatus.CONVERGED
                 break
-        return Grown(layout, theta, status, iterations=iterations)
+        return TrainedLift(layout, theta, status, iterations=iterations)

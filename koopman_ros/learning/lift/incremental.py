@@ -24,7 +24,7 @@ Monitor = Callable[[int, float], bool]
 
 
 @dataclass(frozen=True)
-class Grown:
+class TrainedLift:
     """A trained parameter vector."""
 
     layout: Layout  #: its sizes
@@ -90,8 +90,8 @@ class Growth:
                              + (hint if self.identity else ''))
         return tuple(range(n_x + self.identity, self.n_z + 1))
 
-    def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
-              monitor: Monitor | None = None) -> Grown:
+    def start(self, data: ScaledSamples, n_z: int, parent: TrainedLift | None, seed: int,
+              monitor: Monitor | None = None) -> TrainedLift:
         """
         Extend the lift of the round before, None in the first one, to `n_z` coordinates.
 
@@ -111,9 +111,9 @@ class Growth:
             theta, iterations = minimum.theta, iterations + minimum.iterations
             if minimum.status is MinimumStatus.INTERRUPTED:
                 break
-        return Grown(layout, theta, minimum.status, minimum.decrease, iterations=iterations)
+        return TrainedLift(layout, theta, minimum.status, minimum.decrease, iterations=iterations)
 
-    def root(self, data: ScaledSamples) -> Grown:
+    def root(self, data: ScaledSamples) -> TrainedLift:
         """Return the lift without hidden units that growth starts from."""
         n_x = data.x.shape[1]
         n_z = n_x if self.identity else 0
@@ -122,10 +122,10 @@ class Growth:
                         default if self.decoder is None else self.decoder)
         drift, B = linear_drift(data)
         zeros = layout.split(data.x.new_zeros(layout.size))
-        return Grown(layout, layout.join(replace(zeros, A=drift if self.identity else zeros.A,
-                                                 B=B)), MinimumStatus.CONVERGED)
+        theta = layout.join(replace(zeros, A=drift if self.identity else zeros.A, B=B))
+        return TrainedLift(layout, theta, MinimumStatus.CONVERGED)
 
-    def planted(self, data: ScaledSamples, W: Tensor, b: Tensor, V: Tensor) -> Grown:
+    def planted(self, data: ScaledSamples, W: Tensor, b: Tensor, V: Tensor) -> TrainedLift:
         """
         Return the lift of a network that was learned elsewhere, its A fitted to the samples.
 
@@ -143,10 +143,10 @@ class Growth:
                              'samples: begin from that of a plant in the same range, or from '
                              'nothing')
         begun = replace(begun, V=V / size[:, None])
-        return Grown(layout, _with_linear_fits(layout, begun, data, torch.Generator().manual_seed(
-            0)), MinimumStatus.CONVERGED)
+        theta = _with_linear_fits(layout, begun, data, torch.Generator().manual_seed(0))
+        return TrainedLift(layout, theta, MinimumStatus.CONVERGED)
 
-    def _extended(self, data: ScaledSamples, n_z: int, parent: Grown, seed: int
+    def _extended(self, data: ScaledSamples, n_z: int, parent: TrainedLift, seed: int
                   ) -> tuple[Layout, Tensor]:
         """Add the coordinates up to `n_z`, started from the least spanned product."""
         old = parent.layout
@@ -229,7 +229,7 @@ def _decoder_start(z: Tensor, x: Tensor, units: int, generator: torch.Generator
     return W, b, fit[:, :-1].contiguous(), fit[:, -1].contiguous()
 
 
-def _least_spanned_product(grown: Grown, data: ScaledSamples) -> Tensor:
+def _least_spanned_product(grown: TrainedLift, data: ScaledSamples) -> Tensor:
     """Return the product of slow eigenfunctions that the lift spans least (N,), of variance 1."""
     x, parameters = data.x, grown.layout.split(grown.theta)
     if grown.layout.n_z == 0:

@@ -15,7 +15,7 @@ import torch
 
 from koopman_ros.execution import Backend, Tell
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
-from koopman_ros.learning.lift.incremental import Grown, Growth
+from koopman_ros.learning.lift.incremental import Growth, TrainedLift
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
 from koopman_ros.learning.lift.residuals import ScaledSamples
 
@@ -84,8 +84,8 @@ def torch_threads(count: int) -> Generator[None]:
 
 
 def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
-               parent: Grown | None, seed: int, starts: int, threads: int, tracker: Tracker
-               ) -> Generator[tuple[str, Grown | str]]:
+               parent: TrainedLift | None, seed: int, starts: int, threads: int, tracker: Tracker
+               ) -> Generator[tuple[str, TrainedLift | str]]:
     """Run one round; yield the result of each start in their order, or the reason of a failure."""
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     items = {f'start {i + 1} with n_z = {n_z}': (
@@ -94,8 +94,8 @@ def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
     return backend.run(_start, items, shared=(data, n_z, parent, threads), watch=tracker.told)
 
 
-def _start(shared: tuple[ScaledSamples, int, Grown | None, int], item: tuple[Recipe, int],
-           tell: Tell) -> Grown | str:
+def _start(shared: tuple[ScaledSamples, int, TrainedLift | None, int], item: tuple[Recipe, int],
+           tell: Tell) -> TrainedLift | str:
     (data, n_z, parent, threads), (recipe, seed) = shared, item
 
     def monitor(iteration: int, cost: float) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.lift.incremental import Grown, linear_drift, Monitor, xavier
+from koopman_ros.learning.lift.incremental import linear_drift, Monitor, TrainedLift, xavier
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.learning.lift.residuals import CHUNK, ScaledSamples
@@ -83,8 +83,8 @@ class NeuralDrift:
         """Return the n_z of the one round of starts."""
         return (n_x,)
 
-    def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
-              monitor: Monitor | None = None) -> Grown:
+    def start(self, data: ScaledSamples, n_z: int, parent: TrainedLift | None, seed: int,
+              monitor: Monitor | None = None) -> TrainedLift:
         """Train from random hidden units, as :meth:`Growth.start`; `parent` has no part in it."""
         # a free lift of this size has the very parameters of the drift: V, A (n_x, n_x) and B
         layout = Layout(n_z, n_z, self.hidden, False, 0 if data.u is None else data.u.shape[1])
@@ -98,7 +98,7 @@ class NeuralDrift:
                            monitor=monitor)
         # the read-out is fitted by itself; the A of the lift z = x is that of the linear fit
         found = layout.join(replace(layout.split(minimum.theta), A=A))
-        return Grown(layout, found, minimum.status, drift_alone=True,
+        return TrainedLift(layout, found, minimum.status, drift_alone=True,
                      iterations=minimum.iterations)
 
 

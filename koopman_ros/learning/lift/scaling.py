@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from koopman_ros.learning.lift.incremental import Grown, Growth
+from koopman_ros.learning.lift.incremental import Growth, TrainedLift
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.prestabilization import Frame
 from koopman_ros.learning.lift.residuals import deviations, ScaledSamples
@@ -55,7 +55,7 @@ class Scaling:
         place = checked_device(device)
         return ScaledSamples(*(torch.from_numpy(a).to(place) for a in arrays))
 
-    def planted(self, recipe: Growth, begin: LiftedModel, data: ScaledSamples) -> Grown:
+    def planted(self, recipe: Growth, begin: LiftedModel, data: ScaledSamples) -> TrainedLift:
         """
         Return the lift of another plant of the same signals as one of these samples.
 
@@ -89,7 +89,7 @@ class Scaling:
         return recipe.planted(data, *(data.x.new_tensor(np.ascontiguousarray(a)) for a in (
             W[used], b[used], V[:, used])))
 
-    def model(self, grown: Grown, **about: Any) -> LiftedModel:
+    def model(self, grown: TrainedLift, **about: Any) -> LiftedModel:
         """Return what was learned in units; `about` are further fields of the model."""
         parts = grown.layout.split(grown.theta.cpu())
         A, B = self.pace * parts.A.numpy(), None if parts.B is None else (

@@ -18,7 +18,7 @@ from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.learning.lift.edmd import Edmd
-from koopman_ros.learning.lift.incremental import Grown, Growth
+from koopman_ros.learning.lift.incremental import Growth, TrainedLift
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.lift.metrics import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
 from koopman_ros.learning.lift.multistart import Recipe, run_starts, Tracker, Watch
@@ -60,7 +60,7 @@ class NoUsefulLift(ValueError):  # noqa: N818
 
 @dataclass(frozen=True)
 class _Candidate:
-    grown: Grown
+    grown: TrainedLift
     model: LiftedModel  # its drift read off the rate of z or out of its features
     # of a lift by the rate of z, since features hide that z has lost a state; of a drift its own
     fit: Fit
@@ -125,12 +125,12 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     first = None if begin is None or not isinstance(recipe, Growth) else scaling.planted(
         recipe, begin, data)
 
-    def run(n_z: int, parent: Grown | None) -> Generator[tuple[str, Grown | str]]:
+    def run(n_z: int, parent: TrainedLift | None) -> Generator[tuple[str, TrainedLift | str]]:
         count = 1 if parent is None and first is not None else starts
         return run_starts(backend, recipe, data, n_z, parent or first, seed, count, threads,
                           tracker)
 
-    def judge(grown: Grown | str) -> _Candidate | str:
+    def judge(grown: TrainedLift | str) -> _Candidate | str:
         return _judged(grown, lambda found: scaling.model(found, **about), parts)
 
     path, interrupted = _run_rounds(rounds, tracker, run, judge)
@@ -150,8 +150,8 @@ def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple
 
 
 def _run_rounds(rounds: Sequence[int], tracker: Tracker,
-                run: Callable[[int, Grown | None], Generator[tuple[str, Grown | str]]],
-                judge: Callable[[Grown | str], _Candidate | str]
+                run: Callable[[int, TrainedLift | None], Generator[tuple[str, TrainedLift | str]]],
+                judge: Callable[[TrainedLift | str], _Candidate | str]
                 ) -> tuple[list[_Candidate], bool]:
     """Return the winners of the rounds, and whether they were interrupted."""
     path: list[_Candidate] = []
@@ -242,7 +242,7 @@ def _remedies(model: LiftedModel) -> str:
     return ', '.join([*identity, *smaller, 'more starts, or a narrower range'])
 
 
-def _ending(grown: Grown, interrupted: bool) -> str:
+def _ending(grown: TrainedLift, interrupted: bool) -> str:
     """Say how a training ended, and where at a limit how far it was from its end."""
     if interrupted:
         return MinimumStatus.INTERRUPTED.value
@@ -277,7 +277,7 @@ def training_states(box: Box, samples: Samples) -> TrainingStates | None:
         states.to_deviation(samples.x), 0.5 * (states.upper - states.lower) / states.scale)
 
 
-def _judged(grown: Grown | str, model_of: Callable[[Grown], LiftedModel],
+def _judged(grown: TrainedLift | str, model_of: Callable[[TrainedLift], LiftedModel],
             parts: tuple[Samples, Samples, Samples]) -> _Candidate | str:
     """Return the candidate of a start, or the reason why there is none."""
     if isinstance(grown, str):

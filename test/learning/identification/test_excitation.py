@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from koopman_ros.learning.identification import identify, identify_hidden
+from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.plant_data import Episode, Plant
 
@@ -103,7 +103,7 @@ def test_nothing_is_said_where_the_effects_are_known_or_there_is_one_input() -> 
     assert check_inputs(plant(3), record(u[:12], 0, 0.0)) == ()
 
 
-@pytest.mark.parametrize('estimate', [identify, lambda *given: identify_hidden(*given, 1)])
+@pytest.mark.parametrize('estimate', [identify, lambda *given: identify_unmeasured(*given, 1)])
 def test_estimates_are_refused_before_they_are_made(estimate) -> None:
     u = steps(0, 12)
     u[:, 1] = 0.5 * u[:, 0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from koopman_ros.learning.identification import identify_grey, Standing, Stopped
+from koopman_ros.learning.identification import estimate_parameters, EstimateStatus, Stopped
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import (
@@ -71,13 +71,13 @@ def errors(found, truth):
         # in SI, as the estimates are
         own = getattr(truth, field.name)
         shown[field.name] *= own / field.default
-    assert all(one.standing is Standing.ESTIMATED for one in found.constants)
+    assert all(one.standing is EstimateStatus.ESTIMATED for one in found.constants)
     return {one.name: (one.value - shown[one.name]) / one.standard_error
             for one in found.constants}
 
 
 def test_standard_errors_are_those_of_many_records():
-    z = np.array([list(errors(identify_grey(VESSEL, [vessel(seed)], Vessel), TRUE).values())
+    z = np.array([list(errors(estimate_parameters(VESSEL, [vessel(seed)], Vessel), TRUE).values())
                   for seed in range(4)])
     assert np.max(np.abs(z)) < 3.5
     # the estimates of a record are correlated, so that there are as many squares as records
@@ -86,11 +86,11 @@ def test_standard_errors_are_those_of_many_records():
 
 
 def test_of_a_disturbed_plant_a_filter_is_found_too():
-    found = identify_grey(VESSEL, [vessel(3, 300, disturbed=0.03)], Vessel)
+    found = estimate_parameters(VESSEL, [vessel(3, 300, disturbed=0.03)], Vessel)
     assert found.method == 'innovations form'
     assert np.max(np.abs([one.value / getattr(TRUE, one.name) - 1.0
                           for one in found.constants])) < 0.1
-    assert identify_grey(VESSEL, [vessel(3)], Vessel).method == 'output error'
+    assert estimate_parameters(VESSEL, [vessel(3)], Vessel).method == 'output error'
 
 
 def test_two_tanks_all_of_which_is_measured():
@@ -104,7 +104,7 @@ def test_two_tanks_all_of_which_is_measured():
     noisy = run.x + 1e-3 * np.random.default_rng(0).standard_normal(run.x.shape)
     time = 4.0 * np.arange(len(noisy))
     # in an order of the record's own
-    found = identify_grey(plant, [Episode(time, noisy[:, ::-1], time[:-1], run.u[:, ::-1])],
+    found = estimate_parameters(plant, [Episode(time, noisy[:, ::-1], time[:-1], run.u[:, ::-1])],
                           TwoTanks)
     off = errors(found, truth)
     assert set(off) == {'orifice_1', 'orifice_2', 'pump_gain'}
@@ -145,7 +145,7 @@ def test_reactor_at_its_saddle_from_its_temperature_alone():
     plant = Plant('saddle', ('temperature',), ('K',), ('coolant_temperature',), ('K',), 's',
                   np.full(1, np.nan), np.full(1, np.nan), None)
     said = []
-    found = identify_grey(
+    found = estimate_parameters(
         plant, [saddle(truth, 0)], TwoStateReactor,
         {'heat_transfer_coefficient': None, 'reaction_enthalpy': (-7e4, -3e4)},
         watch=lambda done, total, text: bool(said.append((done, total, text))))
@@ -172,20 +172,21 @@ def test_reactor_at_its_saddle_from_its_temperature_alone():
 def test_a_constant_at_an_end_of_its_range_is_said():
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        found = identify_grey(VESSEL, [vessel(0)], Vessel, {'gain': (0.5, 1.1), 'leak': None})
+        found = estimate_parameters(VESSEL, [vessel(0)], Vessel,
+                                    {'gain': (0.5, 1.1), 'leak': None})
     gain, leak = found.constants
-    assert gain.standing is Standing.AT_UPPER_END
+    assert gain.standing is EstimateStatus.AT_UPPER_END
     assert gain.value == pytest.approx(1.1, rel=1e-3)
     assert np.isnan(gain.standard_error)
     assert 'upper end of its range' in str(gain)
-    assert leak.standing is Standing.ESTIMATED
+    assert leak.standing is EstimateStatus.ESTIMATED
 
 
 def test_constants_that_act_alike_are_said():
-    found = identify_grey(VESSEL, [vessel(0)], Vessel,
+    found = estimate_parameters(VESSEL, [vessel(0)], Vessel,
                           {'gain': None, 'strength': (0.5, 2.0), 'leak': None})
     gain, strength, leak = found.constants
-    assert gain.standing is strength.standing is Standing.NOT_IDENTIFIABLE
+    assert gain.standing is strength.standing is EstimateStatus.NOT_IDENTIFIABLE
     assert gain.value * strength.value == pytest.approx(1.2, rel=0.02)
     assert abs(leak.value - 0.4) < 3.0 * leak.standard_error
     assert 'give its value in place of a range' in str(gain)
@@ -259,11 +260,11 @@ class Silent(Constants):
      Vessel, {}, r'the record has the inputs tap \[V\], Vessel has pump \[V\]')])
 def test_what_does_not_fit_is_refused(plant, equations, ranges, words):
     with pytest.raises(ValueError, match=words):
-        identify_grey(plant, [vessel(0)], equations, ranges)
+        estimate_parameters(plant, [vessel(0)], equations, ranges)
 
 
 def test_it_ends_when_asked_and_a_short_record_is_refused():
     with pytest.raises(Stopped):
-        identify_grey(VESSEL, [vessel(0)], Vessel, watch=lambda *_: True)
+        estimate_parameters(VESSEL, [vessel(0)], Vessel, watch=lambda *_: True)
     with pytest.raises(ValueError, match='record at least 160'):
-        identify_grey(VESSEL, [vessel(0, 100)], Vessel)
+        estimate_parameters(VESSEL, [vessel(0, 100)], Vessel)

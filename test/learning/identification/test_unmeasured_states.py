@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from koopman_ros.learning.identification import identify_hidden, Stopped
+from koopman_ros.learning.identification import identify_unmeasured, Stopped
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
 
@@ -48,7 +48,7 @@ def record(rate, *, samples=1200, gain=0.0, size=1.0, seed=0):
 
 
 def test_modes_and_gain_of_a_linear_plant():
-    found = identify_hidden(PLANT, [record(oscillator, samples=600)], 2, highest_degree=1)
+    found = identify_unmeasured(PLANT, [record(oscillator, samples=600)], 2, highest_degree=1)
     drift = found.drift
     # as few as suffice
     assert len({score.method for score in found.scores}) == 2
@@ -67,7 +67,7 @@ def test_modes_and_gain_of_a_linear_plant():
 
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
-    found = identify_hidden(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
+    found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
                             highest_degree=2)
     drift = found.drift
     assert drift.degree >= 2
@@ -89,7 +89,7 @@ def test_steady_states_of_an_unstable_plant_from_closed_loop():
 
 def test_a_known_input_matrix_is_kept():
     gain = 1.0
-    found = identify_hidden(replace(PLANT, B=np.array([[gain]])),
+    found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])),
                             [record(saddle, samples=200, gain=2.0, size=0.1)], 1,
                             highest_degree=1)
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
@@ -104,7 +104,7 @@ def test_it_says_what_it_does_and_ends_when_asked():
         return len(said) > 3
 
     with pytest.raises(Stopped):
-        identify_hidden(PLANT, [record(oscillator, samples=600)], 1, watch=watch)
+        identify_unmeasured(PLANT, [record(oscillator, samples=600)], 1, watch=watch)
     assert said[0] == 'drift of degree 1 with 1 state not measured'
 
 
@@ -113,11 +113,11 @@ def test_it_says_what_it_does_and_ends_when_asked():
     (replace(PLANT, input_matrix_degree=1), 600, 'set input_matrix_degree to 0')])
 def test_what_cannot_be_learned_from_is_refused(plant, samples, words):
     with pytest.raises(ValueError, match=words):
-        identify_hidden(plant, [record(oscillator, samples=samples)], 1)
+        identify_unmeasured(plant, [record(oscillator, samples=samples)], 1)
 
 
 def test_episodes_in_which_no_filter_finds_the_state_are_refused():
     whole = record(oscillator, samples=600)
     parts = [whole.part(k, k + 40) for k in range(0, 600, 40)]
     with pytest.raises(ValueError, match='too short for a filter'):
-        identify_hidden(PLANT, parts, 1)
+        identify_unmeasured(PLANT, parts, 1)

@@ -124,20 +124,6 @@ def test_a_roll_out_without_inputs_and_one_that_diverges():
         roll_out(linear_model(50.0 * np.eye(2)), np.ones(2), np.zeros((40, 1)), 1.0)
 
 
-def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
-    """With z = sin(x) and dz/dt = z the drift is tan(x): infinite at pi/2, and beyond it back."""
-    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
-    observables = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False,
-                                     activation='sine')
-    model = LiftedModel(observables, np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
-    # sin(x) = sin(0.5) exp(t) is 1 after 0.735 s
-    path = roll_out(model, np.array([0.5]), np.zeros((7, 1)), 0.1)
-    np.testing.assert_allclose(np.sin(path[:, 0]), np.sin(0.5) * np.exp(0.1 * np.arange(8)),
-                               rtol=1e-7)
-    with pytest.raises(RuntimeError, match='diverged after 8 samples'):
-        roll_out(model, np.array([0.5]), np.zeros((9, 1)), 0.1)
-
-
 @pytest.mark.parametrize(('change', 'message'), [
     ({'x0': [2.2]}, r'incompatible x0: expected one number for each of x0, x1 in the last axis, '),
     ({'inputs': [1.0, 2.0]}, r'incompatible inputs: expected one number for each of u0 in'),

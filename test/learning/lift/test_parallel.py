@@ -18,7 +18,7 @@ import torch
 import koopman_ros
 from koopman_ros.control.law_check import check_law
 from koopman_ros.learning import train
-from koopman_ros.learning.identification import identify, identify_hidden
+from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.record import read_record
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from support.known_plants import CUBIC, methods, PAIR
@@ -83,7 +83,7 @@ def test_hidden_states_are_estimated_elsewhere(places):
     plant = replace(PAIR.plant, state_names=('x1',), state_units=('1',),
                     nominal_state=np.zeros(1))
     episode = replace(whole, x=whole.x[:, :1])
-    here, there = (identify_hidden(plant, [episode], 1, highest_degree=1, backend=places[kind])
+    here, there = (identify_unmeasured(plant, [episode], 1, highest_degree=1, backend=places[kind])
                    for kind in ('', 'joblib:2'))
     assert there.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
     assert [score.rmse.tobytes() for score in there.scores] == [
