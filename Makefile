@@ -119,7 +119,7 @@ studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## three plants beside do-mpc and a plain LQG, two of them measured in part, SEEDS=10, five minutes -> out/studies-partial
 	$(BIN)/python -m validation.partly_measured --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## speed beside other programs and on a cluster, an hour (BENCH=--quick: seven minutes) -> out/bench
+bench: $(VENV)/bench.stamp  ## speed beside other programs, an hour (BENCH=--quick: seven minutes) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)
 
 faults: $(VENV)/mpc.stamp  ## put faults into the loops of the reactor, of two tank plants and of a reactor at its saddle, and soak both reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
