@@ -23,6 +23,7 @@ from koopman_ros.learning.drift_sampling import compare_classes
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
+    IdentificationMethod,
     Identified,
     identify,
     identify_unmeasured,
@@ -187,87 +188,47 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` asked for it; nothing is written then.
     """
-    thresholds = Thresholds(task.margin, task.condition)
-    if task.model_class not in (*CLASSES, BEST):
-        raise ValueError(f'model_class = {task.model_class!r} must be one of '
-                         f'{", ".join((*CLASSES, BEST))}')
-    if Path(task.output).suffix != '.safetensors':
-        raise ValueError(f'output = {task.output!r} must end in .safetensors')
-    if task.sibling == FIRST:
-        raise ValueError(f'sibling = {FIRST!r} is the first of a fleet: retrain several plants in '
-                         'one call, or name a model file')
+    thresholds = _checked(task)
     current, sibling = (load(path) if path else None for path in (task.model, task.sibling))
     plant, states, inputs = known(task, current)
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
-    _stop_if(on_progress(0.0, 'reading bags'))
     source = Source(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
+    _stop_if(on_progress(0.0, 'reading bags'))
     record = read_record(source, task.most_samples, task.seed,
                          hidden=bool(task.hidden_states or task.equations),
                          tick=_reading(on_progress, source), backend=backend)
-    account = record.account
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
-                         + '; '.join(account.lines()))
+                         + '; '.join(record.account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
-
-    def estimating(done: int, total: int, text: str) -> bool:
-        return on_progress(_at('estimate', done / total), f'estimating: {text}')
-
-    if task.equations:
-        found = estimate_parameters(plant, episodes, plant_class(task.equations), task.constants,
-                              seed=task.seed, watch=estimating)
-    elif task.hidden_states:
-        found = identify_unmeasured(plant, episodes, task.hidden_states, seed=task.seed,
-                                watch=estimating, backend=backend)
-    else:
-        found = identify(plant, episodes, methods=methods, seed=task.seed, watch=estimating,
-                         backend=backend)
+    found = _estimate(task, plant, episodes, methods, on_progress, backend)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
-    states_found = found.drift.box.states
-    if current is not None and (states_found.names, states_found.units) != (
+    box = found.drift.box
+    if current is not None and (box.states.names, box.states.units) != (
             current.states.names, current.states.units):
         # of other states
         current = None
     if current is None:
         # an input that keeps the plant somewhere in the middle is not far
-        box = found.drift.box
         plant = replace(plant, state_names=box.states.names, state_units=box.states.units, B=None,
                         nominal_state=box.states.center, nominal_input=box.inputs.center)
     elif found.hidden:
         plant = replace(current.plant, B=None)
-    bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
+    bare = Retrained(task, record.account, found, None, None, (), coverage(episodes, box),
                      plant, current, reduction=record.reduction)
-    warnings: list[str] = []
-    for begin in (*[sibling] * (sibling is not None), None):
-        course = _Course(on_progress)
-        learned = decision = None
-        try:
-            learned = compare_classes(
-                found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
-                seed=task.seed, starts=task.starts, watch=course.learning,
-                judging=course.judging, device=task.device, backend=backend, begin=begin)
-        except NoUsefulLift as error:
-            reasons: tuple[str, ...] = (str(error),)
-        _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
-        if learned is not None:
-            decision = decide(found, learned, current, thresholds)
-            reasons = decision.reasons
-        if begin is None or not reasons:
-            break
-        warnings.append(f'it was learned from nothing, as what training made of {task.sibling} '
-                        f'would be refused: {"; ".join(reasons)}')
+    learned, decision, reasons = _learn(bare, sibling, thresholds, on_progress, backend)
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     decision = replace(decision, warnings=(
-        *decision.warnings, *warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
+        *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'it is not compared with the present model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
@@ -278,6 +239,65 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
                    reasons=decision.reasons, model_file=str(path))
+
+
+def _checked(task: TrainingTask) -> Thresholds:
+    """Return the thresholds of a task; ValueError for what does not fit."""
+    if task.model_class not in (*CLASSES, BEST):
+        raise ValueError(f'model_class = {task.model_class!r} must be one of '
+                         f'{", ".join((*CLASSES, BEST))}')
+    if Path(task.output).suffix != '.safetensors':
+        raise ValueError(f'output = {task.output!r} must end in .safetensors')
+    if task.sibling == FIRST:
+        raise ValueError(f'sibling = {FIRST!r} is the first of a fleet: retrain several plants in '
+                         'one call, or name a model file')
+    return Thresholds(task.margin, task.condition)
+
+
+def _estimate(task: TrainingTask, plant: Plant, episodes: list[Episode],
+              methods: Mapping[str, IdentificationMethod], on_progress: OnProgress,
+              backend: Backend) -> Identified:
+    """Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations."""
+    def watch(done: int, total: int, text: str) -> bool:
+        return on_progress(_at('estimate', done / total), f'estimating: {text}')
+
+    if task.equations:
+        return estimate_parameters(plant, episodes, plant_class(task.equations), task.constants,
+                                   seed=task.seed, watch=watch)
+    if task.hidden_states:
+        return identify_unmeasured(plant, episodes, task.hidden_states, seed=task.seed,
+                                   watch=watch, backend=backend)
+    return identify(plant, episodes, methods=methods, seed=task.seed, watch=watch,
+                    backend=backend)
+
+
+def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
+           on_progress: OnProgress, backend: Backend
+           ) -> tuple[Comparison | None, Decision | None, tuple[str, ...]]:
+    """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
+    task, found = bare.task, bare.found
+    learned, decision, reasons = None, None, ('',)
+    warnings: list[str] = []
+    for begin in (None,) if sibling is None else (sibling, None):
+        course = _Course(on_progress)
+        learned = decision = None
+        try:
+            learned = compare_classes(
+                found, bare.plant, thresholds, model_class=task.model_class,
+                n_z=task.coordinates, seed=task.seed, starts=task.starts, watch=course.learning,
+                judging=course.judging, device=task.device, backend=backend, begin=begin)
+        except NoUsefulLift as error:
+            reasons = (str(error),)
+        _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
+        if learned is not None:
+            decision = decide(found, learned, bare.present, thresholds)
+            decision = replace(decision, warnings=(*decision.warnings, *warnings))
+            reasons = decision.reasons
+        if not reasons:
+            break
+        warnings.append(f'it was learned from nothing, as what training made of {task.sibling} '
+                        f'would be refused: {"; ".join(reasons)}')
+    return learned, decision, reasons
 
 
 def _at(stage: str, share: float) -> float:

@@ -155,7 +155,7 @@ def task(bag, folder, model_class):
 
 @pytest.fixture
 def quick():
-    with quick_retraining(16, (1,)):
+    with quick_retraining(16, (1,), (10,)):
         yield
 
 

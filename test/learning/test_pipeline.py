@@ -46,7 +46,7 @@ def few_methods():
 
     What they find is the matter of test_identify and test_law_check.
     """
-    with quick_retraining(16):
+    with quick_retraining(16, windows=(10, 20)):
         yield
 
 
