@@ -176,12 +176,12 @@ def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[s
 
 
 def _check_range(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
-    low, high, opened = (metadata['minimum'], metadata['maximum'],
-                         metadata.get('open_minimum', False))
+    low, high, of = metadata['minimum'], metadata['maximum'], metadata.get('column')
+    # in code 0 stands for itself, not for no bound
+    opened = metadata.get('open_minimum', False) or (of is not None and of.none == ANY)
     # of a value of a signal the range is in the unit that people read
     fits = ~np.isnan(value) if metadata['unit'] == '{shown}' else (
         (value > low if opened else value >= low) & (value <= high))
-    of = metadata.get('column')
     if of is not None and of.none is not None:
         fits |= value == of.none[1]
     if not np.all(fits):

@@ -15,8 +15,6 @@ from koopman_ros.declaration import (
     column,
     for_signals,
     nested,
-    NO_LOWER,
-    NO_UPPER,
     parameter,
     plugin_parameters,
     UNBOUNDED,
@@ -46,11 +44,9 @@ class SensorLimits:
     """What the sensors can measure and their plant can do, one number per measured signal."""
 
     lower: Array = value_column(
-        'measured', -UNBOUNDED, 'Lower end of the range of the sensor.', name='sensor_min',
-        none=NO_LOWER)
+        'measured', -UNBOUNDED, 'Lower end of the range of the sensor.', name='sensor_min')
     upper: Array = value_column(
-        'measured', UNBOUNDED, 'Upper end of the range of the sensor.', name='sensor_max',
-        none=NO_UPPER)
+        'measured', UNBOUNDED, 'Upper end of the range of the sensor.', name='sensor_max')
     rate: Array = column(
         'measured', 0.0, 'Fastest change that is physically possible; 0: any.', '{unit}/s',
         name='max_rate', none=ANY)
@@ -116,10 +112,10 @@ class Tuning:
         code=True)
     validity_margin: float = parameter(
         0.1, 'Distance outside the trained range, in half-ranges, up to which the nonlinear laws '
-        'act; beyond it the linear one acts.', '', 0.0, 100.0)
+        'act; beyond it the linear one acts.', '', 0.0, UNBOUNDED)
     linear_margin: float = parameter(
         0.5, 'Distance outside the trained range, in half-ranges, up to which the laws linear and '
-        'pi act; beyond it the safe inputs are commanded.', '', 0.0, 100.0)
+        'pi act; beyond it the safe inputs are commanded.', '', 0.0, UNBOUNDED)
     safe: Array = value_column(
         'inputs', 0.0, 'Safe value: commanded when no law can act; brought within min and max.')
     hold_timeout: float = parameter(
@@ -181,18 +177,15 @@ class Tuning:
         return made
 
     @classmethod
-    def for_model(cls, model: LiftedModel, measured: Sequence[str] = (), **given: Any) -> Self:
+    def for_model(cls, model: LiftedModel, **given: Any) -> Self:
         """
         Return a tuning whose weights, ranges and safe inputs are a model's, but for what is given.
 
         The weights are 1 on deviations scaled by the model, the inputs' limits their trained
         range, and the safe inputs the nominal ones.
-
-        :param measured: names of the signals that are measured; all states by default.
         """
         inputs = model.inputs
         return cls(**{
             'state_weight': 1.0 / model.states.scale ** 2,
             'input_weight': 1.0 / inputs.scale ** 2,
-            'limits': InputLimits(inputs.lower, inputs.upper), 'safe': inputs.center, **given}
-        ).for_signals(model, measured or model.states.names)
+            'limits': InputLimits(inputs.lower, inputs.upper), 'safe': inputs.center, **given})

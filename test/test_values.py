@@ -7,9 +7,8 @@ from dataclasses import field, FrozenInstanceError, replace
 import inspect
 import pickle
 
-import pytest
-
 from koopman_ros.values import amended, record
+import pytest
 
 
 @record

@@ -21,15 +21,12 @@ from koopman_ros.control import (
     Controller,
     Initialisation,
     InputLimits,
-    LevelSettings,
     Loop,
     SetpointRequest,
-    Settings,
     simulate,
-    SupervisorSettings,
+    Tuning,
 )
 from koopman_ros.control.simulate import Change, Simulation
-from koopman_ros.estimation import SensorLimits
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
@@ -97,12 +94,12 @@ def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = 
     :param informed: whether it measures the concentration, too.
     """
     n_y = 2 if informed else 1
-    return Controller(model, Settings.for_model(
+    return Controller(model, Tuning.for_model(
         model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
-        controlled=('temperature',), transfer_time=0.0, sensor=SensorLimits.none(n_y),
+        controlled=('temperature',), transfer_time=0.0,
         estimator='extended_kalman_filter', noise=np.array([1e-4, NOISE])[-n_y:],
-        wander=np.full(1, WANDER), initial_error=FIRST_GUESS,
-        supervisor=SupervisorSettings(tuple(LevelSettings(law, MARGIN) for law in laws))),
+        wander=np.full(1, WANDER * np.sqrt(60.0)), initial_error=FIRST_GUESS,
+        levels=laws, validity_margin=MARGIN, linear_margin=MARGIN),
         None if informed else TEMPERATURE)
 
 

@@ -29,18 +29,15 @@ from koopman_ros.control import (
     at,
     Controller,
     Initialisation,
-    LevelSettings,
     SetpointRequest,
-    Settings,
     simulate,
-    SupervisorSettings,
+    Tuning,
 )
 from koopman_ros.control.simulate import Simulation
 from koopman_ros.demo.console import LiveTable, read_options, run_act
 from koopman_ros.demo.hands import ActError, Hands
 from koopman_ros.demo.loop import FIRST_STAMP_NS, Row, running_loop, Scenario
 from koopman_ros.demo.reactor import constant
-from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
@@ -155,8 +152,8 @@ def names_and_ranges() -> LiftedModel:
 
 def _controller_parameters(model: Path) -> dict[str, object]:
     return {
-        'system': 'none', 'model': model, 'levels': ['pi'], 'temperature.pi_gain': PI_GAIN,
-        'temperature.pi_time': PI_TIME, 'temperature.setpoint_ramp': RAMP,
+        'system': 'none', 'model': model, 'levels': ['pi'], 'pi.temperature.gain': PI_GAIN,
+        'pi.temperature.integral_time': PI_TIME, 'temperature.setpoint_ramp': RAMP,
         'temperature.noise': NOISE, 'temperature.max': to_celsius(LIMIT_TEMPERATURE),
         'coolant_temperature.min': to_celsius(float(WIDE.lower[0])),
         'coolant_temperature.max': to_celsius(float(WIDE.upper[0])),
@@ -288,15 +285,19 @@ def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) 
     weight[T], upper[T] = 1.0, LIMIT_TEMPERATURE
     alone = n_x == 1
     n_y = n_x if informed else 1
-    return Controller(model, Settings.for_model(
+    # not when the harness starts, which needs neither
+    from koopman_ros.control.laws.pi import PIParameters
+    from koopman_ros.control.laws.receding_horizon import MPCParameters
+
+    return Controller(model, Tuning.for_model(
         model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,
-        controlled=('temperature',), transfer_time=0.0, sensor=SensorLimits.none(n_y),
-        state_lower=-np.full(n_x, np.inf), state_upper=upper,
-        noise=np.array([1e-4, NOISE])[-n_y:], wander=np.full(1, WANDER),
-        **({'pi_gain': np.array([PI_GAIN]), 'pi_time': np.array([PI_TIME]),
-            'setpoint_ramp': np.array([RAMP])} if alone else
+        controlled=('temperature',), transfer_time=0.0,
+        plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(PI_GAIN, PI_TIME)},
+        noise=np.array([1e-4, NOISE])[-n_y:],
+        wander=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
+        **({'setpoint_ramp': np.array([RAMP])} if alone else
            {'estimator': 'extended_kalman_filter', 'initial_error': FIRST_GUESS}),
-        supervisor=SupervisorSettings(tuple(LevelSettings(law, MARGIN) for law in laws))),
+        levels=laws, validity_margin=MARGIN, linear_margin=MARGIN),
         None if informed or alone else TEMPERATURE)
 
 

@@ -20,11 +20,9 @@ from koopman_ros.control import (
     Controller,
     Initialisation,
     InputLimits,
-    LevelSettings,
     SetpointRequest,
-    Settings,
     simulate,
-    SupervisorSettings,
+    Tuning,
 )
 from koopman_ros.control.simulate import Simulation
 from koopman_ros.execution import Backend, backend_of, Tell
@@ -108,10 +106,10 @@ def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: 
     :param begin: in K; its coolant is on before.
     :param x0: (2,) in mol/L and K.
     """
-    settings = Settings.for_model(
+    settings = Tuning.for_model(
         model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
         controlled=('temperature',), transfer_time=0.0,
-        supervisor=SupervisorSettings(tuple(LevelSettings(law, margin) for law in laws)))
+        levels=laws, validity_margin=margin, linear_margin=margin)
     before = steady(begin)[1]
     return simulate(
         Controller(model, settings), Process(SYSTEM, 0, x0, before),

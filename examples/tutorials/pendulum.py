@@ -25,8 +25,8 @@ from koopman_ros.control import (
     Controller,
     InputLimits,
     SetpointRequest,
-    Settings,
     simulate,
+    Tuning,
 )
 from koopman_ros.learning import compare, Growth, NeuralDrift
 from koopman_ros.plants import box_episodes, describe, plant_class, Process, RandomStepDesign
@@ -158,9 +158,9 @@ balance = -heaviest * np.sin(goal[0])
 print(f'in truth 0.7 rad takes {balance:.4f} N m')
 runs, held = {}, {}
 for contender in (found.contenders[0], found.chosen):
-    controller = Controller(contender.model, Settings.for_model(
+    controller = Controller(contender.model, Tuning.for_model(
         contender.model, state_weight=np.array([1.0 / 0.1 ** 2, 1.0]),
-        input_weight=np.array([1.0 / 2.0 ** 2]), limits=limits))
+        input_weight=np.array([1.0 / 2.0 ** 2]), limits=limits, transfer_time=30.0))
     run = simulate(controller, start, [at(0.1, SetpointRequest(0, goal))], duration=2.0,
                    period=0.02)
     runs[contender.name] = run

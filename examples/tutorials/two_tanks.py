@@ -20,7 +20,7 @@ import sys
 import matplotlib.pyplot as plt
 import numpy as np
 
-from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
+from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, simulate, Tuning
 from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
 from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.lifting import load, save
@@ -148,18 +148,18 @@ for signals in (model.states, model.inputs):
 # ## In control
 #
 # The pumps give 0 to 12 V, and change by at most 2 V/s. Weights are those of squared errors in the
-# signals' units: 1 cm of level is worth 1 V here. `observer_bandwidth` is that of the disturbance
-# observer, which finds out what the model does not know; 0 leaves it out.
+# signals' units: 1 cm of level is worth 1 V here. `disturbance_bandwidth` is that of the
+# disturbance observer, which finds out what the model does not know; 0 leaves it out.
 
 # %%
 limits = InputLimits(lower=np.zeros(2), upper=np.full(2, 12.0), rate=np.full(2, 2.0))
 
 
-def controller(observer_bandwidth):
+def controller(disturbance_bandwidth):
     """Return the controller of the model, with an observer of some bandwidth in 1/s."""
-    return Controller(model, Settings.for_model(
+    return Controller(model, Tuning.for_model(
         model, state_weight=np.full(2, 1.0 / 0.01 ** 2), input_weight=np.ones(2), limits=limits,
-        observer_bandwidth=observer_bandwidth))
+        transfer_time=30.0, disturbance_bandwidth=disturbance_bandwidth))
 
 
 tanks = Process(truth, 0, truth.nominal_state, truth.nominal_input)

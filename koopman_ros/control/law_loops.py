@@ -180,7 +180,7 @@ def _called(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Feedb
             w = -(target.drift + model.forcing(target.x, target.u))
             found = law.compute(Estimate(x[k], w), target, memory[k], seconds, None)
             memory[k] = found.memory
-            if found.failure is None and np.isfinite(found.u).all():
+            if found.failure is None and found.u is not None and np.isfinite(found.u).all():
                 v[k] = model.inputs.to_deviation(limits.within(found.u))
         return v
 

@@ -123,7 +123,8 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
     requested = active if setpoint.requested is None else overlaid(active, setpoint.requested)
     ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
     # infinity for a step, also where no time has passed
-    reach = np.where(np.isfinite(ramp), ramp * seconds, np.inf)
+    reach = np.full(len(ramp), np.inf)
+    np.multiply(ramp, seconds, out=reach, where=np.isfinite(ramp))
     ramped = np.minimum(np.maximum(requested, ramped - reach), ramped + reach)
     if lag <= 0.0:
         arrived = ramped.tolist() == requested.tolist()

@@ -13,12 +13,11 @@ import numpy as np
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.control.bumpless import BumplessTransfer
-from koopman_ros.control.laws.base import NO_SOLUTION, Plan, SolutionInfo, Target
+from koopman_ros.control.laws.base import NO_SOLUTION, Plan, SolutionInfo
 from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
-from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.plugs import contained
 from koopman_ros.reasons import Reason
 
@@ -106,84 +105,47 @@ NOTHING_MEASURED = MeasurementReport()
 
 @dataclass(frozen=True, slots=True)
 class EstimateReport:
-    """The estimate in units, which it is turned into where somebody asks."""
+    """The estimate in the units of the signals."""
 
-    estimate: Estimate  #: in scaled deviations
-    estimator: Estimator  #: of the level that acts
+    state: Array  #: (n_x,) in state units
+    #: (n_u,) as an input that would have the same effect, in input units; NaN where not known
+    disturbance: Array
+    at_bound: bool  #: whether the disturbance is as large as is allowed
+    #: (n_x, n_x) of the state's error, in products of state units; None where not known
+    covariance: Array | None
+    innovation: Innovation | None  #: how well the measurements were predicted, or None
 
-    @property
-    def state(self) -> Array:
-        """(n_x,) in state units."""
-        return self.estimator.model.states.to_physical(self.estimate.x)
-
-    @property
-    def disturbance(self) -> Array:
-        """(n_u,) as an input that would have the same effect, in input units."""
-        inputs = self.estimator.model.inputs
+    @staticmethod
+    def of(estimate: Estimate, estimator: Estimator) -> EstimateReport:
+        """Return what is reported of an estimate, whatever fails in an estimator."""
+        states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
         try:
-            as_input: Array = self.estimator.as_input(self.estimate.w)
-            return as_input * inputs.scale
-        except BaseException as error:
-            contained(error)  # an estimator that works in the loop may still fail here
-            return np.full(len(inputs), np.nan)
-
-    @property
-    def at_bound(self) -> bool:
-        """Whether the disturbance is as large as is allowed."""
-        try:
-            return bool(self.estimator.at_bound(self.estimate.w))
+            disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
+            at_bound = bool(estimator.at_bound(estimate.w))
         except BaseException as error:
             contained(error)
-            return False
-
-    @property
-    def covariance(self) -> Array | None:
-        """(n_x, n_x) of the state's error, in products of state units; None where not known."""
-        whole, scale = self.estimate.covariance, self.estimator.model.states.scale
-        n = len(scale)
-        return None if whole is None else scale[:, None] * whole[:n, :n] * scale
-
-    @property
-    def innovation(self) -> Innovation | None:
-        """How well the measurements were expected, or None."""
-        return self.estimate.innovation
+            disturbance, at_bound = np.full(len(inputs), np.nan), False
+        return EstimateReport(
+            states.to_physical(estimate.x), disturbance, at_bound, None if P is None else (
+                states.scale[:, None] * P[:len(states), :len(states)] * states.scale),
+            estimate.innovation)
 
     @property
     def deviation(self) -> Array | None:
-        """Standard deviation, (n_x,), of the state's error, in state units; or None."""
+        """Standard deviation (n_x,) of the state's error, in state units; None if not known."""
         return None if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 
 @dataclass(frozen=True, slots=True)
 class TargetReport:
-    """Where the law goes, in units into which it is turned where somebody asks."""
+    """The target of the law, in the units of the signals."""
 
-    setpoint: Array  #: (n_c,) what is tracked, in state units
-    controlled: Coordinates  #: the states that it is of
-    model: LiftedModel  #: of the steady state that goes with it
-    target: Target | None = None  #: that state, in scaled deviations; None without a law
-
-    @property
-    def outside(self) -> float:
-        """Its distance from the training box, in half-ranges."""
-        return self.controlled.violation(self.setpoint)
-
-    @property
-    def residual(self) -> float:
-        """Rate of the state there that no input balances, scaled; NaN without a law."""
-        return math.nan if self.target is None else self.target.residual
-
-    @property
-    def state(self) -> Array | None:
-        """(n_x,) steady state that goes with it, in state units; None without a law."""
-        if self.target is None:
-            return None
-        return self.model.states.to_physical(self.target.x)
-
-    @property
-    def input(self) -> Array | None:
-        """(n_u,) that holds it, in input units; None without a law."""
-        return None if self.target is None else self.model.inputs.to_physical(self.target.u)
+    setpoint: Array  #: (n_c,) that is tracked, in state units
+    outside: float  #: its distance from the training box, in half-ranges
+    #: rate of the state there that no input balances, scaled; NaN without a law
+    residual: float = math.nan
+    state: Array | None = None  #: (n_x,) steady state, in state units; None without a law
+    input: Array | None = None  #: (n_u,) that holds it, in input units; None without a law
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,7 +106,8 @@ class ControlStep(Configuration):
             predicts.
         :return: as :meth:`step`; the command is None before the first.
         """
-        if state.command is None:
+        held = state.command
+        if held is None:
             return state, None, self._report(state, None)
         time = time_of_silence(state, time_ns)
 
@@ -117,9 +118,8 @@ class ControlStep(Configuration):
                 fault = None if cause is None else reason(cause)
                 return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
             if now.estimate is None or now.setpoint.active is None:
-                assert now.command is not None
                 now = replace(now, commanded_ns=time.command_ns)
-                return now, now.command, self._report(now, now.supervisor.reason)
+                return now, held, self._report(now, now.supervisor.reason)
             x = self.model.states.to_physical(now.estimate.x)
             return self._command(
                 self._advanced(now, x, time), Verdict(now.accepted),
@@ -281,9 +281,12 @@ class ControlStep(Configuration):
                 command: CommandReport = NO_COMMAND) -> Report:
         active, manual = state.setpoint.active, state.mode is Mode.MANUAL
         depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
-        return Report(
-            state.mode, MANUAL if manual else self.order.levels[depth], depth, why, measured,
-            None if state.estimate is None else EstimateReport(
-                state.estimate, self.estimation.level(state).estimator),
-            None if active is None else TargetReport(active, self.controlled, self.model, target),
-            command)
+        known = None if state.estimate is None else EstimateReport.of(
+            state.estimate, self.estimation.level(state).estimator)
+        aim = None if active is None else TargetReport(active, self.controlled.violation(active))
+        if aim is not None and target is not None:
+            aim = replace(aim, residual=target.residual,
+                          state=self.model.states.to_physical(target.x),
+                          input=self.model.inputs.to_physical(target.u))
+        return Report(state.mode, MANUAL if manual else self.order.levels[depth], depth, why,
+                      measured, known, aim, command)

@@ -109,14 +109,15 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
 
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Return the parameter dataclasses of known plug-ins, and of those that values name."""
-    laws, estimator = given.get('levels', ()), given.get('estimator', '')
     found: dict[str, type[Any]] = {}
-    for kind, known, base, named in (('law', LAWS, Law, laws),
-                                     ('estimator', ESTIMATORS, Estimator, (estimator,))):
-        for name in dict.fromkeys((*known, *filter(None, named))):
-            # what is no plug-in, the check of the parameters refuses
-            with contextlib.suppress(ValueError):
-                found[short_name(name)] = plug_class(name, kind, known, base).Parameters
+    # what is no plug-in, the check of the parameters refuses
+    for name in dict.fromkeys((*LAWS, *given.get('levels', ()))):
+        with contextlib.suppress(ValueError):
+            found[short_name(name)] = plug_class(name, 'law', LAWS, Law).Parameters
+    for name in dict.fromkeys((*ESTIMATORS, *filter(None, (given.get('estimator'),)))):
+        with contextlib.suppress(ValueError):
+            found[short_name(name)] = plug_class(
+                name, 'estimator', ESTIMATORS, Estimator).Parameters
     return found
 
 

@@ -158,9 +158,9 @@ class ParameterTable(Generic[T]):
                 for name, own in self._plugins.items():
                     yield from self._declared(own, f'{name}.', defaults)
             elif 'group' in how:
-                for row in self._groups[item.name]:
-                    name = f'{item.name}.{row.name}'
-                    yield name, replace(row, name=name)
+                for given in self._groups[item.name]:
+                    name = f'{item.name}.{given.name}'
+                    yield name, replace(given, name=name)
             elif 'per_signal' in how:
                 for signal, unit in self._of(item).items():
                     for row in fields(how['per_signal']):

@@ -12,6 +12,9 @@ from functools import cache
 import itertools
 import sys
 
+from koopman_ros.estimation.kalman import propagated
+from koopman_ros.estimation.observer import moved
+from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, named, NUMPY
 import numpy as np
 import pytest
 from std_msgs.msg import String
@@ -20,9 +23,6 @@ from koopman_ros.control import State
 from koopman_ros.control.laws.base import steady_state_target, Weights
 from koopman_ros.control.laws.riccati import recentred, regulator
 from koopman_ros.control.laws.shooting import Horizon, program, slope_at
-from koopman_ros.estimation.kalman import propagated
-from koopman_ros.estimation.observer import moved
-from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, named, NUMPY
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.replay.records import decoded, encoded, NUMERICS

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from koopman_ros.control import Arrival, Controller, InputLimits, Mode, Settings, State
-from koopman_ros.estimation import SensorLimits
+from koopman_ros.control import Arrival, Controller, InputLimits, Mode, SensorLimits, State, Tuning
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import decoded
 from koopman_ros.signals import Outputs
-from support.closed_loops import content, controller, EPOCH, SECOND, supervisor_settings
+from support.closed_loops import content, controller, EPOCH, SECOND
 from support.random_lifts import coordinates, random_lift
 
 
@@ -30,12 +29,12 @@ def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object)
     measured = outputs or Outputs(states.names, states.units, np.eye(model.n_x))
     reach = np.abs(measured.C) @ (20.0 * states.scale)
     middle = measured.of(states.center)
-    return Controller(model, replace(Settings.for_model(
+    return Controller(model, replace(Tuning.for_model(
         model, state_weight=1.0 / states.scale ** 2, input_weight=n_u / inputs.scale ** 2,
         limits=InputLimits(inputs.lower - n_u, inputs.upper + n_u, 0.5 * n_u),
         setpoint_ramp=0.1 * states.scale, max_disturbance=2.0 * inputs.scale,
         sensor=SensorLimits(middle - reach, middle + reach, 0.1 * reach, 0.2 * reach, 5.0),
-        observer_bandwidth=0.2, supervisor=supervisor_settings(hold_timeout=5.0),
+        disturbance_bandwidth=0.2, hold_timeout=5.0,
         transfer_time=3.0), **changes), outputs)
 
 
@@ -62,7 +61,7 @@ events = st.lists(st.tuples(kinds, st.lists(shares, min_size=4, max_size=4), wai
 ENDLESS = {'lower': np.array([-math.inf]), 'upper': np.array([math.inf]),
            'rate': np.array([math.inf])}
 REACTORS = [[first, first, *others] for first, *others in (
-    [controller(), controller(observer_bandwidth=0.0, transfer_time=0.0),
+    [controller(), controller(disturbance_bandwidth=0.0, transfer_time=0.0),
      controller(input_weight=np.array([1e-4]))],
     [controller('reactor_linear'), controller(sensor=ENDLESS)],
     [controller('reactor_nz3', setpoint_ramp=np.array([0.2])), controller('reactor_linear')])]
@@ -76,7 +75,7 @@ def random_controllers(n_x: int, n_u: int, seed: int, all_states: bool, n_c: int
     part = {'controlled': model.states.names[:n_c], 'setpoint_ramp': 0.1 * model.states.scale[
         :n_c]} if n_c else {}
     found = [tuned(model, outputs, **part), tuned(model, outputs),
-             tuned(model, outputs, observer_bandwidth=0.0, **part)]
+             tuned(model, outputs, disturbance_bandwidth=0.0, **part)]
     if all_states and n_x > 1 and n_c:
         with contextlib.suppress(ValueError):
             # what is measured may leave the disturbance open
@@ -95,7 +94,7 @@ controllers = st.one_of(st.sampled_from(REACTORS), st.builds(
 @np.errstate(all='ignore')
 def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
     loop, model = controllers[0], controllers[0].model
-    limits, state, now = loop.settings.limits, State(), EPOCH
+    limits, state, now = loop.tuning.limits, State(), EPOCH
     last = loop.measured.of(model.states.center)
     for kind, values, wait in sequence:
         before, earlier, then = state.command, state.commanded_ns, state.time_ns
@@ -199,19 +198,19 @@ def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
     np.testing.assert_allclose(state.estimate.w, load, rtol=0, atol=1e-5)
 
 
-def test_nothing_broadcasts():
+def test_an_array_of_another_size_is_refused():
     good = tuned(random_lift(2, n_u=2))
-    for name in ('state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
-                 'input_tolerance', 'safe_input'):
-        for wrong in (np.ones(1), np.ones(3), 1.0, np.ones((2, 1))):
+    for name in ('state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance', 'tolerance',
+                 'safe'):
+        for wrong in (np.ones(1), np.ones(3), np.ones((2, 1))):
             with pytest.raises((ValueError, TypeError), match='one number for each of'):
-                Controller(good.model, replace(good.settings, **{name: wrong}))
+                Controller(good.model, replace(good.tuning, **{name: wrong}))
     for part, names in (('limits', ('lower', 'upper', 'rate')),
                         ('sensor', ('lower', 'upper', 'rate', 'jump'))):
-        whole = getattr(good.settings, part)
+        whole = getattr(good.tuning, part)
         short = replace(whole, **{item: getattr(whole, item)[:1] for item in names})
         with pytest.raises(ValueError, match=f'{names[0]}: expected one number for each of'):
-            Controller(good.model, replace(good.settings, **{part: short}))
+            Controller(good.model, replace(good.tuning, **{part: short}))
 
 
 @pytest.mark.parametrize('estimator', ['disturbance_observer', 'measured_state'])

@@ -21,7 +21,7 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.control.laws import LawResult, Linear
-from koopman_ros.control.supervisor import WayBack
+from koopman_ros.control.supervisor import SafeStateRecovery
 from koopman_ros.estimation import (
     DisturbanceObserver,
     Estimate,
@@ -113,7 +113,7 @@ class Checked:
         self.controller, self.state, self.reports = controller, State(), []
 
     def do(self, event):
-        limits, before = self.controller.settings.limits, self.state
+        limits, before = self.controller.tuning.limits, self.state
         outcome = apply(self.controller, before, event)
         self.state = outcome.state
         if outcome.command is None:
@@ -314,10 +314,10 @@ def test_the_covariance_stays_positive_definite_over_any_gap(kind, seconds):
         assert np.all(np.diag(estimate.covariance)[:2] > 0.0)
 
 
-def test_a_way_back_that_has_come_to_the_training_data_by_itself_is_over():
-    began = WayBack(1.0, 1.0, 0)
+def test_a_recovery_that_has_come_to_the_training_data_by_itself_is_over():
+    began = SafeStateRecovery(1.0, 1.0, 0)
     assert began.moved(0.0, SECOND, 10.0) is None
-    led = WayBack(1.0, 1.0, 0, led=True).moved(0.0, SECOND, 10.0)
+    led = SafeStateRecovery(1.0, 1.0, 0, led=True).moved(0.0, SECOND, 10.0)
     assert led.share == 1.0
 
 

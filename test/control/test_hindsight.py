@@ -14,13 +14,12 @@ from koopman_ros.control import (
     hindsight,
     InputLimits,
     SetpointRequest,
-    Settings,
+    Tuning,
 )
 from koopman_ros.control.events import Measurement
 from koopman_ros.control.hindsight import Recent, Windows
 from koopman_ros.control.simulate import at, simulate
 from koopman_ros.control.state import Arrival, MeasurementReport
-from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
 from koopman_ros.signals import Outputs
@@ -39,11 +38,10 @@ def model(A: np.ndarray = A, B: np.ndarray = B) -> LiftedModel:
 
 
 def one(model: LiftedModel, outputs: Outputs | None = None) -> Controller:
-    n_y = model.n_x if outputs is None else len(outputs.names)
     limits = InputLimits(model.inputs.lower, model.inputs.upper, np.full(model.n_u, np.inf))
-    return Controller(model, Settings.for_model(
+    return Controller(model, Tuning.for_model(
         model, state_weight=np.ones(model.n_x), input_weight=np.ones(model.n_u), limits=limits,
-        sensor=SensorLimits.none(n_y), noise=np.full(n_y, 0.01), wander=np.full(model.n_u, 1e-3)),
+        noise=0.01, wander=1e-3 * np.sqrt(60.0)),
         outputs)
 
 
@@ -146,7 +144,7 @@ def test_steady_noise_tells_nothing():
 def test_reactor_under_control_tells_lifts_from_models_of_another(noise):
     lift = shipped('reactor_nz4')
     run = simulate(
-        controller(lift, observer_bandwidth=0.1),
+        controller(lift, disturbance_bandwidth=0.1),
         Process(REACTOR, 0, REACTOR.nominal_state, REACTOR.nominal_input),
         [at(500.0, SetpointRequest(0, np.array([START - 4.0]))),
          at(700.0, SetpointRequest(0, np.array([START - 1.0])))],

@@ -3,7 +3,7 @@
 
 """Closed loops over a box: which laws pass, which fail, where, and beside what."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 import math
 
@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from koopman_ros.control import Controller, LevelSettings, Settings, State, SupervisorSettings
+from koopman_ros.control import Controller, InputLimits, State, Tuning
 from koopman_ros.control.law_check import check_law, LawCheck
 from koopman_ros.control.law_map import draw_loops, plot_law_check
-from koopman_ros.control.laws import LawResult, Linear, Tuning, Weights
+from koopman_ros.control.laws import Law, LawResult, Linear
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.control.limits import InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import (
     Coordinates,
@@ -126,16 +125,11 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
     assert check_law(right, linear_rate(0.5), loops=32).accepted
 
 
-@dataclass(frozen=True)
-class Constant:
+class Constant(Law):
     """A law with a gain of 4."""
 
-    model: LiftedModel
-    tuning: Tuning
-
-    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf, last=None):
-        return LawResult(limits.within(
-            self.model.inputs.to_physical(target.u - 4.0 * (estimate.x - target.x))))
+    def compute(self, estimate, target, memory, interval, previous):
+        return LawResult(self.model.inputs.to_physical(target.u - 4.0 * (estimate.x - target.x)))
 
 
 def held_cost(a, gain, h):
@@ -149,10 +143,9 @@ def test_a_costly_law_is_refused_by_what_it_costs():
     endless = InputLimits(np.full(1, -np.inf), np.full(1, np.inf), np.full(1, np.inf))
     model, h = scalar(), 0.4  # longer than half of 1 / sqrt(2)
     found = check_law(model, linear_rate(1.0), law=Constant, limits=endless, interval=h, loops=16)
-    tuning = Tuning(Weights(np.eye(1), np.eye(1)))
-    u = Linear(model, tuning).compute(
-        Estimate(np.ones(1), np.zeros(1)), steady_state_target(model, np.zeros(1)), endless, None,
-        h).u
+    u = Linear(model, Tuning.for_model(model), None).compute(
+        Estimate(np.ones(1), np.zeros(1)), steady_state_target(model, np.zeros(1)), None, h,
+        None).u
     expected = held_cost(1.0, 4.0, h) / held_cost(1.0, -float(u[0]), h)
     assert expected > 1.1
     assert found.ratios == pytest.approx(np.full(16, expected), rel=1e-4)
@@ -272,11 +265,11 @@ def test_tried_loops_of_another_plant_are_refused():
 
 def levels_on_the_way(model, levels, start, setpoint):
     """Let a controller bring the plant dx/dt = x + u to a set-point; return (level, reason)s."""
-    loop = Controller(model, Settings.for_model(
-        model, state_weight=np.ones(1), input_weight=np.ones(1), observer_bandwidth=5.0,
+    loop = Controller(model, Tuning.for_model(
+        model, state_weight=np.ones(1), input_weight=np.ones(1), disturbance_bandwidth=5.0,
         limits=InputLimits(*(np.full(1, bound) for bound in (-3.0, 3.0, np.inf))),
-        transfer_time=0.0, supervisor=SupervisorSettings(tuple(
-            LevelSettings(law, 1.0) for law in levels), recovery_time=0.5)))
+        transfer_time=0.0, levels=levels, validity_margin=1.0, linear_margin=1.0,
+        recovery_time=0.5))
     x, h, found = np.array([start]), 0.05, []
     state, refused = loop.request_setpoint(State(), np.array([setpoint]))
     assert refused is None

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The laws against exact optima, and a law and an estimator added from a folder."""
+"""The laws against exact optima."""
 
 from dataclasses import replace
 import re
@@ -11,18 +11,9 @@ import pytest
 from scipy.linalg import solve_continuous_are
 from scipy.optimize import brentq
 
-from koopman_ros.control import exchange, LevelSettings, run_closed_loop, SupervisorSettings
-from koopman_ros.control.laws import (
-    averaged,
-    feedback,
-    Form,
-    LAWS,
-    recentred,
-    Tuning,
-    Weights,
-)
+from koopman_ros.control import run_closed_loop, Tuning
+from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.control.laws.riccati import Answer, checked
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import Coordinates, linearised_model, NetworkObservables, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
@@ -30,10 +21,8 @@ from koopman_ros.plants.optimum import cost_along, optimum, Task
 from koopman_ros.reasons import Code
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 from support.closed_loops import (
-    controller,
     COOLANT,
     REACTOR,
-    Reactor,
     reactor_weights,
     run_reactor,
     SETPOINT,
@@ -389,103 +378,30 @@ def test_an_interval_makes_gains_smaller_and_predictions_stable():
     assert aware.solved
     assert aware.riccati.gain < 0.5 * unaware.riccati.gain
     assert aware.growth(1.0 / 60.0) < 1.0 < unaware.growth(1.0 / 60.0)
-    # nor is a gain used that came from elsewhere
-    limits = controller().settings.limits
-    within, beyond = (Answer.of(model, found, 1.0 / 60.0) for found in (aware, unaware))
-    assert checked(model, within, limits, 1.0).failure is None
-    refused = checked(model, beyond, limits, 1.0)
-    assert refused.failure.code is Code.PREDICTED_UNSTABLE
-    assert refused.failure.values['interval'] == 1.0
 
 
-def test_the_linear_law_is_solved_for_the_interval_and_once():
+def test_the_linear_law_is_solved_for_the_interval():
     model = shipped('reactor_nz4')
-    weights, linear = reactor_weights(model, 0.1), model.linearised
-    law = LAWS['linear'](model, Tuning(weights))
-    target, limits = setpoint_target(linear, 323.0), controller().settings.limits
+    tuning = Tuning.for_model(model, input_weight=[0.003], max_gain=1e6)
+    law, linear = LAWS['linear'](model, tuning, None), model.linearised
+    weights = Weights.physical(model, tuning.state_weight, tuning.input_weight)
+    target = setpoint_target(linear, 323.0)
     estimate = Estimate(linear.states.to_deviation(np.array([324.0])), np.zeros(1))
     for seconds in (1.0, 15.0, 1.0, 0.0):
-        found = law.compute(estimate, target, limits, None, seconds)
+        found = law.compute(estimate, target, None, seconds, None)
         K = solve_riccati(linear.A, linear.B, weights.Q, weights.R, interval=seconds / 60.0).K
         u = linear.inputs.to_physical(target.u - K @ (estimate.x - target.x))
         np.testing.assert_allclose(found.u, u, rtol=1e-12)
-        again = law.compute(estimate, target, limits, None, seconds)
-        assert again.u.tobytes() == found.u.tobytes()
 
 
-# What CONTRIBUTING says how to add, added from a temporary folder.
-
-LAW = """
-from dataclasses import dataclass
-import math
-
-import numpy as np
-
-from koopman_ros.control.laws.base import LawResult, Tuning
-from koopman_ros.lifting import LiftedModel
-
-
-@dataclass(frozen=True)
-class Proportional:
-    model: LiftedModel
-    tuning: Tuning
-
-    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf, last=None):
-        u = target.u - 2.0 * self.model.input_inverse() @ (estimate.x - target.x)
-        calls = (memory or 0) + 1
-        return LawResult(limits.within(self.model.inputs.to_physical(u)), memory=calls)
-"""
-ESTIMATOR = """
-from koopman_ros.estimation import DisturbanceObserver, Estimate
-
-
-class Slow(DisturbanceObserver):
-    def correct(self, predicted, x, seconds):
-        return super().correct(predicted, x, 0.1 * seconds)
-"""
-
-
-def test_law_of_another_module_controls_and_falls_back(tmp_path, monkeypatch):
-    def levels(*laws: str) -> SupervisorSettings:
-        return SupervisorSettings(
-            tuple(LevelSettings(law, 0.5) for law in laws), recovery_time=0.0)
-
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / 'proportional_law.py').write_text(LAW)
-    name = 'proportional_law:Proportional'
-    usual = controller()
-    loop = Reactor(replace(usual, settings=replace(
-        usual.settings, supervisor=levels(name, 'sdre'))))
-    loop.run(10)
-    loop.ask(320.0)
-    samples = loop.run(400)
-    assert {sample.report.level for sample in samples} == {name}
-    assert samples[-1].temperature == pytest.approx(320.0, abs=1e-3)
-    # what a law remembers goes in again
-    assert loop.loop.state.law_memory == 410
-    loop.do(exchange(replace(usual, settings=replace(
-        usual.settings, supervisor=levels('sdre', name)))))
-    assert loop.run(20)[-1].report.level == 'sdre'
-
-
-def test_estimator_of_another_module_estimates(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / 'slow_estimator.py').write_text(ESTIMATOR)
-    estimates = []
-    for name in ('', 'slow_estimator:Slow'):
-        loop = Reactor(controller(estimator=name))
-        loop.run(5)
-        loop.run(5, lambda kelvin: kelvin + 0.5)
-        estimates.append(float(loop.loop.state.estimate.w[0]))
-    assert abs(estimates[0]) > 2.0 * abs(estimates[1]) > 0.0
-
-
-@pytest.mark.parametrize(('name', 'words'), [
-    ('nonsense', "there is no estimator 'nonsense': choose one of disturbance_observer"),
-    ('no_such_module:Estimator', "'no_such_module:Estimator' cannot be loaded"),
-    ('math:nothing', "'math:nothing' cannot be loaded"),
-    ('math:pi', "'math:pi' is a float, which cannot be called"),
-])
-def test_names_that_stand_for_nothing_are_refused(name: str, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        controller(estimator=name)
+def test_a_law_that_is_predicted_unstable_is_not_used():
+    model = shipped('reactor_nz4')
+    estimate = Estimate(np.array([-0.5]), np.zeros(1))
+    law = LAWS['sdre'](model, Tuning.for_model(model, input_weight=[1e-9], max_gain=1e9), None)
+    with pytest.MonkeyPatch.context() as patched:
+        # a gain for continuous time under a sample a second
+        patched.setattr(riccati, 'feedback', lambda *arguments, interval, **bounds: feedback(
+            *arguments, **bounds))
+        refused = law.compute(estimate, setpoint_target(model), None, 1.0, None)
+    assert refused.failure.code is Code.PREDICTED_UNSTABLE
+    assert refused.failure.values['interval'] == 1.0

@@ -14,13 +14,12 @@ from koopman_ros.control import (
     Controller,
     exchange,
     InputLimits,
-    limit,
     Mode,
     ModeChange,
     restart,
     State,
 )
-from koopman_ros.control.limits import shifted, Transfer
+from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
 from support.closed_loops import (
     controller,
     EPOCH,
@@ -64,8 +63,8 @@ def test_each_input_has_its_own_limits():
     assert limited.at_rate
 
 
-def step(size: float) -> Transfer:
-    return Transfer(np.array([size]), np.array([size]))
+def step(size: float) -> BumplessTransfer:
+    return BumplessTransfer(np.array([size]), np.array([size]))
 
 
 def faded(seconds: float, constant: float) -> float:
@@ -81,7 +80,7 @@ def test_an_offset_fades_by_its_formula_however_it_is_sampled(steps):
 
 
 def test_offsets_add_up():
-    transfer = shifted(step(2.0).after(10.0, 30.0), np.array([-1.0])).after(20.0, 30.0)
+    transfer = with_step(step(2.0).after(10.0, 30.0), np.array([-1.0])).after(20.0, 30.0)
     expected = 2.0 * faded(30.0, 30.0) - faded(20.0, 30.0)
     np.testing.assert_allclose(transfer.offset, [expected], rtol=1e-12)
 
@@ -142,7 +141,7 @@ def test_from_a_coolant_that_the_law_would_not_choose(by):
 
 @pytest.mark.parametrize('change', [
     {'input_weight': np.array([0.05])}, {'state_weight': np.array([0.1])},
-    {'observer_bandwidth': 12.0 / 60.0}, {'transfer_time': 5.0},
+    {'disturbance_bandwidth': 12.0 / 60.0}, {'transfer_time': 5.0},
     {'limits': InputLimits(np.array([270.0]), np.array([320.0]), np.array([5.0]))},
 ], ids=lambda change: next(iter(change)))
 def test_retuning(change):
@@ -215,14 +214,14 @@ def test_a_coolant_that_is_no_number_is_not_taken_over():
 def test_a_controller_succeeds_itself_without_a_trace():
     loop = loop_at(START)
     before, state, x = loop.loop.controller, loop.loop.state, np.array([loop.kelvin])
-    again = Controller(before.model, before.settings)
+    again = Controller(before.model, before.tuning)
     later = state.time_ns + 10 ** 9
     np.testing.assert_array_equal(again.step(again.hand_over(before, state), x, later)[1],
                                   before.step(state, x, later)[1])
 
 
 def test_who_wants_no_transfer_is_answered_by_the_law_from_the_first_measurement_on():
-    free = controller(transfer_time=0.0, observer_bandwidth=0.0, limits=InputLimits(
+    free = controller(transfer_time=0.0, disturbance_bandwidth=0.0, limits=InputLimits(
         np.array([278.15]), np.array([305.15]), np.array([np.inf])))
     measured = np.array([START + 2.0])
     _, alone, _ = free.step(State(), measured, EPOCH)

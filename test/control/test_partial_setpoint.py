@@ -20,13 +20,13 @@ from koopman_ros.control import (
     InputLimits,
     run_closed_loop,
     SetpointRequest,
-    Settings,
     simulate,
     State,
+    Tuning,
     Weights,
 )
 from koopman_ros.control.events import Outcome
-from koopman_ros.control.target import reachable_target
+from koopman_ros.control.steady_state import reachable_target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.lifting.observables import PolynomialObservables
@@ -66,11 +66,11 @@ THREE = tanks([[-0.2, 0.0, 0.0], [0.2, -0.1, 0.0], [0.0, 0.05, -0.1]],
 
 def loop(model, *controlled, lower=0.0, upper=6.0, **others):
     n_u = model.n_u
-    return Controller(model, Settings.for_model(
+    return Controller(model, Tuning.for_model(
         model, state_weight=np.ones(model.n_x), input_weight=np.ones(n_u),
         limits=InputLimits(np.broadcast_to(lower, n_u).astype(float),
                            np.broadcast_to(upper, n_u).astype(float), np.full(n_u, np.inf)),
-        controlled=controlled, observer_bandwidth=0.3, **others))
+        controlled=controlled, disturbance_bandwidth=0.3, **others))
 
 
 def stepped(controller, state, x, second):
@@ -97,7 +97,7 @@ def test_one_of_two_levels_is_held_under_a_disturbance(w):
     state, refused = asked(controller, 1.4, state)
     assert refused is None
     target = controller.levels['sdre'].target(
-        np.array([1.4]), state.estimate.w, controller.settings.limits, None)
+        np.array([1.4]), state.estimate.w, None)
     # 0.2 (h1 - 1) = 0.1 * 0.4 - w2 and 0.1 (q - 3) = 0.2 (h1 - 1) - w1
     h1 = 1.0 + (0.04 - w[1]) / 0.2
     np.testing.assert_allclose(controller.model.states.to_physical(target.x), [h1, 1.4],
@@ -133,7 +133,7 @@ def test_inputs_to_spare_go_least_far_from_the_nominal_point():
     # h1 = 1 + a, q1 = 3 + a, q2 = 3 + r - a; in scaled deviations a / 0.5, a / 2 and (r - a) / 2:
     # the sum of squares is least where 4 a + 0.25 a = 0.25 (r - a)
     target = loop(BOTH, 'h2').levels['sdre'].target(
-        np.array([1.9]), np.zeros(2), loop(BOTH).settings.limits, None)
+        np.array([1.9]), np.zeros(2), None)
     a = 0.9 / 18.0
     np.testing.assert_allclose(BOTH.states.to_physical(target.x), [1.0 + a, 1.9], atol=1e-9)
     np.testing.assert_allclose(BOTH.inputs.to_physical(target.u), [3.0 + a, 3.9 - a], atol=1e-9)
@@ -143,7 +143,7 @@ def test_an_input_makes_up_for_another_at_its_limit():
     controller = loop(BOTH, 'h2', upper=[3.5, 3.2])
     assert asked(controller, 1.65)[1] is None
     target = controller.levels['sdre'].target(
-        np.array([1.65]), np.zeros(2), controller.settings.limits, None)
+        np.array([1.65]), np.zeros(2), None)
     np.testing.assert_allclose(BOTH.inputs.to_physical(target.u), [3.45, 3.2], atol=1e-9)
     # both together reach 0.5 + 0.2
     refused = asked(controller, 1.9)[1]
@@ -177,8 +177,7 @@ def test_of_two_steady_states_the_one_before_is_followed():
     controller = parabola()
     for sign in (1.0, -1.0):
         target = controller.levels['sdre'].target(
-            np.array([0.81]), np.zeros(2), controller.settings.limits,
-            np.array([sign, 1.0, sign]))
+            np.array([0.81]), np.zeros(2), np.array([sign, 1.0, sign]))
         np.testing.assert_allclose(
             controller.model.states.to_physical(target.x), [0.9 * sign, 0.81], atol=1e-8)
 
@@ -487,7 +486,7 @@ changes = st.lists(st.tuples(
     loop(THREE, 'h2', 'h3', setpoint_ramp=np.array([0.1, np.inf])), loop(SERIES, 'h1'),
     parabola(setpoint_filter=3.0)]), changes)
 def test_commands_are_numbers_within_limits_and_follow_from_the_state_alone(controller, sequence):
-    n, limits, state = controller.model.n_x, controller.settings.limits, State()
+    n, limits, state = controller.model.n_x, controller.tuning.limits, State()
     signals = controller.controlled.names
     for second, (kind, values) in enumerate(sequence):
         kept, now = content(state), EPOCH + second * SECOND
@@ -521,7 +520,7 @@ def test_commands_are_numbers_within_limits_and_follow_from_the_state_alone(cont
     (THREE, ('h2', 'h3'), [2.0, 1.8], [-0.05, 0.0, -0.2])])
 def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, controlled, asked, w):
     level = next(iter(loop(model, *controlled).levels.values()))
-    limits = loop(model).settings.limits
+    limits = loop(model).tuning.limits
     w = np.array(w) / model.states.scale
     places = [model.states.names.index(name) for name in controlled]
     found = reachable_target(

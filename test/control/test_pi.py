@@ -12,13 +12,12 @@ from koopman_ros.control import (
     Controller,
     Initialisation,
     InputLimits,
-    LevelSettings,
     SetpointRequest,
-    Settings,
     simulate,
     State,
-    SupervisorSettings,
+    Tuning,
 )
+from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.reasons import Code
@@ -40,16 +39,15 @@ def signals_alone(names=('x',), low=-50.0, high=50.0, inputs=('u',)):
                             Provenance('signals alone'))
 
 
-def controller(model=None, *, lower=-1e3, upper=1e3, rate=np.inf, laws=('pi',), **others):
+def controller(model=None, *, lower=-1e3, upper=1e3, rate=np.inf, laws=('pi',), gain=GAIN,
+               time=TIME, **others):
     model = model or signals_alone()
-    return Controller(model, Settings.for_model(model, **{
+    return Controller(model, Tuning.for_model(model, **{
         'state_weight': np.ones(model.n_x), 'input_weight': np.ones(model.n_u),
         'limits': InputLimits(np.full(model.n_u, lower), np.full(model.n_u, upper),
                               np.full(model.n_u, rate)),
-        'transfer_time': 0.0, 'pi_gain': np.full(model.n_x, GAIN),
-        'pi_time': np.full(model.n_x, TIME),
-        'supervisor': SupervisorSettings(tuple(LevelSettings(law, 1.0) for law in laws)),
-        **others}))
+        'transfer_time': 0.0, 'plugins': {'pi': PIParameters(gain, time)}, 'levels': laws,
+        'validity_margin': 1.0, 'linear_margin': 1.0, **others}))
 
 
 def run(one, setpoint=10.0, seconds=200.0, u=0.0, events=()):
@@ -99,7 +97,7 @@ def test_it_begins_where_another_law_ended():
 
 
 def test_without_a_gain_the_next_level_acts_and_says_why():
-    loop = run(controller(pi_gain=np.zeros(1), laws=('pi',)), seconds=5.0)
+    loop = run(controller(gain=0.0, laws=('pi',)), seconds=5.0)
     assert set(loop.levels) == {'hold'}
     assert loop.reports[-1].reason.cause.code is Code.NO_PI_GAIN
 
@@ -107,7 +105,7 @@ def test_without_a_gain_the_next_level_acts_and_says_why():
 def test_two_signals_move_two_inputs_each_its_own():
     model = signals_alone(('x', 'y', 'z'), inputs=('u', 'v'))
     one = controller(model, controlled=('x', 'z'), setpoint_ramp=np.full(2, np.inf),
-                     pi_gain=np.array([2.0, 0.0, -3.0]))
+                     gain=[2.0, 0.0, -3.0])
     state, _ = one.request_setpoint(one.initialise(State(), np.zeros(2)),
                                     np.array([10.0, 10.0]))
     for k in (1, 2):
@@ -116,7 +114,7 @@ def test_two_signals_move_two_inputs_each_its_own():
     assert command - first == pytest.approx([2.0 * (-1.0 + 9.0 / TIME),
                                              -3.0 * (-2.0 + 8.0 / TIME)])
     with pytest.raises(ValueError, match='2 inputs for the PI laws of x, y, z'):
-        controller(model, pi_gain=np.ones(3))
+        controller(model, gain=1.0)
 
 
 def test_signals_alone_are_a_model_file(tmp_path):
@@ -132,8 +130,8 @@ def test_the_reactor_is_held_at_its_saddle_for_an_hour():
         Coordinates.spanning(('temperature',), ('K',), np.array([320.0]), np.array([380.0])),
         Coordinates.spanning(('coolant_temperature',), ('K',), np.array([253.15]),
                              np.array([373.15])), 'min', Provenance('signals alone'))
-    one = controller(model, lower=253.15, upper=373.15, rate=1.0, pi_gain=np.array([8.0]),
-                     pi_time=np.array([120.0]), setpoint_ramp=np.array([0.05]))
+    one = controller(model, lower=253.15, upper=373.15, rate=1.0, gain=8.0, time=120.0,
+                     setpoint_ramp=np.array([0.05]))
     x0, u0 = steady_state(system, {'temperature': 350.0})
     rng = np.random.default_rng(0)
     loop = simulate(one, Process(system, 0, x0, u0), [

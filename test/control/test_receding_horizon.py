@@ -72,7 +72,7 @@ def sampled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, h: float
 
 def settings(model: LiftedModel, weights: tuple[np.ndarray, np.ndarray], limits: InputLimits,
              *laws: str, **others: object) -> Settings:
-    return Settings.for_model(
+    return Tuning.for_model(
         model, state_weight=weights[0], input_weight=weights[1], limits=limits, **{
             'supervisor': SupervisorSettings(tuple(
                 LevelSettings(law, 1e9) for law in laws or ('mpc',)), recovery_time=5.0),

@@ -3,11 +3,11 @@
 
 """A regular step is the same, bit for bit, as without a way of its own."""
 
+from koopman_ros.control.regular import Regular
 import numpy as np
 import pytest
 
 from koopman_ros.control import State
-from koopman_ros.control.regular import Regular
 from koopman_ros.lifting import load
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.replay.records import encoded

@@ -109,7 +109,7 @@ RUNS = {name: (Run(name), limited(name, 10.0))
 @np.errstate(all='ignore')
 def test_commands_keep_their_limits_and_follow_from_the_records(name, slow, sequence):
     run = RUNS[name][slow]
-    limits, names = run.controller.settings.limits, run.controller.controlled.names
+    limits, names = run.controller.tuning.limits, run.controller.controlled.names
     assert bool(np.all(np.isfinite(limits.rate))) is slow
     run.begin()
     commands = []

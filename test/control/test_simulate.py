@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 
-from koopman_ros.control import Controller, InputLimits, Mode, Settings
+from koopman_ros.control import Controller, InputLimits, Mode, Tuning
 from koopman_ros.control.events import Initialisation, ManualCommand, ModeChange, SetpointRequest
 from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, Weights
 from koopman_ros.control.simulate import at, exchange, restart, run_closed_loop, simulate
-from koopman_ros.control.supervisor import LevelSettings, SupervisorSettings
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
     Actuator,
@@ -30,7 +29,7 @@ from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
 from support.random_lifts import coordinates
 from validation.paper.optimal_control import exact_two_state_model
 
-EVERYWHERE = 1e9  # half widths: the margin of a law that acts anywhere
+EVERYWHERE = 100.0  # half-ranges: the margin of a law that acts anywhere
 
 
 def random_pair() -> tuple[ControlAffineSystem, LiftedModel]:
@@ -79,11 +78,11 @@ each_case = pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 def controller(case: Case, law: str = 'sdre', bandwidth: float = 0.0) -> Controller:
     n_x, n_u = case.model.n_x, case.model.n_u
     low, high = case.bounds
-    return Controller(case.model, Settings.for_model(
+    return Controller(case.model, Tuning.for_model(
         case.model, state_weight=np.full(n_x, 3.0), input_weight=np.ones(n_u),
         limits=InputLimits(np.full(n_u, low), np.full(n_u, high), np.full(n_u, np.inf)),
-        observer_bandwidth=bandwidth / case.seconds,
-        supervisor=SupervisorSettings((LevelSettings(law, EVERYWHERE),))))
+        disturbance_bandwidth=bandwidth / case.seconds,
+        levels=(law,), validity_margin=EVERYWHERE, linear_margin=EVERYWHERE))
 
 
 def process(case: Case) -> Process:
@@ -224,7 +223,7 @@ def at_rest(case, *events, **others):
 @each_case
 def test_a_hand_over_at_rest_is_not_felt(case):
     later = 10.0 * case.seconds
-    heavier = replace(controller(case).settings, input_weight=np.full(case.model.n_u, 9.0))
+    heavier = replace(controller(case).tuning, input_weight=np.full(case.model.n_u, 9.0))
     for what in (exchange(Controller(case.model, heavier)), restart, ModeChange(Mode.MANUAL)):
         found = at_rest(case, at(later, what), samples=20)
         assert np.max(np.abs(np.diff(found.commands, axis=0))) < 1e-3 * np.max(

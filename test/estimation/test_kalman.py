@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,22 +20,21 @@ from koopman_ros.control import (
     exchange,
     Initialisation,
     InputLimits,
-    LevelSettings,
     Loop,
     SetpointRequest,
-    Settings,
     simulate,
     State,
-    SupervisorSettings,
+    Tuning,
 )
+from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.estimation import (
     Estimate,
-    EstimatorTuning,
+    Estimator,
     ExtendedKalmanFilter,
     Innovation,
-    SensorLimits,
     UnscentedKalmanFilter,
 )
+from koopman_ros.estimation.kalman_filters import uncertainty
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
@@ -64,11 +64,12 @@ def first(model: LiftedModel, n_y: int) -> Outputs:
     return Outputs(states.names[:n_y], states.units[:n_y], np.eye(model.n_x)[:n_y])
 
 
-def tuning(model: LiftedModel, outputs: Outputs, *, noise: float = 0.1, wander: float = 0.05,
-           error: float = 0.3) -> EstimatorTuning:
-    return EstimatorTuning(outputs, 0.0, np.full(model.n_u, np.inf),
-                           np.full(len(outputs.names), noise), np.full(model.n_u, wander),
-                           np.full(model.n_x, error))
+def kalman(kind: type[Estimator], model: LiftedModel, outputs: Outputs, *, noise: float = 0.1,
+           wander: float = 0.05, error: float = 0.3) -> Any:
+    """Return a filter; wander and error are in scaled deviations, the former per root second."""
+    return kind(model, outputs, Tuning.for_model(
+        model, noise=noise, wander=wander * np.sqrt(60.0) * model.inputs.scale,
+        initial_error=error * model.states.scale).for_signals(model, outputs.names), None)
 
 
 def oscillator() -> LiftedModel:
@@ -79,7 +80,7 @@ def oscillator() -> LiftedModel:
 @pytest.mark.parametrize('seconds', [2.0, 20.0])
 def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
     model = oscillator()
-    one = kind(model, tuning(model, first(model, 1)))
+    one = kalman(kind, model, first(model, 1))
     estimate = Estimate(np.zeros(2), np.zeros(2))
     for _ in range(400):
         estimate = one.predict(estimate, np.zeros(1), seconds)
@@ -99,7 +100,7 @@ def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
 
 @pytest.mark.parametrize('kind', FILTERS)
 def test_the_covariance_follows_the_nonlinear_flow(kind):
-    one = kind(TRUTH, tuning(TRUTH, TEMPERATURE, wander=1e-4))
+    one = kalman(kind, TRUTH, TEMPERATURE, wander=1e-4)
     x, w, u = np.array([0.2, -0.3]), np.array([0.0, 0.4]), np.array([0.5])
     P = 1e-8 * np.eye(4)
     found = one.predict(Estimate(x, w, P), u, 20.0)
@@ -122,8 +123,7 @@ def test_the_covariance_follows_the_nonlinear_flow(kind):
 @pytest.mark.parametrize(('factor', 'consistent'), [(1.0, True), (2.0, False), (0.5, False)])
 def test_squares_of_innovations_tell_whether_the_noise_is_what_was_said(factor, consistent):
     model, rng = oscillator(), np.random.default_rng(3)
-    said = tuning(model, first(model, 1))
-    one = ExtendedKalmanFilter(model, replace(said, noise=factor * said.noise))
+    one = kalman(ExtendedKalmanFilter, model, first(model, 1), noise=0.1 * factor)
     F = expm(np.vstack((np.hstack((model.A, model.B)), np.zeros((1, 3)))) * 5.0 / 60.0)
     truth = np.zeros(3)
     estimate = one.restart(None, np.zeros(2), None)
@@ -155,27 +155,19 @@ def test_a_state_that_cannot_be_seen_is_refused(A, B, hidden):
     model = linear(A, B)
     if hidden:
         with pytest.raises(ValueError, match='x0, measured, do not determine the states x0, x1'):
-            ExtendedKalmanFilter(model, tuning(model, first(model, 1)))
+            kalman(ExtendedKalmanFilter, model, first(model, 1))
     else:
-        assert ExtendedKalmanFilter(model, tuning(model, first(model, 1)))
-
-
-@pytest.mark.parametrize('wrong', ['noise', 'wander', 'initial_error'])
-def test_a_number_is_missing(wrong):
-    model = oscillator()
-    with pytest.raises(ValueError, match=rf'{wrong} must be \d finite numbers above 0, got \[\]'):
-        ExtendedKalmanFilter(model, replace(tuning(model, first(model, 1)),
-                                            **{wrong: np.zeros(0)}))
+        assert kalman(ExtendedKalmanFilter, model, first(model, 1))
 
 
 def saddle(model: LiftedModel = TRUTH, **changes: object) -> Controller:
     """Return the controller of the temperature that knows nothing else."""
-    return Controller(model, Settings.for_model(model, **{
+    return Controller(model, Tuning.for_model(model, **{
         'state_weight': np.array([0.0, 1.0]), 'input_weight': np.ones(1), 'limits': WIDE,
-        'controlled': ('temperature',), 'sensor': SensorLimits.none(1), 'transfer_time': 0.0,
-        'noise': np.array([NOISE]), 'wander': np.array([0.1]),
+        'controlled': ('temperature',),
+        'noise': np.array([NOISE]), 'wander': np.array([0.1 * np.sqrt(60.0)]),
         'initial_error': np.array([0.2, 2.0]),
-        'supervisor': SupervisorSettings((LevelSettings('sdre', 0.3),)), **changes}), TEMPERATURE)
+        'levels': ('sdre',), 'validity_margin': 0.3, **changes}), TEMPERATURE)
 
 
 def held(temperature: float) -> tuple[Array, Array]:
@@ -290,16 +282,15 @@ def test_more_inputs_than_outputs_and_fewer():
     # one disturbance for each output, whatever the inputs: no offset where the plant differs
     for n_u, n_y in ((2, 1), (1, 2), (1, 1)):
         model = random_lift(2, n_u=n_u, seed=1)
-        one = ExtendedKalmanFilter(model, tuning(model, first(model, n_y)))
+        one = kalman(ExtendedKalmanFilter, model, first(model, n_y))
         assert np.linalg.matrix_rank(one.initial_covariance[2:, 2:]) == n_y
 
 
 def test_a_start_up_from_far_outside_the_data_arrives():
     # a PI law, which asks nothing of the model, until the data begin
     limits = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
-    one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), pi_gain=np.array([0.0, 8.0]),
-                 pi_time=np.array([1.0, 120.0]), supervisor=SupervisorSettings(
-                     (LevelSettings('sdre', 0.3), LevelSettings('pi', 3.0))))
+    one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), levels=('sdre', 'pi'),
+                 linear_margin=3.0, plugins={'pi': PIParameters([0.0, 8.0], [1.0, 120.0])})
     u0 = np.array([300.0])
     loop = simulate(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
         at(0.0, Initialisation(u0)), at(5.0, SetpointRequest(0, np.array([350.0])))],
@@ -312,28 +303,27 @@ def test_a_start_up_from_far_outside_the_data_arrives():
     assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
 
 
-def test_noise_that_is_not_said_is_that_of_the_record():
+def test_noise_that_is_not_given_is_that_of_the_record():
     model = oscillator()
     outputs, name = first(model, 1), model.states.names[0]
     known = replace(model, provenance=replace(
         model.provenance, metrics={f'noise_{name}': 0.125}))
-    settings = saddle(noise=np.zeros(0)).settings
     half = 0.5 * (model.states.upper[0] - model.states.lower[0])
-    assert settings.uncertainty(model, outputs)[0] == pytest.approx([1e-3 * half], rel=1e-12)
-    assert settings.uncertainty(known, outputs)[0].tolist() == [0.125]
-    said = replace(settings, noise=np.array([0.5]))
-    assert said.uncertainty(known, outputs)[0].tolist() == [0.5]
+    for noise, one, expected in ((0.0, model, 1e-3 * half), (0.0, known, 0.125),
+                                 (0.5, known, 0.5)):
+        given = Tuning.for_model(one, noise=noise)
+        assert uncertainty(one, outputs, given)[0] == pytest.approx([expected], rel=1e-12)
 
 
 def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_all():
     model, rng = oscillator(), np.random.default_rng(0)
     outputs = first(model, 1)
-    one = Controller(model, Settings.for_model(
+    one = Controller(model, Tuning.for_model(
         model, state_weight=np.ones(2), input_weight=np.ones(1), controlled=(outputs.names[0],),
         limits=InputLimits(model.inputs.lower, model.inputs.upper, np.ones(1)),
-        sensor=SensorLimits.none(1), noise=np.array([0.1]), wander=0.05 * model.inputs.scale,
+        noise=np.array([0.1]), wander=0.05 * np.sqrt(60.0) * model.inputs.scale,
         initial_error=0.3 * model.states.scale, estimator='extended_kalman_filter'), outputs)
-    kalman = ExtendedKalmanFilter(model, tuning(model, outputs))
+    own = kalman(ExtendedKalmanFilter, model, outputs)
     state, now, expected, before = State(), 10 ** 12, None, None
     for k in range(60):
         seconds = float(rng.choice([0.4, 1.0, 2.5]))
@@ -344,11 +334,11 @@ def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_
         state, command, _ = one.step(state, np.full(1, np.nan) if lost else y, now)
         deviation = (y - model.states.center[:1]) / model.states.scale[:1]
         if expected is None:
-            expected = kalman.restart(None, np.append(deviation, 0.0), None)
+            expected = own.restart(None, np.append(deviation, 0.0), None)
         else:
-            expected = kalman.predict(expected, before, elapsed / 1e9)
+            expected = own.predict(expected, before, elapsed / 1e9)
             if not lost:
-                expected = kalman.correct(expected, np.append(deviation, expected.x[1]), 0.0)
+                expected = own.correct(expected, np.append(deviation, expected.x[1]), 0.0)
         if k:
             # first guesses differ
             assert state.estimate.x == pytest.approx(expected.x, abs=1e-9)

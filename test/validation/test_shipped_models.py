@@ -13,11 +13,9 @@ from koopman_ros.control import (
     at,
     Controller,
     InputLimits,
-    LevelSettings,
     SetpointRequest,
-    Settings,
     simulate,
-    SupervisorSettings,
+    Tuning,
 )
 from koopman_ros.learning import fit, roll_out
 from koopman_ros.lifting import load
@@ -236,10 +234,10 @@ def keeps(name, model):
 
     lower, upper = map(np.array, promise.limits)
     # the learned law alone, within the margin of its data that is the default
-    settings = Settings.for_model(
+    settings = Tuning.for_model(
         model, state_weight=task.Q, input_weight=task.R,
         limits=InputLimits(lower, upper, np.full(system.n_u, np.inf)),
-        supervisor=SupervisorSettings((LevelSettings('sdre', 0.1),)))
+        levels=('sdre',), transfer_time=30.0)
     loop = simulate(
         Controller(model, settings), Process(system, 0, task.x0, system.nominal_input),
         [at(0.0, SetpointRequest(0, x_ref))], period=promise.period,

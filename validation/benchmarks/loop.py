@@ -14,6 +14,7 @@ import tempfile
 import time
 from typing import Any
 
+from koopman_ros.kernels import PACKAGE
 import numpy as np
 import psutil
 from sensor_msgs.msg import Temperature
@@ -21,7 +22,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.demo import reactor
-from koopman_ros.kernels import PACKAGE
 from koopman_ros.replay.records import NUMERICS
 from koopman_ros.reports import table
 from koopman_ros.ros import topics

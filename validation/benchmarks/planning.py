@@ -16,16 +16,14 @@ from koopman_ros.arrays import Array
 from koopman_ros.control import (
     at,
     Controller,
-    LevelSettings,
     SetpointRequest,
     simulate,
     State,
-    SupervisorSettings,
 )
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 from koopman_ros.control.simulate import after_a_second
-from koopman_ros.estimation import Estimate, SensorLimits
+from koopman_ros.estimation import Estimate
 from koopman_ros.plants import Process
 from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.process import Tell
@@ -115,10 +113,9 @@ def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
 def _controller(case: Case) -> Controller:
     """Return a controller that measures every state, its law alone on the shipped lift."""
     model = case.lift
-    return Controller(model, case.settings(
-        model, estimator='measured_state', sensor=SensorLimits.none(model.n_x),
-        noise=np.zeros(0), wander=np.zeros(0), initial_error=np.zeros(0),
-        supervisor=SupervisorSettings((LevelSettings('mpc', _MARGIN),))))
+    return Controller(model, case.tuning(
+        model, estimator='measured_state', noise=0.0, wander=0.0, initial_error=0.0,
+        levels=('mpc',), validity_margin=_MARGIN))
 
 
 def _course(case: Case, controller: Controller, samples: int
@@ -133,7 +130,7 @@ def _course(case: Case, controller: Controller, samples: int
     if set(loop.levels) != {'mpc'}:
         raise ValueError(f'{case.plant}: the law does not act at every sample')
     level, model = controller.levels['mpc'], controller.model
-    targets = {tuple(value): level.target(value, np.zeros(model.n_x), case.limits, None)
+    targets = {tuple(value): level.target(value, np.zeros(model.n_x), None)
                for value in requested.values()}
     calls = []
     for y, setpoint in zip(loop.measured, loop.setpoints, strict=True):

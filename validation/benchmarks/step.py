@@ -21,16 +21,14 @@ from koopman_ros.control import (
     Controller,
     Form,
     SetpointRequest,
-    Settings,
     simulate,
     Simulation,
     State,
+    Tuning,
 )
 from koopman_ros.control.simulate import after_a_second
-from koopman_ros.kernels import COMPILED, named
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
-from koopman_ros.parameters.controller import table_of
-from koopman_ros.parameters.wire import signals_of
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.resources import model_path
 from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.process import Tell
@@ -49,17 +47,13 @@ _BENT = 1e-9
 
 
 def compare(n_z: int, samples: int) -> dict[str, Any]:
-    """
-    Time both sides on one course, block by block in turns, once they are seen to agree.
-
-    Beside them the step with compiled functions, where what compiles is installed.
-    """
+    """Time both sides on one course, block by block in turns, once they are seen to agree."""
     model = _lift(n_z)
-    ours = Controller(model, table_of(model).snapshot({}).settings(signals_of(model)))
+    ours = built(table_of(model).snapshot({}), model)
     course, requested = _course(ours, samples)
     if any(report.command.law.form != Form.RECENTRED.value for report in course.reports):
         raise ValueError(f'the re-centred law is not always in force for n_z = {n_z}')
-    naive, naive_again = (NaiveLaw(model, ours.settings) for _ in range(2))
+    naive, naive_again = (NaiveLaw(model, ours.tuning) for _ in range(2))
     setpoints = [report.target.setpoint for report in course.reports if report.target]
     calls = list(zip(course.measured, setpoints, np.diff(course.times, prepend=0.0), strict=True))
     apart = max(float(np.max(np.abs(naive.step(*call) - command)))
@@ -68,9 +62,6 @@ def compare(n_z: int, samples: int) -> dict[str, Any]:
         raise ValueError(f'the commands for n_z = {n_z} differ by {apart:.2g} K, so the two sides '
                          f'are not the same law: they must agree to {_TOLERANCE:g} K')
     sides, states = {'': ours}, {'': State()}
-    if (kernels := named(COMPILED)) is not None:
-        sides['compiled_'] = Controller(replace(model, kernels=kernels), ours.settings)
-        states['compiled_'] = State()
     taken: dict[str, list[tuple[int, int]]] = {side: [] for side in (*sides, 'naive_')}
     for block in range(0, samples, _BLOCK):
         for side, controller in sides.items():
@@ -149,19 +140,19 @@ def _course(ours: Controller, samples: int) -> tuple[Simulation, dict[int, Array
 class NaiveLaw:
     """The re-centred law with the disturbance observer, for one state and one input."""
 
-    def __init__(self, model: LiftedModel, settings: Settings) -> None:
+    def __init__(self, model: LiftedModel, tuning: Tuning) -> None:
         network = model.observables
         assert isinstance(network, NetworkObservables)
         self._layers = [(torch.tensor(W), torch.tensor(b)) for W, b in network.hidden]
         self._output = torch.tensor(network.output)
-        self._model, self._limits = model, settings.limits
-        self._Q = np.diag(settings.state_weight * model.states.scale ** 2)
-        self._R = np.diag(settings.input_weight * model.inputs.scale ** 2)
+        self._model, self._limits = model, tuning.limits
+        self._Q = np.diag(tuning.state_weight * model.states.scale ** 2)
+        self._R = np.diag(tuning.input_weight * model.inputs.scale ** 2)
         self._C = np.eye(1, model.n_z)
         self._at_zero = self._activations(torch.zeros(1, dtype=torch.float64))
         self._jacobian = jacrev(self._lift_twice, has_aux=True)
         self._second = jacrev(jacrev(self._lift))
-        self._bandwidth = settings.observer_bandwidth
+        self._bandwidth = tuning.disturbance_bandwidth
         self._setpoint = np.full(1, np.nan)
         self._x, self._w = np.full(1, np.nan), np.zeros(1)
         self._command: Array | None = None

@@ -147,7 +147,8 @@ SADDLE = Plant(
         'model': 'two_state_saddle', 'states_measured': ('temperature [K]',),
         'levels': ('mpc', 'sdre', 'pi'), 'temperature.noise': 0.05,
         'concentration.initial_error': 0.2, 'temperature.max_rate': 2.0,
-        'temperature.max_jump': 2.0, 'temperature.pi_gain': 6.0, 'temperature.pi_time': 60.0,
+        'temperature.max_jump': 2.0, 'pi.temperature.gain': 6.0,
+        'pi.temperature.integral_time': 60.0,
         **_each(('coolant_temperature',), wander=0.775, min=-20.0, max=100.0, rate_limit=1.0)})
 # It falls where nothing acts; its rate is estimated from the angle.
 PENDULUM = Plant(

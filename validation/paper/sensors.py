@@ -10,7 +10,7 @@ import numpy as np
 from koopman_ros import experiment as experiments
 from koopman_ros import plants
 from koopman_ros.arrays import Array
-from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
+from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, simulate, Tuning
 from koopman_ros.learning import (
     decide,
     Decision,
@@ -176,9 +176,10 @@ def _roll_out_error(model: LiftedModel, system: ControlAffineSystem, design: Ran
 def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minutes: float,
                 seed: int) -> tuple[Array, Episode]:
     """Run the control step once a second; return the true path (N, n_x) and the noisy record."""
-    controller = Controller(model, Settings.for_model(
+    controller = Controller(model, Tuning.for_model(
         model, state_weight=np.ones(1), input_weight=np.ones(1),
-        limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))))
+        limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1)),
+        transfer_time=30.0))
     rng = np.random.default_rng([seed, 2])
     run = simulate(
         controller, plants.Process(system, 0, np.asarray(x0), system.nominal_input),

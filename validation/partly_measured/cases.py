@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import InputLimits, Settings
+from koopman_ros.control import InputLimits, Tuning
 from koopman_ros.control.laws.base import Target
-from koopman_ros.control.target import partial_target
-from koopman_ros.estimation import SensorLimits
+from koopman_ros.control.laws.receding_horizon import MPCParameters
+from koopman_ros.control.steady_state import partial_target
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.plants import ControlAffineSystem, steady_state
 from koopman_ros.plants.optimum import Task
@@ -136,15 +136,15 @@ class Case:
                     self.period / self.system.seconds_per_time_unit,
                     round((self.loaded_at - self.stepped_at) / self.period), 10)
 
-    def settings(self, model: LiftedModel, **others: Any) -> Settings:
+    def tuning(self, model: LiftedModel, **others: Any) -> Tuning:
         """Return what a controller of this package is tuned by; `others` replace that by name."""
-        return Settings.for_model(model, **{
+        return Tuning.for_model(model, **{
             'state_weight': self.Q, 'input_weight': self.R, 'limits': self.limits,
             'controlled': tuple(self.setpoint), 'transfer_time': 0.0,
-            'sensor': SensorLimits.none(len(self.measured)),
-            'estimator': 'extended_kalman_filter', 'noise': self.noise, 'wander': self.wander,
-            'initial_error': self.initial_error, 'state_upper': self.state_upper,
-            'state_lower': np.full(len(self.state_upper), -np.inf), **others})
+            'estimator': 'extended_kalman_filter', 'noise': self.noise,
+            'wander': self.wander * np.sqrt(60.0),
+            'initial_error': self.initial_error,
+            'plugins': {'mpc': MPCParameters(upper=self.state_upper)}, **others})
 
     def target(self, setpoint: Array, w: Array) -> tuple[Array, Array]:
         """Return the state and the input that hold a set-point (n_c,) under rates w (n_x,)."""

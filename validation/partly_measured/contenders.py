@@ -10,7 +10,7 @@ import numpy as np
 
 import control
 from koopman_ros.arrays import Array
-from koopman_ros.control import Controller, LevelSettings, State, SupervisorSettings
+from koopman_ros.control import Controller, State
 from koopman_ros.control.simulate import after_a_second
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import solve_riccati
@@ -32,9 +32,8 @@ class Own:
     """A controller of this package with the extended Kalman filter."""
 
     def __init__(self, case: Case, model: LiftedModel, laws: tuple[str, ...]) -> None:
-        supervisor = SupervisorSettings(tuple(LevelSettings(law, MARGIN) for law in laws))
-        self._controller = Controller(
-            model, case.settings(model, supervisor=supervisor), case.outputs)
+        self._controller = Controller(model, case.tuning(
+            model, levels=laws, validity_margin=MARGIN, linear_margin=MARGIN), case.outputs)
         self._state = self._controller.initialise(State(), case.start[1])
         self._period_ns, self._number = round(case.period * NANOSECONDS), 0
         self._setpoint: Array | None = None

@@ -15,9 +15,8 @@ import casadi
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws.base import Tuning, Weights
-from koopman_ros.control.laws.receding_horizon import RecedingHorizon
-from koopman_ros.estimation import Estimate, EstimatorTuning, ExtendedKalmanFilter
+from koopman_ros.control.laws.receding_horizon import MPCParameters, RecedingHorizon
+from koopman_ros.estimation import Estimate, ExtendedKalmanFilter
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case
 
@@ -153,7 +152,7 @@ class WithWindow:
 
 def horizon(case: Case) -> int:
     """Return how many samples the law `mpc` looks ahead."""
-    law = RecedingHorizon(case.truth, Tuning(Weights.physical(case.truth, case.Q, case.R)))
+    law = RecedingHorizon(case.truth, case.tuning(case.truth), MPCParameters())
     interval = case.period / case.system.seconds_per_time_unit
     return round(float(np.sum(law.lengths(interval))) / interval)
 
@@ -161,9 +160,7 @@ def horizon(case: Case) -> int:
 def true_filter(case: Case) -> ExtendedKalmanFilter:
     """Return the filter that a controller of this package has with the true model."""
     model = case.truth
-    return ExtendedKalmanFilter(model, EstimatorTuning(
-        case.outputs, 0.0, np.full(model.n_u, np.inf), case.noise,
-        case.wander / model.inputs.scale, case.initial_error / model.states.scale))
+    return ExtendedKalmanFilter(model, case.outputs, case.tuning(model), None)
 
 
 def _guess(case: Case, y: Array) -> Array:

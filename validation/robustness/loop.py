@@ -14,8 +14,7 @@ from koopman_ros import control, plants
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Simulation
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import table_of
-from koopman_ros.parameters.wire import signals_of
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.resources import model_path
 from koopman_ros.units import SECONDS_PER_MINUTE
 
@@ -26,7 +25,7 @@ PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
 # Margins that are never exceeded: without fallback the learned law acts everywhere.
-NO_FALLBACK = (control.LevelSettings('sdre', 1e9), control.LevelSettings('linear', 1e9))
+NO_FALLBACK = {'validity_margin': 1e9, 'linear_margin': 1e9}
 
 
 @lru_cache
@@ -47,12 +46,11 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
     :param linear_margin: up to which the linear law does, in half widths.
     """
     model = model or shipped_model()
-    settings = table_of(model).snapshot({
+    tuning = built(table_of(model).snapshot({
         'disturbance_bandwidth': bandwidth / SECONDS_PER_MINUTE,
-        'coolant_temperature.weight': coolant_weight, 'linear_margin': linear_margin,
-    }).settings(signals_of(model))
-    return Controller(model, settings if fallback else replace(
-        settings, supervisor=replace(settings.supervisor, levels=NO_FALLBACK)))
+        'coolant_temperature.weight': coolant_weight, 'linear_margin': linear_margin}),
+        model).tuning
+    return Controller(model, tuning if fallback else replace(tuning, **NO_FALLBACK))
 
 
 def changed_reactor(*, heat_transfer: float = 1.0, concentration: float = 1.0,
@@ -103,7 +101,7 @@ def settling(run: Simulation, reference: float, tolerance: float, since: float =
 
 def worst(run: Simulation) -> str:
     """Return the last of the levels that acted."""
-    return max(run.levels, key=run.loop.controller.settings.supervisor.order.index)
+    return max(run.levels, key=run.loop.controller.order.levels.index)
 
 
 def run_loop(controller: Controller, system: plants.ControlAffineSystem, x0: Array,

@@ -99,12 +99,11 @@ def two_state_courses() -> dict[tuple[str, str], Simulation]:
 
 def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
     """Regulate the two-state example from (5, 5) to the origin, sampled 20 times a second."""
-    controller = Controller(model, control.Settings.for_model(
+    controller = Controller(model, control.Tuning.for_model(
         model, state_weight=np.ones(2), input_weight=np.ones(1),
         limits=control.InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
-        safe_input=np.zeros(1), transfer_time=1.0,
-        supervisor=control.SupervisorSettings(recovery_time=1.0) if fallback else (
-            control.SupervisorSettings(loop.NO_FALLBACK))))
+        safe=np.zeros(1), transfer_time=1.0,
+        **({'recovery_time': 1.0} if fallback else loop.NO_FALLBACK)))
 
     # put into the controller's state, since it refuses set-points outside its data
     def to_origin(before: control.Loop) -> control.Loop:

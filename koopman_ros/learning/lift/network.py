@@ -79,7 +79,7 @@ class Layout:
         """Return the parameters as views of the flat vector."""
         parts = [theta[place].view(shape)
                  for place, shape in zip(self.slices, self.shapes, strict=True)]
-        return Parameters(*parts[:4], parts[4] if self.n_u else None,
+        return Parameters(parts[0], parts[1], parts[2], parts[3], parts[4] if self.n_u else None,
                           (parts[-4], parts[-3], parts[-2], parts[-1]) if self.decoder else None)
 
     def join(self, p: Parameters) -> Tensor:

@@ -12,7 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from koopman_ros.jobs import processes
+from koopman_ros.execution import pools
 from koopman_ros.learning import Edmd, fit, Linearisation
 from koopman_ros.lifting import load
 from koopman_ros.plants import box_episodes, describe
@@ -51,7 +51,7 @@ def test_summary_has_one_entry_for_each_seed(monkeypatch, capsys):
 
 def test_a_lost_worker_keeps_what_is_done(monkeypatch):
     # what is begun anew, and how often, is the place's own affair
-    monkeypatch.setattr(processes, 'ATTEMPTS', 1)
+    monkeypatch.setattr(pools, '_ATTEMPTS', 1)
 
     def deadly(seed):
         if seed == 1:

@@ -41,7 +41,7 @@ _CONTROL = 'controller: control'
 _FAST = {'lockstep': True, 'speed': 30.0}
 _BY_CLOCK = {'use_sim_time': True}
 _WATCHED = 8.0  # s of plant time at that speed between two looks of the controller
-_NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'law_deadline': 1e-6}
+_NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'mpc.time_limit': 1e-6}
 _SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 1.0, 'recovery_time': 1.0}
 # Largest distance from the set-point after a few seconds of the safe inputs.
 _NEAR = {REACTOR.name: 10.0, TWO_TANKS.name: 0.08}
