@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.declaration import plugin_parameters
+from koopman_ros.declaration import (
+    column,
+    NO_LOWER,
+    NO_UPPER,
+    parameter,
+    per_signal,
+    plugin_parameters,
+    UNBOUNDED,
+    value_column,
+)
 from koopman_ros.execution import scheduler_refusal
 from koopman_ros.experiment import Experiment
 from koopman_ros.identification_methods import parameters_of
@@ -21,15 +30,7 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
 from koopman_ros.parameters.equations import named_ranges, refused
-from koopman_ros.parameters.table import (
-    ConfigurationError,
-    in_own_units,
-    parameter,
-    ParameterTable,
-    per_signal,
-    signal_value,
-    UNBOUNDED,
-)
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.parameters.wire import (
     InputPlaces,
     preset,
@@ -46,38 +47,7 @@ COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
 FIRST = 'first'  # as `sibling`, the first plant of a fleet whose lift is accepted
 
 
-@dataclass(frozen=True)
-class StateParameters(StatePlaces):
-    """A measured state, and what an experiment may do to it."""
-
-    experiment_min: float = signal_value(
-        -UNBOUNDED, 'measurement below which the experiment is aborted')
-    experiment_max: float = signal_value(
-        UNBOUNDED, 'measurement above which the experiment is aborted')
-    setpoint_min: float = signal_value(
-        0.0, 'lowest set-point of an experiment on set-points')
-    setpoint_max: float = signal_value(
-        0.0, 'highest set-point of an experiment on set-points')
-
-
-@dataclass(frozen=True)
-class InputParameters(InputPlaces):
-    """An input, and what an experiment does with it."""
-
-    experiment_min: float = signal_value(
-        0.0, 'lowest value of a step')
-    experiment_max: float = signal_value(
-        0.0, 'highest value of a step')
-    experiment_rate_limit: float = parameter(
-        0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
-    safe: float = signal_value(
-        0.0, 'what is safe whatever happened; the experiment starts and ends with it')
-    delay: float = parameter(
-        0.0, 'dead time of the actuator: a command acts this long after it was given', 's', 0.0,
-        3600.0)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrainerParameters:
     """Snapshot of the trainer's parameters, in the units that people read."""
 
@@ -195,8 +165,27 @@ class TrainerParameters:
         1e4, 'largest condition number of the coordinates of a new lift', '', 1.0, 1e12,
         open_minimum=True)
 
-    states: Mapping[str, StateParameters] = per_signal(StateParameters)
-    inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
+    states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
+    measured_min: Array = value_column(
+        'states', -UNBOUNDED, 'measurement below which the experiment is aborted',
+        name='experiment_min', none=NO_LOWER)
+    measured_max: Array = value_column(
+        'states', UNBOUNDED, 'measurement above which the experiment is aborted',
+        name='experiment_max', none=NO_UPPER)
+    setpoint_min: Array = value_column(
+        'states', 0.0, 'lowest set-point of an experiment on set-points')
+    setpoint_max: Array = value_column(
+        'states', 0.0, 'highest set-point of an experiment on set-points')
+    inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    experiment_min: Array = value_column('inputs', 0.0, 'lowest value of a step')
+    experiment_max: Array = value_column('inputs', 0.0, 'highest value of a step')
+    experiment_rate_limit: Array = column(
+        'inputs', 0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
+    safe: Array = value_column(
+        'inputs', 0.0, 'what is safe whatever happened; the experiment starts and ends with it')
+    delay: Array = column(
+        'inputs', 0.0, 'dead time of the actuator: a command acts this long after it was given',
+        's', 0.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
@@ -208,45 +197,40 @@ class TrainerParameters:
         if missing := self.missing(signals, on_setpoints):
             raise ValueError('the bounds of the experiment are not known: give '
                              + ', '.join(missing))
-        units = {name: signals.states[name] for name in signals.controlled
-                 } if on_setpoints else signals.inputs
-        of: Mapping[str, Any] = self.states if on_setpoints else self.inputs
-        low, high = ((f'{"setpoint" if on_setpoints else "experiment"}_{end}')
-                     for end in ('min', 'max'))
+        names, lower, upper = self._steps(signals, on_setpoints)
+        rate = np.zeros(len(names)) if on_setpoints else self.experiment_rate_limit
         return Experiment(
-            duration=self.experiment_length,
-            names=tuple(units), lower=in_own_units(of, low, units),
-            upper=in_own_units(of, high, units),
-            rate=np.array([getattr(of[name], 'experiment_rate_limit', 0.0) or UNBOUNDED
-                           for name in units]),
-            home=in_own_units(self.inputs, 'safe', units) if setpoints is None else setpoints,
+            duration=self.experiment_length, names=names, lower=lower, upper=upper,
+            rate=np.where(rate > 0.0, rate, UNBOUNDED),
+            home=self.safe if setpoints is None else setpoints,
             hold_shortest=self.experiment_shortest_hold,
-            hold_longest=self.experiment_longest_hold,
-            measured=tuple(signals.states),
-            measured_lower=in_own_units(self.states, 'experiment_min', signals.states),
-            measured_upper=in_own_units(self.states, 'experiment_max', signals.states),
+            hold_longest=self.experiment_longest_hold, measured=tuple(signals.states),
+            measured_lower=self.measured_min, measured_upper=self.measured_max,
             seed=self.experiment_seed)
+
+    def _steps(self, signals: Signals, on_setpoints: bool) -> tuple[tuple[str, ...], Array, Array]:
+        """Return names, lowest and highest values of the signals that are stepped."""
+        if not on_setpoints:
+            return tuple(signals.inputs), self.experiment_min, self.experiment_max
+        rows = [list(signals.states).index(name) for name in signals.controlled]
+        return signals.controlled, self.setpoint_min[rows], self.setpoint_max[rows]
 
     def missing(self, signals: Signals, on_setpoints: bool = False) -> list[str]:
         """Return the parameters without which there is no experiment, with their units."""
         what = 'setpoint' if on_setpoints else 'experiment'
-        stepped = {name: self.states[name] for name in signals.controlled
-                   } if on_setpoints else self.inputs
-        units = signals.units
-        return [f'{name}.{row} [{display_unit(units[name])}]' for name, row in [
-            *((name, f'{what}_{end}') for name, item in stepped.items() for end in ('min', 'max')
-              if getattr(item, f'{what}_min') == getattr(item, f'{what}_max')),
-            *((name, f'experiment_{end}') for name, item in self.states.items()
-              for end, none in (('min', -UNBOUNDED), ('max', UNBOUNDED))
-              if getattr(item, f'experiment_{end}') == none)]]
+        steps = zip(*self._steps(signals, on_setpoints), strict=True)
+        bounds = zip(signals.states, self.measured_min, self.measured_max, strict=True)
+        rows = [*((name, f'{what}_{end}') for name, low, high in steps if low == high
+                  for end in ('min', 'max')),
+                *((name, f'experiment_{end}') for name, low, high in bounds
+                  for end, bound in (('min', low), ('max', high)) if np.isinf(bound))]
+        return [f'{name}.{row} [{display_unit(signals.units[name])}]' for name, row in rows]
 
     def setpoint_ranges(self, signals: Signals) -> dict[str, tuple[float, float]]:
         """Return the lowest and highest set-point of states that have a range, in their units."""
-        lows, highs = (in_own_units(self.states, f'setpoint_{end}', signals.states).tolist()
-                       for end in ('min', 'max'))
-        return {name: (low, high)
-                for name, low, high in zip(signals.states, lows, highs, strict=True)
-                if name in signals.controlled and low < high}
+        names, lows, highs = self._steps(signals, on_setpoints=True)
+        return {name: (low, high) for name, low, high in zip(
+            names, lows.tolist(), highs.tolist(), strict=True) if low < high}
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""

@@ -61,7 +61,8 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
                    for name, unit in states.items()],
         'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
                     'measured': found(wiring.applied[name]),
-                    'delay': settings.inputs[name].delay} for name, unit in inputs.items()],
+                    'delay': delay} for (name, unit), delay in zip(
+                        inputs.items(), settings.delay.tolist(), strict=True)],
         'setpoints': settings.setpoint_ranges(wiring.signals),
         'tolerance': settings.synchronisation_tolerance,
         'input_gain': {state: dict(zip(inputs, row, strict=True))
