@@ -89,7 +89,7 @@ class TrainingTask:
             'measured': Place(**signal['measured']) if signal.get('measured') else None})
             for signal in values['inputs'])
         return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
-                      'inputs': inputs})
+                      'inputs': inputs, 'methods': tuple(values.get('methods', cls.methods))})
 
 
 def known(task: TrainingTask, current: LiftedModel | None
