@@ -214,19 +214,6 @@ def test_total_variation_bears_a_rough_input_matrix():
     assert found.input_matrix == pytest.approx(CUBIC.B, rel=5e-2)
 
 
-@pytest.mark.parametrize('seed', range(2))
-@pytest.mark.parametrize(('method', 'bound'), [('weak form', 3.0), ('total variation', 12.0)])
-def test_noise_does_little_harm(method, bound, seed):
-    noise, count = 0.02, 600
-    record = CUBIC.excited(count, 0.05, noise=noise, seed=seed)
-    misfit = CUBIC.misfit(estimate(method, CUBIC, [record], 3))
-    # The Cramer-Rao bound of one coefficient whose feature moves the state by about its scale
-    # over a time constant is about noise / sqrt(count); five are shared, and the corners of the
-    # box, where the misfit is largest, multiply it by about five more.
-    best = 5.0 * np.sqrt(5.0) * noise / np.sqrt(count)
-    assert misfit < bound * best
-
-
 def test_noise_level():
     clean = PAIR.excited(1500, 0.02, hold=60)
     box = box_of(PAIR.plant, [clean])

@@ -5,23 +5,16 @@
 
 from dataclasses import replace
 import sys
-import tracemalloc
 
 import numpy as np
 import pytest
 
 from koopman_ros.learning.identification import (
-    box_of,
     identify,
-    longest_step,
     methods_of,
-    Segments,
     Stopped,
-    weak_form,
 )
-from koopman_ros.learning.identification.output_error import _Problem, Weights
-from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
-from koopman_ros.plant_data import cut, Episode
+from koopman_ros.plant_data import cut
 from support.known_plants import CUBIC, methods, PAIR
 
 NOISE = 0.02
@@ -240,21 +233,3 @@ def test_linear_model_that_diverges_does_not_stand_in_the_way(noisy, monkeypatch
     monkeypatch.setattr(module, 'prediction_error', lambda *_: np.full(1, np.inf))
     with pytest.raises(ValueError, match='no drift fits the episodes: record longer'):
         identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1, 3), methods=methods(10))
-
-
-def test_memory_of_a_long_record():
-    # 20000 samples: some five hours and a half at one a second
-    rng = np.random.default_rng(0)
-    times = np.arange(20000.0) / 60.0
-    record = Episode(times, np.cumsum(rng.standard_normal((20000, 1)), axis=0), times,
-                    rng.uniform(-1.0, 1.0, (20000, 1)))
-    parts = cut([record], 240)
-    model = weak_form(parts, box_of(CUBIC.plant, parts), 6, None, 80)
-    tracemalloc.start()
-    segments = Segments.of(parts, longest_step(parts))
-    problem = _Problem(Weights(model, True), segments)
-    normal_equations(problem.add_residuals, 0.0 * problem.start())
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    # sums over the steps are gathered as they are made; kept apart they would take 30 MB
-    assert peak < 20e6

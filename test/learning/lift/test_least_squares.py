@@ -6,15 +6,11 @@
 from functools import partial
 import itertools
 import math
-from pathlib import Path
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
 
-import koopman_ros
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, MinimumStatus, normal_equations
 from koopman_ros.learning.lift.network import Layout, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
@@ -130,34 +126,6 @@ def test_any_chunks_and_the_cost_alone(chunk):
 def test_what_a_problem_needs(layout, weights, words):
     with pytest.raises(ValueError, match=words):
         LiftProblem(layout, ScaledSamples(torch.zeros(3, 2), torch.zeros(3, 2)), weights)
-
-
-MEMORY = """
-import resource
-from koopman_ros.learning.lift.network import Layout
-from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights
-from koopman_ros.learning.lift.residuals import ScaledSamples
-from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
-import torch
-torch.set_num_threads(1)
-layout = Layout(2, 5, 8, True)
-theta = 0.1 * torch.ones(layout.size, dtype=torch.float64)
-peaks = []
-for count in (6_000, 60_000):
-    x = torch.linspace(-1.0, 1.0, 2 * count, dtype=torch.float64).view(count, 2)
-    problem = LiftProblem(layout, ScaledSamples(x, x), ResidualWeights(1.0))
-    normal_equations(problem.add_residuals, theta)
-    peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-print(peaks[1] - peaks[0])
-"""
-
-
-def test_memory_does_not_grow_with_the_samples():
-    """The residual Jacobian of ten times the samples would take 170 MB, the samples take 1 MB."""
-    result = subprocess.run([sys.executable, '-c', MEMORY], capture_output=True, text=True,
-                            timeout=240, check=False, cwd=Path(koopman_ros.__file__).parents[1])
-    assert result.returncode == 0, result.stderr
-    assert int(result.stdout) < 32 * 1024  # KiB
 
 
 def least_squares(residual):
