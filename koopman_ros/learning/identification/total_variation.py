@@ -54,7 +54,7 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
     features, inputs, rates = [], [], []
     episodes = [episode for episode in episodes if len(episode) >= _SHORTEST]
     shifts = [_moved(episode, box, assumed) for episode in episodes]
-    curves = _smoothed([(episode.time, box.states.to_deviation(episode.x) - moved)
+    curves = smoothed([(episode.time, box.states.to_deviation(episode.x) - moved)
                         for episode, moved in zip(episodes, shifts, strict=True)])
     for episode, moved, smooth in zip(episodes, shifts, curves, strict=True):
         v = box.inputs.to_deviation(episode.inputs_at(episode.time))
@@ -104,12 +104,7 @@ def _noise(D: Array, y: Array) -> float:
     return float(np.median(np.abs(_apply(D, y)) / np.sqrt(np.sum(D ** 2, axis=1))) / 0.6745)
 
 
-def smoothed(time: Array, values: Array) -> Array:
-    """Smooth signals (N, n) as :func:`_smoothed` does."""
-    return _smoothed([(time, values)])[0]
-
-
-def _smoothed(records: Sequence[tuple[Array, Array]]) -> list[Array]:
+def smoothed(records: Sequence[tuple[Array, Array]]) -> list[Array]:
     """
     Smooth signals (N, n) of several times as far as their noise allows.
 

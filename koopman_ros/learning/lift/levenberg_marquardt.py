@@ -62,22 +62,14 @@ class NormalEquations:
         """Half the sum of squares."""
         return float(self._cost)
 
-    @property
-    def sums(self) -> tuple[Tensor, ...]:
-        """The cost and, where wanted, gradient and matrix, as :meth:`add_sums` takes them."""
-        return (self._cost, self.gradient, self.matrix) if self.derivatives else (self._cost,)
-
     def add(self, r: Tensor, J: Tensor | None = None, count: int = 1) -> None:
         """Add residuals (...) with their J (..., p) where wanted, squares divided by a count."""
         self._cost += 0.5 * torch.sum(r * r) / count
         if J is not None:
             J = J.reshape(-1, len(self.gradient))
             self.gradient += J.T @ r.reshape(-1) / count
-            if count == 1:
-                self.matrix += J.T @ J
-            else:
-                # chunk after chunk: without another matrix of this size
-                self.matrix.addmm_(J.T, J, alpha=1.0 / count)
+            # without another matrix of this size
+            self.matrix.addmm_(J.T, J, alpha=1.0 / count)
 
     def add_sums(self, cost: Tensor | float, gradient: Tensor | None = None,
                  matrix: Tensor | None = None) -> None:

@@ -240,7 +240,7 @@ def test_smoothing_takes_away_noise_alone():
     # the derivative of the second one bends sharply
     true = np.column_stack([np.sin(t), np.where(t < 3.0, t, 6.0 - t) ** 2])
     sigma = np.array([0.02, 0.1])
-    found = smoothed(t, true + sigma * rng.standard_normal(true.shape))
+    found = smoothed([(t, true + sigma * rng.standard_normal(true.shape))])[0]
     # two thirds of the noise go; what is taken away has its size (discrepancy principle)
     assert np.all(np.sqrt(np.mean((found - true) ** 2, axis=0)) < sigma / 3.0)
 
@@ -251,9 +251,9 @@ def test_smoothing_of_a_parabola_finds_it_and_leaves_what_has_no_noise():
     for seed in range(3):
         noisy = true + 0.01 * np.random.default_rng(seed).standard_normal((240, 1))
         # third differences of a parabola are zero, so that any weight is right but the smallest
-        assert np.max(np.abs(smoothed(t, noisy) - true)) < 0.015
-    assert np.max(np.abs(smoothed(t, true) - true)) < 1e-8
-    assert np.array_equal(smoothed(t, np.ones((240, 1))), np.ones((240, 1)))
+        assert np.max(np.abs(smoothed([(t, noisy)])[0] - true)) < 0.015
+    assert np.max(np.abs(smoothed([(t, true)])[0] - true)) < 1e-8
+    assert np.array_equal(smoothed([(t, np.ones((240, 1)))])[0], np.ones((240, 1)))
 
 
 @pytest.mark.parametrize(('call', 'words'), [
