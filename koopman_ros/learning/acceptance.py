@@ -53,7 +53,7 @@ class Thresholds:
 
 
 class HeldOut:
-    """The held-out part of a record, and what a model of the rest has to reach there."""
+    """The held-out part of a record, and the requirements on a model there."""
 
     def __init__(self, found: Identified, thresholds: Thresholds) -> None:
         self._found, self._thresholds = found, thresholds

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What of a long record is learned from: means of samples, segments from all over its range."""
+"""Downsampling of a long record: means of samples, segments from all over its range."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RecordStatistics:
     upper: Array  #: (n,) highest value
     count: int = 0  #: samples
     #: (2, groups, n_x) mean square errors of lines through groups, and through four samples each,
-    #: weighed by the square of the slope: what stands still tells nothing of the pace
+    #: weighed by the square of the slope: a signal at rest tells nothing of the pace
     errors: Array = field(default_factory=lambda: np.zeros((2, len(_GROUPS), 1)))
 
     @classmethod
@@ -129,7 +129,7 @@ class Selection:
         return replace(self, offered=0, _held=[])
 
     def offer(self, bag: int, episode: Episode, rng: np.random.Generator) -> None:
-        """Cut an episode and take what should be taken of it."""
+        """Cut an episode into segments, and keep the best ones."""
         for part in cut([episode], self.length * self.group):
             key = float(rng.random())
             if len(part) < _SHORTEST * self.group:

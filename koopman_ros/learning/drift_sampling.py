@@ -113,7 +113,7 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
 
 
 def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
-    """Return what is known of a plant by its estimated drift, and samples of that."""
+    """Return the plant with its estimated nominal point and B, and samples of the drift."""
     samples = drift_samples(found.drift, found.fitted)
     lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
     within = (plant.nominal_state > lower) & (plant.nominal_state < upper)

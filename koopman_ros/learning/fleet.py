@@ -25,7 +25,7 @@ from koopman_ros.learning.pipeline import retrain_by
 from koopman_ros.learning.report import reported
 from koopman_ros.learning.task import FIRST, TrainingTask
 
-#: What a retraining raises where the task, the bags or the machine are to blame.
+#: Exceptions of a training that the task, the bags or the machine cause.
 EXPECTED = (ValueError, TypeError, KeyError, OSError, MemoryError, WorkerLost, SchedulerLost,
             ImportError)
 
@@ -56,7 +56,7 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
     Retrain plants side by side, and yield each with its outcome.
 
     Each is worked as a job of its own, as :func:`retrain` works one here, and judged, written and
-    reported likewise; what goes wrong with one is its outcome and no matter of the others. Those
+    reported likewise; a failure of one is its outcome and does not touch the others. Those
     whose sibling is ``'first'`` begin from the lift of the first plant of their kind that is
     accepted: of the same signals, class and number of coordinates. They wait for that; where one
     is refused or fails, the next one of the kind is learned from nothing.
@@ -68,7 +68,7 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
     :param scheduler: where they are worked, see :func:`~koopman_ros.execution.backend_of`.
     :raises ValueError: for plants that would write the same file, none, or another `scheduler`
         than there is.
-    :raises SchedulerLost: when a scheduler is not reached, or is lost; what was yielded stands.
+    :raises SchedulerLost: when a scheduler is not reached, or is lost; yielded outcomes stand.
     """
     _check(tasks)
     with backend_of(scheduler) as backend:
@@ -76,7 +76,7 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
 
 
 def kind_of(task: TrainingTask) -> tuple[object, ...]:
-    """Return what the lifts of siblings have in common."""
+    """Return the properties that lifts of siblings share."""
     return (task.model_class, task.coordinates, task.equations, task.hidden_states,
             *((state.name, state.unit) for state in task.states),
             *((one.name, one.unit) for one in task.inputs))
@@ -129,7 +129,7 @@ def _failed(error: BaseException) -> Outcome:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, in a line; an unexpected one by its kind, too."""
+    """Return the text of an error in a line; of an unexpected one with its class."""
     said = ' '.join(str(error).split())
     expected = isinstance(error, EXPECTED)
     return said if said and expected else ': '.join(filter(None, [type(error).__name__, said]))

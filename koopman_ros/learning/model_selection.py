@@ -55,13 +55,13 @@ class Contender:
 
     @property
     def error(self) -> float:
-        """What the rule goes by: the error on a record where there is one, else `rx`."""
+        """The error that the rule compares: on a record where there is one, else `rx`."""
         return self.rx if self.excess is None else self.excess
 
 
 @dataclass(frozen=True)
 class Judge:
-    """By what models are judged in the place of validation episodes and their polynomials."""
+    """Judgement of models in place of that by validation episodes and their polynomials."""
 
     #: completes a contender that has no law check, no `excess` and no refusal yet
     judged: Callable[[Contender], Contender]
@@ -70,7 +70,7 @@ class Judge:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What :func:`compare` has found; as text a table in Markdown."""
+    """The result of :func:`compare`; as text a table in Markdown."""
 
     contenders: tuple[Contender, ...]  #: the plainest first
     chosen: Contender  #: by the rule, or as it was asked for
@@ -149,7 +149,7 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
         default. Other arguments as in :func:`train`.
     :param choose: the name of the class to take whatever the rule says.
     :param alone: whether it is the only one to be learned.
-    :param judge: what the models are judged by in the place of validation episodes and `loops`.
+    :param judge: of the models, in place of validation episodes and `loops`.
     :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
     :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
     :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
@@ -235,7 +235,7 @@ def _rounds(recipe: Recipe, n_x: int) -> int:
 
 
 def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch | None:
-    """Return what tells `watch` of the starts of one class among those of all."""
+    """Return a watch that counts the starts of one class among those of all."""
     if watch is None:
         return None
     before = sum(counts[other] for other in list(counts)[:list(counts).index(name)])
@@ -248,14 +248,14 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
 
 
 class _Learner:
-    """What all contenders are learned from, and judged by where no record does."""
+    """The samples that all contenders are learned from and, without a record, judged by."""
 
     def __init__(self, plant: Plant, samples: Samples, split_seed: int) -> None:
         self._plant = plant
         self._parts = split_by_episode(samples, split_seed)
         self._training, self._validation, self._test = self._parts
         self._box = Box.of(plant, samples.x, samples.u)
-        # what is wrong with the samples is no matter of one class
+        # errors of the samples concern all classes
         check_rates(plant, samples)
         check_nominal_point(plant, samples, self._box)
         self._known = training_states(self._box, samples)

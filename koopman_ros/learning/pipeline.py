@@ -71,7 +71,7 @@ class Retrained:
     plant: Plant  #: names, units and nominal point; its time unit is that of the drift
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
-    reduction: Reduction | None = None  #: what was taken of a long record
+    reduction: Reduction | None = None  #: the part of a long record that is used
 
     __repr__ = brief
 
@@ -242,7 +242,7 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
 
 
 def _checked(task: TrainingTask) -> Thresholds:
-    """Return the thresholds of a task; ValueError for what does not fit."""
+    """Return the thresholds of a task; ValueError for fields that do not fit."""
     if task.model_class not in (*CLASSES, BEST):
         raise ValueError(f'model_class = {task.model_class!r} must be one of '
                          f'{", ".join((*CLASSES, BEST))}')
@@ -311,7 +311,7 @@ def _stop_if(stop: bool) -> None:
 
 
 def _reading(on_progress: OnProgress, source: Source) -> Callable[[int], None]:
-    """Return what reports how much of a record was read, twice; it ends the reading by Stopped."""
+    """Return a tick that reports the share read of a record, twice; it may raise Stopped."""
     total, read = 2 * source.size(), 0
 
     def tick(samples: int) -> None:

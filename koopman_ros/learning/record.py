@@ -37,7 +37,7 @@ Tick = Callable[[int], None]
 
 @dataclass(frozen=True)
 class Source:
-    """Bags, and what is looked for in them."""
+    """Bags, and the signals to read from them."""
 
     bags: tuple[str, ...]
     states: Sequence[RecordedState]
@@ -54,7 +54,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Reduction:
-    """What of a long record was learned from."""
+    """The part of a long record that is used."""
 
     samples: int  #: in the record
     group: int  #: samples that were averaged, 1 for none
@@ -83,7 +83,7 @@ class Record:
 def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
                 tick: Tick = lambda _: None, backend: Backend | None = None) -> Record:
     """
-    Read the episodes of some bags: all of them, or what stands for them where they are many.
+    Read the episodes of some bags: all of them, or a selection where they are many.
 
     A record of more than `most` samples is read twice. The first reading tells its range, and
     over how many samples the motion is a straight line but for the noise: so many are averaged,

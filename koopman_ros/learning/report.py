@@ -22,7 +22,7 @@ from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 
 
 def write_report(retrained: Retrained) -> list[Path]:
-    """Write ``<output>.json``, ``.md`` and, with matplotlib, ``.png``; return what was written."""
+    """Write ``<output>.json``, ``.md`` and, with matplotlib, ``.png``; return the files."""
     base = Path(retrained.task.output)
     picture = base.with_suffix('.png')
     drawn = _draw(picture, retrained)

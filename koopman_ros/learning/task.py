@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The task of a retraining, and what it says of a plant before the record is read."""
+"""The task of a training, and the plant and signals that it describes."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class TrainingTask:
     model: str  #: file of the present lift, empty to learn the first one
     states: tuple[RecordedState, ...]  #: those of the present lift, in any order
     inputs: tuple[RecordedInput, ...]  #: likewise
-    plant: str = ''  #: what a first lift calls the plant
+    plant: str = ''  #: name of the plant in a first lift
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
     #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
     model_class: str = IDENTITY_LIFT
     coordinates: int = 3  #: n_z of the identity lift
-    seed: int = 0  #: of the split and of the training, and of what is taken of a long record
+    seed: int = 0  #: of the split and of the training, and of the reduction of a long record
     #: samples that are learned from and judged by; a longer record is reduced to them, see
     #: :func:`read_record`
     most_samples: int = MOST_SAMPLES
@@ -95,7 +95,7 @@ class TrainingTask:
 def known(task: TrainingTask, current: LiftedModel | None
           ) -> tuple[Plant, Sequence[RecordedState], Sequence[RecordedInput]]:
     """
-    Return what is known of a plant before it is estimated, and its signals in order.
+    Return the plant as far as the task describes it, and its signals in order.
 
     :param current: the present lift, where there is one.
     :raises ValueError: for a task whose parts do not fit each other or the present lift.
@@ -144,7 +144,7 @@ def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: st
 
 
 def _unknown(task: TrainingTask) -> Plant:
-    """Return what is known of a plant without a lift, but for its nominal point."""
+    """Return the plant of a task without a lift; its nominal point is unknown."""
     states, inputs = task.states, task.inputs
     return Plant(task.plant, tuple(signal.name for signal in states),
                  tuple(signal.unit for signal in states), tuple(signal.name for signal in inputs),

@@ -26,9 +26,9 @@ _SHORTEST = 20  # samples of a segment, whatever grows
 
 class Record:
     """
-    The measurements of the first states of a plant, and what predictors make of them.
+    The measurements of the first states of a plant, and their predictions.
 
-    :param plant: names and units of what was measured, and B where it is known.
+    :param plant: names and units of the measured signals, and B where it is known.
     :param hidden: whether the plant has other states, which a filter finds after a while.
     :raises ValueError: when the episodes are too short.
     """
@@ -82,7 +82,7 @@ class Record:
 
     def identified(self, predictor: Predictor[Drift], method: str, scores: Sequence[Score],
                    monitor: Callable[..., bool]) -> Identified:
-        """Return what was found in the form that a record of all states leads to."""
+        """Return the result in the form of a record of all states."""
         drift, n_y = predictor.drift, predictor.gain.shape[1]
         hidden = drift.box.states.to_physical(self._run(predictor).estimates)[:, n_y:]
         known, held_out = (
@@ -97,7 +97,7 @@ class Record:
                           tuple(known), tuple(held_out), len(drift.box.states) - n_y)
 
     def _run(self, predictor: Predictor[Drift]) -> Run:
-        """Filter all episodes; what the last predictor made of them is kept."""
+        """Filter all episodes; the result of the last predictor is kept."""
         if self._last is None or self._last[0] is not predictor:
             self._last = predictor, predictor.run(self._episodes, self.step)
         return self._last[1]

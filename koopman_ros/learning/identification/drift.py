@@ -24,7 +24,7 @@ from koopman_ros.solvers import runge_kutta_step
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
 Rate = Callable[[Array, Array], Array]
 
-# A state; features that depend on it, what they turn into, and their factors.
+# A state; features that depend on it, their derivatives, and factors.
 _Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
 # Of the search of a steady state: the range is that of noisy measurements, and a search that is so
@@ -49,7 +49,7 @@ class Drift(ABC):
     @property
     @abstractmethod
     def form(self) -> str:
-        """What kind of model it is, in words."""
+        """The kind of model, in words."""
 
     @property
     @abstractmethod
@@ -158,7 +158,7 @@ class DriftModel(Drift):
         return features @ self.coefficients + regressors @ self.B.T
 
     def regressors(self, xi: Array, v: Array) -> Array:
-        """Return what `B` holds the weights of: (..., n_x), (..., n_u) -> (..., columns of B)."""
+        """Return the regressors of `B`: (..., n_x), (..., n_u) -> (..., columns of B)."""
         return InputTerms.regressors(xi, v, self.input_degree)
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
@@ -183,7 +183,7 @@ def _features(n_x: int, degree: int) -> Monomials:
 
 @lru_cache(maxsize=64)
 def _derivatives(n_x: int, degree: int) -> tuple[_Derivative, ...]:
-    """Return by each state: it, features that depend on it, what they turn into, factors."""
+    """Return for each state: features that depend on it, their derivatives, factors."""
     E = _features(n_x, degree).exponents
     place = {tuple(row): k for k, row in enumerate(E.tolist())}
     found = []

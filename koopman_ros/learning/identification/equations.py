@@ -49,8 +49,8 @@ class Equations(Drift):
         """
         Return the equations with the constants to begin with; states that are measured come first.
 
-        :param known: names and units of what was measured.
-        :param x: (N, n_y) and u (N, n_u), what was measured; states that are not are taken to
+        :param known: names and units of the measured signals.
+        :param x: (N, n_y) and u (N, n_u), as measured; states that are not are taken to
             move about their nominal values.
         :raises ValueError: when the names and units are not those of the plant's class.
         """
@@ -185,7 +185,7 @@ def _built(plant: Any, sought: Sequence[Sought], theta: Array, nominal: Array | 
 
 
 def _check(system: ControlAffineSystem, plant: Any, known: Plant) -> None:
-    """Raise ValueError unless what was measured are states and all inputs of the equations."""
+    """Raise ValueError unless the signals are states and all inputs of the equations."""
     for kind, whole in (('state', False), ('input', True)):
         own, given = (dict(zip(getattr(one, f'{kind}_names'), getattr(one, f'{kind}_units'),
                                strict=True)) for one in (system, known))

@@ -60,11 +60,11 @@ def estimate_parameters(plant: Plant, episodes: Sequence[Episode], equations: An
     the names and units of the class. The search begins at the values of the class. Standard
     errors are those of least squares (Ljung 1999, section 9.4), outputs taken as uncorrelated.
 
-    :param plant: names and units of what was measured; B and the nominal point play no part.
+    :param plant: names and units of the measured signals; B and the nominal point play no part.
     :param equations: a plant's class, see :func:`koopman_ros.plants.plant_class`.
     :param ranges: of the constants that are looked for, see :func:`sought_of`.
     :param seed: of the split.
-    :return: an estimate with `constants`; what was measured are its first states.
+    :return: an estimate with `constants`; its first states are the measured ones.
     :raises ValueError: when names, units or ranges do not fit the class, the episodes are too
         short, or the equations follow none of them.
     :raises Stopped: when `watch` asked for it.
@@ -144,7 +144,7 @@ def _fitted(record: Record, start: Predictor[Equations], gain: Array, parts: Seq
     """
     samples = record.length(start.drift, growth)
     segments, starts = record.segments(parts, samples), record.foreseen(start, parts, samples)
-    # outputs weighed by what a filter leaves of each
+    # outputs weighed by the innovations of a filter
     deviation = np.std(start.along(segments, starts).innovations, axis=0)
     return innovations_form(start.drift, gain, segments, starts, deviation, smooth=True,
                             tolerance=_TOLERANCE, monitor=monitor)

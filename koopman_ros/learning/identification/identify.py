@@ -60,7 +60,7 @@ class Stopped(Exception):  # noqa: N818
 def stage_by_stage(watch: Watch, total: int, done: int = 0
                    ) -> Callable[[str], Callable[..., bool]]:
     """
-    Return what begins the next of `total` stages by its name, and returns the stage's monitor.
+    Return a function that begins the next of `total` stages and returns its monitor.
 
     Of the stages so many are `done` already.
 
@@ -94,7 +94,7 @@ class Score:
 
 
 class EstimateStatus(Enum):
-    """How the estimate of a constant is to be taken; the value is what to tell the user."""
+    """Reliability of the estimate of a constant; the value is the sentence for the user."""
 
     ESTIMATED = ''
     AT_LOWER_END = ('it ends at the lower end of its range: widen the range, or look for what '
@@ -138,7 +138,7 @@ class Identified:
     noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
     fitted: tuple[Episode, ...]  #: the segments that it was fitted to
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
-    #: states, the last ones, that were not measured: the segments hold what a filter makes of them
+    #: states, the last ones, that were not measured: the segments hold a filter's estimates of them
     hidden: int = 0
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()
@@ -226,7 +226,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
 
 @dataclass(frozen=True)
 class _Given:
-    """What the estimates of all degrees go by."""
+    """The data of the estimates of all degrees."""
 
     fit: Sequence[Episode]
     fitter: Segments  # the same

@@ -37,7 +37,7 @@ class Predictor(Generic[_Drift]):
         data = Segments.of(episodes, step)
         run = self._filter(data, self._starts(data))
         if not np.all(np.isfinite(run[1])):
-            raise ValueError('the estimate of what is not measured diverges')
+            raise ValueError('the estimate of the unmeasured states diverges')
         return _run(data, run)
 
     def along(self, segments: Segments, starts: Array) -> Run:
@@ -45,7 +45,7 @@ class Predictor(Generic[_Drift]):
         return _run(segments, self._filter(segments, starts))
 
     def _filter(self, data: Segments, x: Array) -> tuple[Array, Array, Array]:
-        """Return from starts (M, n_x) what a :class:`Run` has, on the grid (K + 1, M, ...)."""
+        """Return the arrays of a :class:`Run` from starts (M, n_x), on the grid (K + 1, M, ...)."""
         drift, n_y = self.drift, self.gain.shape[1]
         v, target = drift.box.inputs.to_deviation(data.u), self._target(data)
         foreseen = np.empty((*target.shape[:2], len(self.gain)))
@@ -107,7 +107,7 @@ class Predictor(Generic[_Drift]):
 
 @dataclass(frozen=True)
 class Run:
-    """What a filter makes of all samples, in deviations."""
+    """The result of a filter on all samples, in deviations."""
 
     foreseen: Array  #: (N, n_x) states before the samples
     estimates: Array  #: (N, n_x) states after them
@@ -132,7 +132,7 @@ def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:
 
 def standardised(predictor: Predictor[DriftModel], xi: Array) -> Predictor[DriftModel]:
     """
-    Take of the hidden states what measurements do not tell, from -1 to 1, for coordinates.
+    Replace hidden states by their part that measurements do not explain, from -1 to 1.
 
     :param xi: (N, n_x) states as they were estimated, in deviations.
     """

@@ -111,11 +111,11 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
 
 @dataclass(frozen=True)
 class Refined(Generic[_Model]):
-    """What :func:`innovations_form` has found."""
+    """The result of :func:`innovations_form`."""
 
     model: _Model  #: the drift
     gain: Array  #: (n_x, n_y) K, in deviations
-    starts: Array  #: (M, n_x) what is foreseen for the first samples, in deviations
+    starts: Array  #: (M, n_x) predictions of the first samples, in deviations
     cost: float  #: half the mean square of the weighed innovations of one output
     _problem: _Problem[_Model]
     _theta: Array
@@ -150,7 +150,7 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
 
     :param gain: (n_x, n_y) K to begin with, in deviations.
     :param segments: with n_y columns of measurements.
-    :param starts: (M, n_x) what is foreseen for the first samples, in deviations.
+    :param starts: (M, n_x) predictions of the first samples, in deviations.
     :param deviation: (n_y,) standard deviations of the innovations by which outputs are weighed,
         in deviations.
     :param settling: first samples of a segment whose innovations do not count.

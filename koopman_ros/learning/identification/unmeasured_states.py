@@ -79,7 +79,7 @@ def identify_unmeasured(plant: Plant, episodes: Sequence[Episode], hidden: int, 
     that are not measured are what the filter makes of them: of the unit 1, from -1 to 1, and
     uncorrelated with the measurements; no record tells their own names and units.
 
-    :param plant: names, units, and B where it is known, of what is measured.
+    :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
     :param highest_degree: of f.
     :param seed: of the split.

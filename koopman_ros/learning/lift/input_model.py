@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What inputs do to the rates of samples: known, or left to learn."""
+"""The effect of inputs on the rates of samples, known or to be learned."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class InputModel:
     @staticmethod
     def of(plant: Plant, box: Box, x: Array) -> InputModel:
         """
-        Return what is known of a plant's inputs, in the coordinates of a box.
+        Return the input model of a plant, in the coordinates of a box.
 
         :param x: (N, n_x) states, in state units, at which a function B(x) is fitted.
         :raises ValueError: for a B of another shape, or a function that is no polynomial there.
@@ -67,7 +67,7 @@ class InputModel:
 
     def apart(self, x: Array, rate: Array, u: Array) -> tuple[Array, Array | None]:
         """
-        Take what the inputs do off the rates, as far as it is known.
+        Subtract the known effect of the inputs from the rates.
 
         :param x: (N, n_x), and rates (N, n_x) and inputs (N, n_u), all scaled deviations.
         :return: what is left (N, n_x), and what the unknown weights are of (N, n_u (1 + n_phi)),

@@ -97,7 +97,7 @@ def drift_error(model: LiftedModel, samples: Samples) -> float:
 
 
 def _drifts(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> tuple[Array, Array]:
-    """Return scaled states (N, n_x), and their rates (N, n_x) less what the inputs add."""
+    """Return scaled states (N, n_x), and their rates (N, n_x) less the effect of inputs."""
     x, dxdt = (model.states.array(name, a) for name, a in (('x', x), ('dxdt', dxdt)))
     xi = model.states.to_deviation(x)
     return xi, dxdt / model.states.scale - model.forcing(
@@ -118,7 +118,7 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
     :param sample_period: in the model's time unit, or (K,) periods.
     :return: (..., K + 1, n_x) states at the samples, in state units.
     :raises RuntimeError: when the prediction diverges.
-    :raises ValueError: for what does not fit the model, or periods that are not above 0.
+    :raises ValueError: for arrays that do not fit the model, or periods that are not above 0.
     """
     inputs = model.inputs.array('inputs', inputs)
     xi = model.states.to_deviation(model.states.array('x0', x0))

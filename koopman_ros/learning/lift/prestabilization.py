@@ -29,7 +29,7 @@ class Frame:
     :meth:`leave`. Scaled deviations throughout; time may be in any unit.
     """
 
-    inputs: InputModel  #: what is known of B
+    inputs: InputModel  #: the known part of B
     B: Array  #: (n_x, n_u) at the nominal point, known or of the linear fit
     K: Array  #: (n_u, n_x) gain
     T: Array  #: (n_x, n_x)

@@ -24,7 +24,7 @@ class Scaling:
     """Scaling of samples for training, and of its result back."""
 
     box: Box  #: names and scaling of states and inputs
-    inputs: InputModel  #: what is known of B
+    inputs: InputModel  #: the known part of B
     frame: Frame | None  #: in which the lift is learned; None for that of the samples
     #: root mean square of the scaled rates, by which time is scaled, in 1/time unit
     pace: float
@@ -90,7 +90,7 @@ class Scaling:
             W[used], b[used], V[:, used])))
 
     def model(self, grown: TrainedLift, **about: Any) -> LiftedModel:
-        """Return what was learned in units; `about` are further fields of the model."""
+        """Return the trained model in units; `about` are further fields of the model."""
         parts = grown.layout.split(grown.theta.cpu())
         A, B = self.pace * parts.A.numpy(), None if parts.B is None else (
             self.pace * parts.B.numpy())
@@ -112,7 +112,7 @@ def _listed(signals: Coordinates) -> str:
 
 
 def _plain(box: Box, inputs: InputModel, samples: Samples) -> tuple[Array, Array, Array | None]:
-    """Return states, rates without what is known of the inputs, and regressors of the rest."""
+    """Return states, rates less the known effect of inputs, and regressors of the rest."""
     x, rate, u = deviations(box, samples)
     return x, *inputs.apart(x, rate, u)
 

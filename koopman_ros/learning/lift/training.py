@@ -236,7 +236,7 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
 
 
 def _remedies(model: LiftedModel) -> str:
-    """Say what else can be tried than this lift."""
+    """Return alternatives to this lift, in words."""
     identity = [] if model.identity else ['identity coordinates']
     smaller = ['a smaller n_z'] if model.n_z > model.n_x + model.identity else []
     return ', '.join([*identity, *smaller, 'more starts, or a narrower range'])
