@@ -248,7 +248,7 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
 
 
 class _Learner:
-    """The samples that all contenders are learned from and, without a record, judged by."""
+    """The samples that all contenders are learned from, and judged by without a record."""
 
     def __init__(self, plant: Plant, samples: Samples, split_seed: int) -> None:
         self._plant = plant

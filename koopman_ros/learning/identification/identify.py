@@ -138,7 +138,7 @@ class Identified:
     noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
     fitted: tuple[Episode, ...]  #: the segments that it was fitted to
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
-    #: states, the last ones, that were not measured: the segments hold a filter's estimates of them
+    #: unmeasured states, the last ones: the segments hold a filter's estimates of them
     hidden: int = 0
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()

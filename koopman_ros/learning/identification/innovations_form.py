@@ -45,7 +45,7 @@ class Predictor(Generic[_Drift]):
         return _run(segments, self._filter(segments, starts))
 
     def _filter(self, data: Segments, x: Array) -> tuple[Array, Array, Array]:
-        """Return the arrays of a :class:`Run` from starts (M, n_x), on the grid (K + 1, M, ...)."""
+        """Return the arrays of a run from starts (M, n_x), on the grid (K + 1, M, ...)."""
         drift, n_y = self.drift, self.gain.shape[1]
         v, target = drift.box.inputs.to_deviation(data.u), self._target(data)
         foreseen = np.empty((*target.shape[:2], len(self.gain)))
