@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Places of the shipped configuration: installed by colcon or pip, or beside the source tree."""
+"""Files: places of the shipped configuration and of models, and atomic writing."""
 
 import os
 from pathlib import Path
 import sys
+import tempfile
 
 LOOPBACK_PROFILE = 'loopback_discovery.xml'
 LEAN_PROFILE = 'many_loops.xml'
@@ -38,3 +39,14 @@ def model_path(model: str) -> Path:
     if model.endswith('.safetensors') or os.sep in model:
         return Path(model).expanduser()
     return config_directory() / 'models' / f'{model}.safetensors'
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file; a reader sees the old content or the new, after a loss of power as well."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'{path.name}.') as folder:
+        temporary = Path(folder) / path.name
+        with open(temporary, 'wb') as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)

@@ -10,7 +10,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
-from koopman_ros.lifting.input_terms import InputTerms
+from koopman_ros.lifting.input_matrix import InputTerms
 from koopman_ros.lifting.model import NODES, WEIGHTS
 from koopman_ros.plants import ControlAffineSystem
 
@@ -39,7 +39,7 @@ class TrueModel(LiftedModel):
                 (system.state_names, system.state_units, system.nominal_state, lower, upper),
                 (system.input_names, system.input_units, system.nominal_input, input_lower,
                  input_upper)))
-        itself = NetworkObservables((), np.zeros((0, len(states))), identity=True)
+        itself = NetworkObservables.linear(len(states))
         slope = system.slope(states.center, inputs.center) * states.scale / states.scale[:, None]
         B, terms = _input_matrix(system, states, inputs)
         return cls(itself, slope, B, states, inputs, system.time_unit, Provenance(system.name),

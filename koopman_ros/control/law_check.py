@@ -24,7 +24,7 @@ from koopman_ros.control.law_loops import (
 from koopman_ros.control.laws import Law, StateDependentRiccati, Weights
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
-from koopman_ros.lifting.coordinates import MAX_TRIED_LOOPS
+from koopman_ros.lifting.training_data import MAX_TRIED_LOOPS
 from koopman_ros.solvers import solve_riccati
 from koopman_ros.tuning import InputLimits, Tuning
 

@@ -151,7 +151,7 @@ class DriftPlant:
         """The linear model of the plant at the model's nominal point."""
         model, n = self.model, self.model.n_x
         slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
-        itself = NetworkObservables((), np.zeros((0, n)), identity=True)
+        itself = NetworkObservables.linear(n)
         return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
                        readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
 

@@ -27,7 +27,7 @@ from koopman_ros.learning.lift.training import (
     train,
     training_states,
 )
-from koopman_ros.lifting import bounds, Box, LiftedModel
+from koopman_ros.lifting import Box, LiftedModel, model_file
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.reports import table
@@ -274,7 +274,7 @@ class _Learner:
         for degree in degrees:
             try:
                 model = Edmd(degree).learn(self._plant, self._training, self._box)
-                bounds.check(model)
+                model_file.check(model)
                 tried.append(Contender(POLYNOMIAL, model, self.rx(model), None, None, 0.0))
             except (ValueError, np.linalg.LinAlgError) as error:
                 refusal = str(error)

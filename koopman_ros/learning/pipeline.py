@@ -361,7 +361,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, 
     return replace(model, tried_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
         method=f'{found.method}, {found.drift.form}', model_class=model_class,
-        refused=decision.reasons))
+        accepted=decision.accepted, reasons=decision.reasons))
 
 
 def _place(output: Path, accepted: bool) -> Path:

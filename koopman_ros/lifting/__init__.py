@@ -1,16 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lifted models at run time: observables, scaling, model file; in numpy alone."""
+"""The learned model at run time, and its file."""
 
-from koopman_ros.lifting.artefact import load, load_with_digest, ModelFileError, save
-from koopman_ros.lifting.coordinates import Box, Coordinates, TrainingStates, TriedLoops
-from koopman_ros.lifting.input_terms import InputTerms
+from koopman_ros.lifting.coordinates import Box, Coordinates
+from koopman_ros.lifting.input_matrix import InputTerms
 from koopman_ros.lifting.model import LiftedModel, linearised_model, Provenance
+from koopman_ros.lifting.model_file import load, load_with_digest, ModelFileError, save
 from koopman_ros.lifting.observables import NetworkObservables, Observables, PolynomialObservables
-from koopman_ros.lifting.shared import load_shared
+from koopman_ros.lifting.training_data import TrainingStates, TriedLoops
 
 __all__ = ['Box', 'Coordinates', 'InputTerms', 'LiftedModel', 'ModelFileError',
            'NetworkObservables', 'Observables', 'PolynomialObservables', 'Provenance',
-           'TrainingStates', 'TriedLoops', 'linearised_model', 'load', 'load_shared',
-           'load_with_digest', 'save']
+           'TrainingStates', 'TriedLoops', 'linearised_model', 'load', 'load_with_digest', 'save']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names, units, scaling and range of the signals that a model was learned over, and its data."""
+"""Names, units, scaling and training range of a model's signals."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.plant_data import Plant
-
-MAX_TRAINING_STATES = 256
-MAX_TRIED_LOOPS = 1024
 
 
 @dataclass(frozen=True)
@@ -102,24 +99,15 @@ class Coordinates:
 
     def violation(self, value: Array) -> float:
         """
-        Measure how far a physical value (n,) lies outside the training box.
+        Return the distance of a physical value (n,) from the training box.
 
-        :return: largest excess over a side of the box, as a fraction of half its width; 0 inside,
-            infinity for a value that is not finite.
+        :return: largest excess over a side of the box in half its width; 0 inside, infinity for a
+            value that is not finite.
         """
-        worst = 0.0
-        # in plain numbers, as the few of a measurement take numpy ten times as long
-        for v, (lower, upper, half) in zip(value.tolist(), self._sides, strict=True):
-            if not math.isfinite(v):
-                return math.inf
-            if not lower <= v <= upper:
-                worst = max(worst, max(lower - v, v - upper) / half)
-        return worst
-
-    @cached_property
-    def _sides(self) -> list[tuple[float, float, float]]:
-        return list(zip(self.lower.tolist(), self.upper.tolist(),
-                        (0.5 * (self.upper - self.lower)).tolist(), strict=True))
+        if not np.isfinite(value).all():
+            return math.inf
+        excess = np.maximum(self.lower - value, value - self.upper)
+        return max(0.0, float(np.max(2.0 * excess / (self.upper - self.lower), initial=0.0)))
 
     @cached_property
     def half_widths(self) -> Array:
@@ -170,117 +158,3 @@ class Box:
         if np.shape(B)[-2:] != (n_x, n_u):
             raise ValueError(f'incompatible B: expected {(n_x, n_u)}, got {np.shape(B)}')
         return np.asarray(B) * self.inputs.scale / self.states.scale[:, None]
-
-
-@dataclass(frozen=True)
-class TrainingStates:
-    """
-    Some of the states that a lift was learned from, spread over all of them.
-
-    A box around the data of several states holds corners where no data are.
-
-    :raises ValueError: naming what does not fit.
-    """
-
-    states: Array  #: (M, n_x) in scaled deviations, M from 1 to 256
-    #: largest distance of any training state from the nearest of these, in half widths of the
-    #: training box
-    fill_distance: float
-
-    __repr__ = brief
-
-    def __post_init__(self) -> None:
-        shape = np.shape(self.states)
-        if len(shape) != 2 or not 1 <= shape[0] <= MAX_TRAINING_STATES:
-            raise ValueError(f'incompatible training_states: expected (M, n_x) with M from 1 to '
-                             f'{MAX_TRAINING_STATES}, got {shape}')
-        object.__setattr__(self, 'states', frozen(self.states, 'training_states', shape))
-        if not (math.isfinite(self.fill_distance) and self.fill_distance >= 0.0):
-            raise ValueError('fill_distance must be finite and at least 0, got '
-                             f'{self.fill_distance}')
-
-    @staticmethod
-    def of(states: Array, half_widths: Array) -> TrainingStates:
-        """
-        Choose by farthest points: each next one is the farthest from those chosen so far.
-
-        :param states: (N, n_x) all of the training data, in scaled deviations, as the half widths
-            (n_x,) of the training box.
-        """
-        middle = 0.5 * (states.min(axis=0) + states.max(axis=0))
-        chosen = [int(np.argmin(_distances(states, middle, half_widths)))]
-        nearest = _distances(states, states[chosen[0]], half_widths)
-        while len(chosen) < MAX_TRAINING_STATES and np.max(nearest) > 0.0:
-            chosen.append(int(np.argmax(nearest)))
-            nearest = np.minimum(nearest, _distances(states, states[chosen[-1]], half_widths))
-        return TrainingStates(states[chosen], float(np.max(nearest)))
-
-    def distance(self, x: Array, half_widths: Array) -> float:
-        """
-        Return how far a state (n_x,), scaled, is from the nearest one beyond the fill distance.
-
-        :return: in half widths, so 0 at every training state; infinity where x is not finite.
-        """
-        if not all(map(math.isfinite, x.tolist())):
-            return math.inf
-        # the largest of each column: numpy takes half as long as for rows of a few numbers
-        apart = np.abs(self._columns - x[:, None]) / half_widths[:, None]
-        return max(0.0, float(apart.max(axis=0).min()) - self.fill_distance)
-
-    @cached_property
-    def _columns(self) -> Array:
-        return np.ascontiguousarray(self.states.T)
-
-    def distances(self, x: Array, half_widths: Array) -> Array:
-        """Return the distances, (N,), as :meth:`distance`, of finite states (N, n_x)."""
-        apart = np.zeros((len(x), len(self.states)))
-        for column, values, half in zip(self._columns, x.T, half_widths.tolist(), strict=True):
-            np.maximum(apart, np.abs(column - values[:, None]) / half, out=apart)
-        found: Array = np.maximum(apart.min(axis=1) - self.fill_distance, 0.0)
-        return found
-
-
-@dataclass(frozen=True)
-class TriedLoops:
-    """
-    The closed loops in which a model's law was tried, and in which of them it was lost.
-
-    :raises ValueError: naming what does not fit.
-    """
-
-    starts: Array  #: (N, n_x) where they began, in scaled deviations; N from 1 to 1024
-    setpoints: Array  #: (N, n_x) where they were to go, likewise
-    lost: NDArray[np.bool_]  #: (N,) where it did not arrive, or had no gain, but a linear law did
-
-    __repr__ = brief
-
-    def __post_init__(self) -> None:
-        shape = np.shape(self.starts)
-        if len(shape) != 2 or not 1 <= shape[0] <= MAX_TRIED_LOOPS:
-            raise ValueError(f'incompatible tried_loops: expected (N, n_x) with N from 1 to '
-                             f'{MAX_TRIED_LOOPS}, got {shape}')
-        object.__setattr__(self, 'starts', frozen(self.starts, 'starts', shape))
-        object.__setattr__(self, 'setpoints', frozen(self.setpoints, 'setpoints', shape))
-        lost = np.array(self.lost, dtype=np.bool_)
-        if lost.shape != shape[:1]:
-            raise ValueError(f'incompatible lost: expected {shape[:1]}, got {lost.shape}')
-        lost.setflags(write=False)
-        object.__setattr__(self, 'lost', lost)
-
-    def lost_at(self, x: Array, x_ref: Array, half_widths: Array) -> bool:
-        """
-        Tell whether the loop that is nearest to a state and a set-point, (n_x,) each, was lost.
-
-        All are scaled; distances are in half widths of the training box, as those of
-        :class:`TrainingStates`. Between two equally near loops the law has the doubt's benefit.
-        """
-        distances = np.maximum(_distances(self.starts, x, half_widths),
-                               _distances(self.setpoints, x_ref, half_widths))
-        nearest = np.min(distances, where=self.lost, initial=math.inf)
-        return bool(nearest < np.min(distances, where=~self.lost, initial=math.inf))
-
-
-def _distances(states: Array, x: Array, half_widths: Array) -> Array:
-    """Return the distances (N,) of states (N, n_x) from one (n_x,): the largest coordinate's."""
-    distances: Array = np.max(np.abs((states - x) / half_widths), axis=1)
-    return distances

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A model's numbers in one row, as compiled code takes them: two arrays whatever the depth."""
+"""The numbers of a model in two flat arrays, as compiled code takes them."""
 
 from __future__ import annotations
 
@@ -20,31 +20,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The numbers of a model with a network of tanh and a constant input matrix."""
+    """The numbers of a model of a network with a constant input matrix."""
 
-    #: n_x, n_u, n_z, whether z starts with the state, whether there is a read-out, and the width
-    #: of each hidden layer
+    #: n_x, n_u, n_z, whether z starts with the state, whether there is a read-out, and, unless
+    #: there are none, the number h of hidden units
     sizes: NDArray[np.int64]
-    #: transposed weight and bias of each hidden layer, its last one at the origin, (n_z, h) output
-    #: with rows of zeros for the state, A, B, the slope of the pre-feedback, and (n_x, n_x + h)
-    #: read-out, of zeros where there is none
+    #: row by row: W' (n_x, h), b (h,), h(0) (h,), V (n_z, h) below rows of zeros for the state,
+    #: A (n_z, n_z), B (n_x, n_u), slope of the pre-feedback (n_x, n_x), and the read-out
+    #: (n_x, n_x + h), zeros where there is none
     numbers: Array
 
 
 def layout_of(model: LiftedModel) -> Layout | None:
-    """Return the numbers of a model; None for one of another kind."""
+    """Return the numbers of a model; None for monomials, or an input matrix of the state."""
     network = model.observables
-    if (not isinstance(network, NetworkObservables) or network.activation != 'tanh'
-            or model.input_terms is not None):
+    if not isinstance(network, NetworkObservables) or model.input_terms is not None:
         return None
-    widths = [len(bias) for _, bias in network.hidden]
-    width = widths[-1] if widths else 0
-    readout = np.zeros((model.n_x, model.n_x + width)) if model.readout is None else model.readout
-    parts = [part for weight, bias in network.hidden for part in (weight.T, bias)]
-    if widths:
-        parts += [network.value_at_zero, network.rows]
-    parts += [model.A, model.B, model.pre_feedback_slope, readout]
+    h = len(network.W)
+    rows = np.zeros((model.n_z, h))
+    rows[model.n_z - len(network.V):] = network.V
+    readout = np.zeros((model.n_x, model.n_x + h)) if model.readout is None else model.readout
     return Layout(
         np.array([model.n_x, model.n_u, model.n_z, network.identity, model.readout is not None,
-                  *widths], dtype=np.int64),
-        np.concatenate([part.ravel() for part in parts]))
+                  *([h] if h else [])], dtype=np.int64),
+        np.concatenate([part.ravel() for part in (
+            network.W.T, network.b, network.value_at_zero, rows, model.A, model.B,
+            model.pre_feedback_slope, readout)]))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The run-time lifted model: lift, Jacobian, secants and drift, in numpy alone."""
+"""The learned model at run time: dx/dt = f(x) + B(x) u with its derivatives, in NumPy."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
-from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLoops
-from koopman_ros.lifting.input_terms import InputTerms
+from koopman_ros.lifting.coordinates import Coordinates
+from koopman_ros.lifting.input_matrix import InputTerms
 from koopman_ros.lifting.layout import Layout, layout_of
 from koopman_ros.lifting.observables import NetworkObservables, Observables
+from koopman_ros.lifting.training_data import TrainingStates, TriedLoops
 from koopman_ros.model_classes import (
     FREE_LIFT,
     IDENTITY_LIFT,
@@ -28,17 +29,18 @@ from koopman_ros.model_classes import (
 from koopman_ros.plant_data import Plant
 from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
 
-# Of scaled deviations: rounding and the third derivative both leave about ten digits.
-_DIFFERENCE = 1e-5
-# States of a box whose data are not known.
-_TRIED = 256
+_SAMPLES = 256  # random states of a box whose training states are not known
 # Of Gauss and Legendre on [0, 1].
 NODES, WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of a lift and its held-out figures."""
+    """
+    Origin of a model, its held-out figures and its acceptance.
+
+    :raises ValueError: for a refusal without a reason, or reasons without a verdict.
+    """
 
     plant: str  #: name of the plant it was learned from
     seed: int | None = None  #: seed of the training run, or None for a model that was not trained
@@ -51,7 +53,20 @@ class Provenance:
     method: str = ''  #: how derivatives were found; empty where they were given
     #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
     model_class: str = ''
-    refused: tuple[str, ...] = ()  #: why its training refused it; empty where it did not
+    accepted: bool | None = None  #: verdict of the acceptance test; None for a model never judged
+    reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
+
+    def __post_init__(self) -> None:
+        if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
+                self.accepted is not None):
+            raise ValueError(f'accepted = {self.accepted} does not fit the reasons '
+                             f'{list(self.reasons)}')
+
+    @property
+    def acceptance(self) -> str:
+        """The verdict in words, with the reasons."""
+        verdict = {True: 'accepted', False: 'refused', None: 'never judged'}[self.accepted]
+        return f'{verdict} ({"; ".join(self.reasons)})' if self.reasons else verdict
 
 
 @dataclass(frozen=True)
@@ -59,14 +74,14 @@ class LiftedModel:
     """
     A lift z = N(x) with dz/dt = A z + J_N(x) B(x) u (paper, equation for control-affine systems).
 
-    B is constant but where there are `input_terms`.
+    B is constant without `input_terms`.
 
     With a pre-feedback K the lift is one of the plant under it, f(x) + B K x, for which there is
     an A where the plant alone is unstable: dz/dt = A z - J_N(x) B K x + J_N(x) B(x) u. Inputs and
     drift stay those of the plant.
 
     All methods work in scaled deviations from the nominal point (see :class:`Coordinates`),
-    with time in `time_unit`. With a network without hidden layers it is a linearisation.
+    with time in `time_unit`. With a network without hidden units it is a linearisation.
 
     :raises ValueError: naming the array that does not fit and both shapes.
     """
@@ -77,50 +92,44 @@ class LiftedModel:
     states: Coordinates  #: the states' names, units, scaling and training box
     inputs: Coordinates  #: the inputs' names, units, scaling and training box
     time_unit: str  #: ``'s'`` or ``'min'``
-    provenance: Provenance  #: origin and held-out figures
-    #: where the data were, within their box; None when that is not known
+    provenance: Provenance  #: origin, held-out figures and acceptance
+    #: states of the training data within their box; None when they are not known
     training_states: TrainingStates | None = None
-    #: (n_x, n_phi) weights of the features phi in the drift, in 1/time unit; None where it is read
-    #: off the rate of z
+    #: (n_x, n_phi) weights of the features phi in the drift, in 1/time unit; None where the drift
+    #: follows from the rate of z
     readout: Array | None = None
-    input_terms: InputTerms | None = None  #: what B(x) has beside B; None where it is constant
+    input_terms: InputTerms | None = None  #: the state-dependent part of B(x); None for none
     #: (n_u, n_x) gain K of the pre-feedback that A holds under, in scaled coordinates, or None
     pre_feedback: Array | None = None
-    #: where the law of the model was tried; None where that is not known, or it was lost nowhere
+    #: closed loops of the model's law; None where they are not known, or none failed
     tried_loops: TriedLoops | None = None
 
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        n_x, n_z = self.observables.n_x, self.observables.n_z
+        n_x, n_u, n_z = self.n_x, self.n_u, self.observables.n_z
         check_time_unit(self.time_unit)
-        if n_x != self.n_x:
-            raise ValueError(f'incompatible observables: expected {self.n_x} states, got {n_x}')
-        object.__setattr__(self, 'A', frozen(self.A, 'A', (n_z, n_z)))
-        object.__setattr__(self, 'B', frozen(self.B, 'B', (n_x, self.n_u)))
-        if self.readout is not None:
-            shape = (n_x, self.observables.features.n_z)
-            object.__setattr__(self, 'readout', frozen(self.readout, 'readout', shape))
+        if self.observables.n_x != n_x:
+            raise ValueError(f'incompatible observables: expected {n_x} states, got '
+                             f'{self.observables.n_x}')
+        for name, shape in (('A', (n_z, n_z)), ('B', (n_x, n_u)), ('pre_feedback', (n_u, n_x)),
+                            ('readout', (n_x, self.observables.features.n_z))):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, frozen(value, name, shape))
         if self.input_terms is not None and (
                 self.input_terms.coefficients.shape[1:] != self.B.shape):
             raise ValueError(f'incompatible input terms: expected {("any", *self.B.shape)}, got '
                              f'{self.input_terms.coefficients.shape}')
-        if self.pre_feedback is not None:
-            object.__setattr__(self, 'pre_feedback', frozen(
-                self.pre_feedback, 'pre_feedback', (self.n_u, n_x)))
-        if self.training_states is not None and self.training_states.states.shape[1] != n_x:
-            raise ValueError(f'incompatible training_states: expected {n_x} states, got '
-                             f'{self.training_states.states.shape[1]}')
-        if self.tried_loops is not None and self.tried_loops.starts.shape[1] != n_x:
-            raise ValueError(f'incompatible tried_loops: expected {n_x} states, got '
-                             f'{self.tried_loops.starts.shape[1]}')
+        for name, width in (
+                ('training_states', self.training_states and self.training_states.n_x),
+                ('tried_loops', self.tried_loops and self.tried_loops.n_x)):
+            if width is not None and width != n_x:
+                raise ValueError(f'incompatible {name}: expected {n_x} states, got {width}')
 
     @cached_property
     def layout(self) -> Layout | None:
-        """Its numbers as compiled code takes them; None for a kind that it does not know."""
+        """Its numbers as compiled code takes them; None for a kind that they do not describe."""
         return layout_of(self)
-
-    # kept, since a control step asks for them again and again
 
     @cached_property
     def n_x(self) -> int:
@@ -133,18 +142,6 @@ class LiftedModel:
         return len(self.inputs)
 
     @cached_property
-    def kind(self) -> str:
-        """Its class as people read it, of a lift with its number of coordinates."""
-        lift, name = self.observables, self.provenance.model_class
-        if not name:
-            name = (POLYNOMIAL if not isinstance(lift, NetworkObservables) else
-                    LINEAR if not lift.hidden else
-                    FREE_LIFT if not lift.identity else
-                    NEURAL_DRIFT if self.readout is not None and self.n_z == self.n_x else
-                    IDENTITY_LIFT)
-        return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
-
-    @cached_property
     def n_z(self) -> int:
         """Number of lifted coordinates."""
         return self.A.shape[0]
@@ -154,9 +151,21 @@ class LiftedModel:
         """Whether z starts with the state."""
         return self.observables.identity
 
+    @cached_property
+    def kind(self) -> str:
+        """Its class for people, of a lift with the number of coordinates."""
+        lift, name = self.observables, self.provenance.model_class
+        if not name:
+            name = (POLYNOMIAL if not isinstance(lift, NetworkObservables) else
+                    LINEAR if not len(lift.W) else
+                    FREE_LIFT if not lift.identity else
+                    NEURAL_DRIFT if self.readout is not None and self.n_z == self.n_x else
+                    IDENTITY_LIFT)
+        return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
+
     @property
     def plant(self) -> Plant:
-        """What the model knows of its plant: names, units, nominal point; B is left to learn."""
+        """The names, units and nominal point of its plant, without B."""
         return Plant(self.provenance.plant, self.states.names, self.states.units,
                      self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
                      self.inputs.center, None, self.input_matrix_degree)
@@ -185,7 +194,7 @@ class LiftedModel:
     @cached_property
     def adds_unstable_modes(self) -> bool:
         """
-        Whether more modes of A grow, or do not decay, than of the linearised model.
+        Whether A has more modes that do not decay than the linearised model.
 
         Both under the pre-feedback, if there is one.
         """
@@ -197,19 +206,18 @@ class LiftedModel:
     @cached_property
     def mismatch(self) -> float:
         """
-        How far A z is from J_N f, the rate of z under the model's drift f: 0 for a closed lift.
+        Error of A z as the rate J_N f of z under the model's drift f: 0 for a closed lift.
 
-        Under the pre-feedback, if there is one.
-
-        As the training figure ``rw``, a mean square without unit, over the training states or all
-        over the box; 0 also for what moves nowhere.
+        Under the pre-feedback, if there is one. As the training figure ``rw`` a mean square
+        without unit, over the training states or random ones of the box; 0 also for a lift at
+        rest everywhere.
         """
         if self.training_states is not None:
             x = self.training_states.states
         else:
             box = self.states
             x = box.to_deviation(np.random.default_rng(0).uniform(
-                box.lower, box.upper, (_TRIED, self.n_x)))
+                box.lower, box.upper, (_SAMPLES, self.n_x)))
         z, J = self.lift_and_jacobian(x)
         rate = (J @ (self.drift(x) + self.pre_feedback_rate(x))[..., None])[..., 0]
         rest = rate - z @ self.A.T
@@ -237,11 +245,8 @@ class LiftedModel:
         return self.B if self.input_terms is None else self.B + self.input_terms.matrix(x)
 
     def forcing(self, x: Array, u: Array) -> Array:
-        """Evaluate B(x) u, what inputs add to the rate: (..., n_x), (..., n_u) -> (..., n_x)."""
-        if self.input_terms is not None:
-            return (self.input_matrix(x) @ u[..., None])[..., 0]
-        # dot takes a third of the time of @ here
-        return self.B.dot(u) if u.ndim == 1 else u @ self.B.T
+        """Evaluate B(x) u, the rate due to inputs: (..., n_x), (..., n_u) -> (..., n_x)."""
+        return (self.input_matrix(x) @ u[..., None])[..., 0]
 
     def forcing_jacobian(self, x: Array, u: Array) -> Array:
         """Evaluate d(B(x) u)/dx, (..., n_x), (..., n_u) -> (..., n_x, n_x); 0 for a constant B."""
@@ -256,56 +261,43 @@ class LiftedModel:
         :param u: (..., n_u) scaled deviations.
         :param w: (..., n_x) disturbance.
         """
-        if self.input_terms is not None:
-            return lambda x: self.drift(x) + self.forcing(x, u) + w
-        constant = (self.B.dot(u) if u.ndim == 1 else u @ self.B.T) + w
-        return lambda x: self.drift(x) + constant
+        return lambda x: self.drift(x) + self.forcing(x, u) + w
 
     @cached_property
     def linearised(self) -> LiftedModel:
         """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B(0) u."""
-        origin = np.zeros(self.n_x)
-        if self.readout is None:
-            # exact, as N(0) = 0
-            J = self.jacobian(origin)
-            slope = np.linalg.pinv(J) @ self.A @ J - self.pre_feedback_slope
-        else:
-            slope = self.drift_jacobian(origin)
-        observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
-        return replace(self, observables=observables, A=slope, readout=None,
-                       input_terms=None, pre_feedback=None, tried_loops=None)
+        slope = self.drift_jacobian(np.zeros(self.n_x))
+        return replace(self, observables=NetworkObservables.linear(self.n_x), A=slope,
+                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
 
     def lost_at(self, x: Array, x_ref: Array) -> bool:
         """
-        Tell whether the law was lost when it was tried on a way from x to x_ref, (n_x,) each.
+        Tell whether the law failed in the tested loop nearest to a state and a set-point.
 
-        In scaled deviations; see :attr:`tried_loops`.
+        Both (n_x,) in scaled deviations; see :attr:`tried_loops`.
         """
         return self.tried_loops is not None and self.tried_loops.lost_at(
             x, x_ref, self.states.half_widths)
 
     def distance(self, x: Array) -> float:
-        """
-        Measure how far a state (n_x,), in state units, is from the training data.
-
-        :return: in half widths of the training box: the larger of the distance from the box and,
-            where it is known, that from the data in it; infinity for what is not finite.
-        """
-        x = self.states.array('state', x)
-        outside = self.states.violation(x)
-        if self.training_states is None:
-            return outside
-        return max(outside, self.training_states.distance(
-            self.states.to_deviation(x), self.states.half_widths))
+        """Return the distance of a state (n_x,), in state units, as :meth:`distances`."""
+        x = self.states.to_deviation(self.states.array('state', x))
+        return float(self.distances(x[None])[0])
 
     def distances(self, x: Array) -> Array:
-        """Measure, as :meth:`distance`, for states (N, n_x) in scaled deviations: (N,)."""
+        """
+        Return the distances of states from the training data.
+
+        :param x: (N, n_x) in scaled deviations.
+        :return: (N,) in half widths of the training box: the larger of the distance from the box
+            and, where they are known, from the training states; infinity for a state that is not
+            finite.
+        """
         half, (lower, upper) = self.states.half_widths, self.states.corners
         outside = np.max(np.maximum(np.maximum(lower - x, x - upper) / half, 0.0), axis=1)
         if self.training_states is not None:
-            outside = np.maximum(outside, self.training_states.distances(x, half))
-        found: Array = np.where(np.isfinite(x).all(axis=1), outside, np.inf)
-        return found
+            outside = np.maximum(outside, self.training_states.distance(x, half))
+        return np.where(np.isfinite(x).all(axis=1), outside, np.inf)
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z); ValueError for another size."""
@@ -324,19 +316,22 @@ class LiftedModel:
         """Evaluate N(x), J_N(x) and their secants; see :meth:`Observables.lift_and_secants`."""
         return self.observables.lift_and_secants(x, x_ref, w)
 
+    def _onto_states(self, J: Array) -> Array:
+        """Return the pseudo-inverse of J_N(x): (..., n_z, n_x) -> (..., n_x, n_z)."""
+        if self.identity and J.shape[-1] == 1:
+            # one state: a tenth of the time of a singular value decomposition
+            inverse: Array = (J / np.sum(J * J, axis=-2, keepdims=True)).swapaxes(-1, -2)
+            return inverse
+        return np.asarray(np.linalg.pinv(J), dtype=np.float64)
+
     def onto_states(self, J: Array, rate: Array) -> Array:
         """
-        Read the rate of the state off a rate of z, by J_N(x)^+: (..., n_z, k) -> (..., n_x, k).
+        Return the rate of the state, by J_N(x)^+, for a rate of z.
 
-        :param J: (..., n_z, n_x) from the state x in question.
-        :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
+        :param J: (n_z, n_x) at the state x.
+        :param rate: (n_z,) or (n_z, k).
         """
-        # all coordinates share in what training left over, so that all of them are asked
-        if self.identity and J.shape[1:] == (1,):
-            # one state: the same without a singular value decomposition; J holds a 1
-            found: Array = J.T.dot(rate) / J[:, 0].dot(J[:, 0])
-            return found
-        return np.linalg.pinv(J) @ rate
+        return self._onto_states(J) @ rate
 
     def drift(self, x: Array) -> Array:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
@@ -344,9 +339,8 @@ class LiftedModel:
         if self.readout is not None:
             return self.observables.features.lift(x) @ self.readout.T
         z, J = self.observables.lift_and_jacobian(x)
-        rate = (self.onto_states(J, self.A.dot(z)) if x.ndim == 1 else
-                self.onto_states(J, (z @ self.A.T)[..., None])[..., 0])
-        return rate if self.pre_feedback is None else rate - self.pre_feedback_rate(x)
+        f = (self._onto_states(J) @ (z @ self.A.T)[..., None])[..., 0]
+        return f - self.pre_feedback_rate(x)
 
     @cached_property
     def pre_feedback_slope(self) -> Array:
@@ -356,54 +350,38 @@ class LiftedModel:
         return frozen(slope, 'slope of the pre-feedback', shape)
 
     def pre_feedback_rate(self, x: Array) -> Array:
-        """Evaluate B K x, what the pre-feedback adds to the drift: (..., n_x) -> same."""
+        """Evaluate B K x, the part of A z that is due to the pre-feedback: (..., n_x) -> same."""
         return x @ self.pre_feedback_slope.T
 
     def drift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """
-        Evaluate the drift and its Jacobian at once, both exactly: (..., n_x), (..., n_x, n_x).
-
-        Where there is no read-out they are of the normal equations, which are quicker for many
-        states and lose digits where J_N is badly conditioned.
-
-        :raises numpy.linalg.LinAlgError: where it has not full rank.
-        """
+        """Evaluate the drift and its Jacobian exactly: (..., n_x) -> same, (..., n_x, n_x)."""
         if self.readout is not None:
             features, slope = self.observables.features.lift_and_jacobian(x)
             return features @ self.readout.T, self.readout @ slope
         z, J, bend = self.observables.lift_and_derivatives(x)
-        rate, transposed = z @ self.A.T, J.swapaxes(-1, -2)
-        square = transposed @ J
-        f = np.linalg.solve(square, transposed @ rate[..., None])
-        rest = rate[..., None] - J @ f
-        # of J'J f = J'A z, by each state; the derivatives of J are symmetric in the states
-        slope = np.linalg.solve(
-            square, transposed @ (self.A @ J - (bend @ f[..., None, :, :])[..., 0])
-            + (bend * rest[..., None]).sum(axis=-3))
-        return (f[..., 0] - self.pre_feedback_rate(x), slope - self.pre_feedback_slope)
+        inverse, rate = self._onto_states(J), (z @ self.A.T)[..., None]
+        f = inverse @ rate
+        # the derivative of J'J f = J'A z by each state, with J of full rank
+        rest = (bend * (rate - J @ f)[..., None]).sum(axis=-3)
+        slope = inverse @ (self.A @ J - (bend @ f[..., None, :, :])[..., 0]
+                           + inverse.swapaxes(-1, -2) @ rest)
+        return f[..., 0] - self.pre_feedback_rate(x), slope - self.pre_feedback_slope
 
     def drift_jacobian(self, x: Array) -> Array:
-        """Evaluate df/dx of the drift, (..., n_x) -> (..., n_x, n_x): of a read-out exactly."""
-        if self.readout is not None:
-            return self.readout @ self.observables.features.lift_and_jacobian(x)[1]
-        # by central differences: J_N^+ changes with x as well, so that the exact one would need
-        # second derivatives
-        steps, x = _DIFFERENCE * np.eye(self.n_x), x[..., None, :]
-        ahead, behind = self.drift(np.array((x + steps, x - steps)))
-        return np.asarray(ahead - behind).swapaxes(-1, -2) / (2.0 * _DIFFERENCE)
+        """Evaluate df/dx of the drift exactly: (..., n_x) -> (..., n_x, n_x)."""
+        return self.drift_and_jacobian(x)[1]
 
     def averaged_drift_jacobian(self, x: Array, x_ref: Array) -> Array:
         """
         Average df/dx along the segment from x_ref to x, both (n_x,).
 
-        :return: A (n_x, n_x) with f(x) - f(x_ref) = A (x - x_ref): of a read-out exactly, by its
-            features' secants, otherwise closely, by Gauss and Legendre.
+        :return: A (n_x, n_x) with f(x) - f(x_ref) = A (x - x_ref): exact for a read-out, by the
+            secants of its features, otherwise close, by Gauss-Legendre quadrature.
         """
         if self.readout is not None:
-            # w and what comes of it are not asked for
             return self.readout @ self.observables.features.lift_and_secants(x, x_ref, x)[2]
         along = self.drift_jacobian(x_ref + NODES[:, None] * (x - x_ref))
-        return WEIGHTS.dot(along.reshape(len(WEIGHTS), -1)).reshape(self.n_x, self.n_x)
+        return np.tensordot(WEIGHTS, along, 1)
 
 
 def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coordinates,
@@ -417,5 +395,5 @@ def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coo
     n_x = len(states)
     A = np.asarray(jacobian) * states.scale / states.scale[:, None]
     scaled_B = np.asarray(B) * inputs.scale / states.scale[:, None]
-    itself = NetworkObservables((), np.zeros((0, n_x)), identity=True)
-    return LiftedModel(itself, A, scaled_B, states, inputs, time_unit, provenance)
+    return LiftedModel(NetworkObservables.linear(n_x), A, scaled_B, states, inputs, time_unit,
+                       provenance)

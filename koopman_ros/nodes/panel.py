@@ -463,7 +463,7 @@ def _about(model: LiftedModel) -> dict[str, str]:
     origin = model.provenance
     return {
         'class': model.kind,
-        **({'refused by its training': '; '.join(origin.refused)} if origin.refused else {}),
+        'acceptance': origin.acceptance,
         'learned from': origin.plant, 'derivatives': origin.method,
         'made by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'seed': '' if origin.seed is None else str(origin.seed),

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from koopman_ros.arrays import Array
 from koopman_ros.control import compare, Controller, State, Windows
 from koopman_ros.control.usable import unusable
-from koopman_ros.lifting import Coordinates, LiftedModel, load_shared, ModelFileError
+from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of
 from koopman_ros.reasons import Code
@@ -59,9 +59,8 @@ class LoadedModel:
     @property
     def about(self) -> str:
         """The model in a few words."""
-        refused = '; '.join(self.model.provenance.refused)
-        return (f'model {self.name}: {self.model.kind}, trained for {ranges(self.model)}'
-                + (f'; REFUSED by its training ({refused})' if refused else ''))
+        return (f'model {self.name}: {self.model.kind}, trained for {ranges(self.model)}; '
+                f'acceptance: {self.model.provenance.acceptance}')
 
 
 @dataclass(frozen=True)
@@ -103,12 +102,12 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
         raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
                              f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
-    model, digest = load_shared(path)
+    model, digest = load_with_digest(path)
     if reason := unusable(model):
         raise ModelFileError(f'{path}: {reason}')
-    if (reasons := model.provenance.refused) and not force:
+    if model.provenance.accepted is False and not force:
         raise ModelFileError(
-            f'{path} was refused by its training ({"; ".join(reasons)}): train it again, or set '
+            f'{path} was {model.provenance.acceptance}: train it again, or set '
             'load_refused_model to true to control with it all the same')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs

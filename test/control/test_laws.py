@@ -295,9 +295,9 @@ def test_the_averaged_law_has_a_gain_where_the_secant_of_the_lift_has_none():
     g, slope = np.tanh(1.0), 1.0 - np.tanh(1.0) ** 2
     b = slope * g - g
     small = 1e-4
-    hidden = np.array([[small, 0.0], [0.0, small], [0.0, 1.0]]), np.zeros(3)
-    lift = NetworkObservables((hidden,), np.array([[1.0 / small, 0.0, 1.0],
-                                                   [0.0, 1.0 / small, 0.0]]), identity=False)
+    lift = NetworkObservables(
+        np.array([[small, 0.0], [0.0, small], [0.0, 1.0]]), np.zeros(3),
+        np.array([[1.0 / small, 0.0, 1.0], [0.0, 1.0 / small, 0.0]]), identity=False)
     model = replace(saddle_model(), observables=lift, A=np.array([[1.0, b], [1.0, 0.0]]),
                     B=np.array([[0.0], [1.0]]))
     x, origin = np.ones(2), np.zeros(2)

@@ -187,14 +187,13 @@ def test_a_plant_without_inputs_and_degrees_that_cannot_be():
 
 
 def test_units_of_a_drift_leave_the_lift_as_it_is():
-    widths = (4,)
-    lift, other = random_lift(2, widths), random_lift(2, tuple(w + 1 for w in widths), seed=5)
+    lift, other = random_lift(2, 4), random_lift(2, 5, seed=5)
     joined = with_units_of(other, lift)
     x = np.random.default_rng(0).normal(size=(10, 2))
     np.testing.assert_allclose(joined.lift(x), lift.lift(x), rtol=0, atol=1e-14)
     np.testing.assert_allclose(joined.drift(x), lift.drift(x), rtol=0, atol=1e-12)
     phi = joined.observables.features.lift(x)
-    for model, at in ((lift, slice(2, 2 + widths[-1])), (other, slice(2 + widths[-1], None))):
+    for model, at in ((lift, slice(2, 6)), (other, slice(6, None))):
         np.testing.assert_allclose(phi[:, at], model.observables.features.lift(x)[:, 2:],
                                    rtol=0, atol=1e-14)
 

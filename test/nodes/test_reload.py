@@ -171,9 +171,9 @@ BAD_MODELS = {
     'gain beyond its bound': (
         replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),
     'refused by its training': (
-        replace(SHIPPED, provenance=replace(SHIPPED.provenance, refused=('too large an error',))),
-        'was refused by its training (too large an error): train it again, or set '
-        'load_refused_model'),
+        replace(SHIPPED, provenance=replace(
+            SHIPPED.provenance, accepted=False, reasons=('too large an error',))),
+        'was refused (too large an error): train it again, or set load_refused_model'),
     'numbers that overflow': (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
 }
 
@@ -212,7 +212,7 @@ def test_unsuitable_model_is_refused_with_the_reason(
 
     assert running.reload() == (
         True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
-        '53.85 degC')
+        '53.85 degC; acceptance: never judged')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
 

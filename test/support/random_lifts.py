@@ -17,26 +17,20 @@ def coordinates(prefix: str, n: int) -> Coordinates:
         center - 2.0 * scale, center + scale)
 
 
-def random_network(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool = True,
-                   n_free: int = 3, activation: str = 'tanh',
+def random_network(n_x: int = 2, units: int = 5, *, identity: bool = True, n_free: int = 3,
                    seed: int | np.random.Generator = 0) -> NetworkObservables:
-    """Return a network of order one with n_free outputs from hidden layers of these widths."""
+    """Return a network of order one with n_free outputs from so many hidden units."""
     rng = np.random.default_rng(seed)
-    hidden, width = [], n_x
-    for h in widths:
-        hidden.append((rng.normal(size=(h, width)) / np.sqrt(width), rng.normal(size=h)))
-        width = h
-    output = rng.normal(size=(n_free, width)) / np.sqrt(width)
-    return NetworkObservables(tuple(hidden), output, identity, activation)
+    return NetworkObservables(
+        rng.normal(size=(units, n_x)) / np.sqrt(n_x), rng.normal(size=units),
+        rng.normal(size=(n_free, units)) / np.sqrt(units), identity)
 
 
-def random_lift(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool = True,
-                n_u: int = 1, n_free: int = 3, activation: str = 'tanh',
-                seed: int = 0) -> LiftedModel:
+def random_lift(n_x: int = 2, units: int = 5, *, identity: bool = True, n_u: int = 1,
+                n_free: int = 3, seed: int = 0) -> LiftedModel:
     """Return a model with such a network, and A and B of order one."""
     rng = np.random.default_rng(seed)
-    observables = random_network(
-        n_x, widths, identity=identity, n_free=n_free, activation=activation, seed=rng)
+    observables = random_network(n_x, units, identity=identity, n_free=n_free, seed=rng)
     n_z = observables.n_z
     return LiftedModel(
         observables=observables,
@@ -51,6 +45,6 @@ def random_lift(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool 
 def change_of_variable(scale: float = 1.0, gain: float = 1.0) -> LiftedModel:
     """Return the free lift z = tanh(x) of one state, dz/dt = -z + J(x) gain u."""
     c = Coordinates(('x',), ('1',), np.zeros(1), np.array([scale]), -np.ones(1), np.ones(1))
-    itself = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
+    itself = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
     return LiftedModel(itself, -np.eye(1), np.array([[gain]]), c, c, 's',
                        Provenance('change of variable'))

@@ -48,7 +48,6 @@ def two_state_samples(count=600, seed=0):
 
 def bits(model):
     network = model.observables
-    arrays = (model.A, model.B, network.output, model.states.scale,
-              *(array for layer in network.hidden for array in layer),
+    arrays = (model.A, model.B, network.W, network.b, network.V, model.states.scale,
               np.zeros(0) if model.readout is None else model.readout)
     return b''.join(array.tobytes() for array in arrays)

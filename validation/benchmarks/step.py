@@ -99,7 +99,7 @@ def _lift(n_z: int) -> LiftedModel:
         return load(model_path(f'reactor_nz{n_z}'))
     rng = np.random.default_rng(n_z)
     network = NetworkObservables(
-        ((_BENT * rng.normal(size=(_HIDDEN, 1)), rng.normal(size=_HIDDEN)),),
+        _BENT * rng.normal(size=(_HIDDEN, 1)), rng.normal(size=_HIDDEN),
         rng.normal(size=(n_z - 1, _HIDDEN)) / np.sqrt(_HIDDEN), identity=True)
     # multiples of the state that decay as it does: the lift is closed, and the re-centred law the
     # one in force
@@ -143,8 +143,7 @@ class NaiveLaw:
     def __init__(self, model: LiftedModel, tuning: Tuning) -> None:
         network = model.observables
         assert isinstance(network, NetworkObservables)
-        self._layers = [(torch.tensor(W), torch.tensor(b)) for W, b in network.hidden]
-        self._output = torch.tensor(network.output)
+        self._W, self._b, self._output = map(torch.tensor, (network.W, network.b, network.V))
         self._model, self._limits = model, tuning.limits
         self._Q = np.diag(tuning.state_weight * model.states.scale ** 2)
         self._R = np.diag(tuning.input_weight * model.inputs.scale ** 2)
@@ -227,9 +226,7 @@ class NaiveLaw:
         return z.numpy(), J.numpy()
 
     def _activations(self, x: torch.Tensor) -> torch.Tensor:
-        for W, b in self._layers:
-            x = torch.tanh(W @ x + b)
-        return x
+        return torch.tanh(self._W @ x + self._b)
 
     def _lift(self, x: torch.Tensor) -> torch.Tensor:
         return torch.cat((x, self._output @ (self._activations(x) - self._at_zero)))

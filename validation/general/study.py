@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from koopman_ros.learning import fit, rollout_rmse
-from koopman_ros.lifting.bounds import MAX_COORDINATES
+from koopman_ros.lifting.model_file import MAX_COORDINATES
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import describe
 from validation.general.learners import Learned, LEARNERS

@@ -55,11 +55,10 @@ def with_units_of(drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
     ours, theirs = lift.observables, drift.observables
     if not (isinstance(ours, NetworkObservables) and isinstance(theirs, NetworkObservables)):
         raise ValueError('only a network has hidden units')
-    (W, b), (more_W, more_b) = ours.hidden[0], theirs.hidden[0]
-    idle = np.zeros((len(ours.output), theirs.output.shape[1]))
+    idle = np.zeros((len(ours.V), len(theirs.W)))
     return replace(lift, readout=None, observables=replace(
-        ours, hidden=((np.vstack([W, more_W]), np.concatenate([b, more_b])),),
-        output=np.hstack([ours.output, idle])))
+        ours, W=np.vstack([ours.W, theirs.W]), b=np.concatenate([ours.b, theirs.b]),
+        V=np.hstack([ours.V, idle])))
 
 
 @dataclass(frozen=True)

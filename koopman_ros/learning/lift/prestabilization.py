@@ -89,8 +89,7 @@ class Frame:
         largest and smallest variance, so that they do not add to the condition number.
         """
         back = np.linalg.inv(self.T)
-        W, b = observables.hidden[0]
-        output = observables.output
+        output = observables.V
         if observables.identity:
             spread = np.linalg.eigvalsh(back @ back.T)
             size = float((spread[0] * spread[-1]) ** 0.25)
@@ -98,5 +97,5 @@ class Frame:
             n_free = len(output)
             A = block_diag(back, size * np.eye(n_free)) @ A @ block_diag(
                 self.T, np.eye(n_free) / size)
-        return (replace(observables, hidden=((W @ self.T, b),), output=output), A,
+        return (replace(observables, W=observables.W @ self.T, V=output), A,
                 None if B is None else back @ B)

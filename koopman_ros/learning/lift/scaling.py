@@ -72,7 +72,7 @@ class Scaling:
                 raise ValueError(f'the lift that is begun from has the {kind} {_listed(its)}, the '
                                  f'plant has {_listed(ours)}: begin from that of a plant of the '
                                  'same kind')
-        if not isinstance(network, NetworkObservables) or not len(network.output) or (
+        if not isinstance(network, NetworkObservables) or not len(network.V) or (
                 network.identity != recipe.identity):
             raise ValueError(
                 'the lift that is begun from is of another class: begin from one with '
@@ -80,14 +80,13 @@ class Scaling:
         # deviations there are `stretch` times those here and `shift`
         stretch = own.scale / begin.states.scale
         shift = (own.center - begin.states.center) / begin.states.scale
-        (W, b), V = network.hidden[0], network.output
-        W, b = W * stretch, b + W @ shift
+        W, b = network.W * stretch, network.b + network.W @ shift
         if self.frame:
             W = W @ np.linalg.inv(self.frame.T)
         # units of the read-out alone have no part in z
-        used = np.any(V != 0.0, axis=0)
+        used = np.any(network.V != 0.0, axis=0)
         return recipe.planted(data, *(data.x.new_tensor(np.ascontiguousarray(a)) for a in (
-            W[used], b[used], V[:, used])))
+            W[used], b[used], network.V[:, used])))
 
     def model(self, grown: TrainedLift, **about: Any) -> LiftedModel:
         """Return the trained model in units; `about` are further fields of the model."""
@@ -96,7 +95,7 @@ class Scaling:
             self.pace * parts.B.numpy())
         alone = grown.drift_alone
         observables = NetworkObservables(
-            ((parts.W.numpy(), parts.b.numpy()),), parts.V.numpy()[:0 if alone else None],
+            parts.W.numpy(), parts.b.numpy(), parts.V.numpy()[:0 if alone else None],
             alone or grown.layout.identity)
         if self.frame:
             observables, A, B = self.frame.leave(observables, A, B)

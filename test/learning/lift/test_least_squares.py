@@ -41,7 +41,7 @@ def test_a_pass_is_what_the_model_evaluates_at_run_time(identity):
     normal = normals(0)
     parts, x, f = layout.split(normal(layout.size)), normal(20, 2), normal(20, 2)
     lifted = Pass(layout, parts, x, f)
-    z, J = NetworkObservables(((parts.W.numpy(), parts.b.numpy()),), parts.V.numpy(),
+    z, J = NetworkObservables(parts.W.numpy(), parts.b.numpy(), parts.V.numpy(),
                               identity).lift_and_jacobian(x.numpy())
     np.testing.assert_allclose(lifted.z, z, rtol=0, atol=1e-14)
     np.testing.assert_allclose(lifted.z_rate, (J @ f.numpy()[..., None])[..., 0],

@@ -66,7 +66,7 @@ def test_figures_under_a_pre_feedback_are_those_of_the_plant_under_it():
 
 
 def test_rw_is_the_residual_in_whitened_coordinates():
-    model = random_lift(2, (8,), identity=False)
+    model = random_lift(2, 8, identity=False)
     rng = np.random.default_rng(6)
     x, dxdt, u = rng.normal(size=(90, 2)), rng.normal(size=(90, 2)), rng.normal(size=(90, 1))
     xi = model.states.to_deviation(x)
@@ -110,7 +110,7 @@ def test_roll_out_of_a_linear_model_against_the_matrix_exponential():
 def test_roll_out_follows_the_projected_drift():
     """A free lift of n_z = n_x = 1 is a change of variable: z = tanh(x) decays as exp(-t)."""
     c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
-    observables = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
+    observables = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
     model = LiftedModel(observables, -np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
     path = roll_out(model, np.array([1.2]), np.zeros((20, 1)), 0.2)
     expected = np.arctanh(np.tanh(1.2) * np.exp(-0.2 * np.arange(21)))
@@ -122,6 +122,19 @@ def test_a_roll_out_without_inputs_and_one_that_diverges():
     np.testing.assert_array_equal(roll_out(linear_model(), x0, np.zeros((0, 1)), 0.3), [x0])
     with pytest.raises(RuntimeError, match=r'diverged after \d+ samples: keep the inputs within'):
         roll_out(linear_model(50.0 * np.eye(2)), np.ones(2), np.zeros((40, 1)), 1.0)
+
+
+def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
+    """With dz/dt = z a coordinate leaves its maximum, at x = 1.5, where the drift is infinite."""
+    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
+    observables = NetworkObservables(np.ones((2, 1)), np.array([-0.5, -2.5]),
+                                     np.array([[1.0, -1.0]]), identity=False)
+    model = LiftedModel(observables, np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
+    path = roll_out(model, np.array([0.5]), np.zeros((7, 1)), 0.1)
+    z = model.lift(path)
+    np.testing.assert_allclose(z, z[0] * np.exp(0.1 * np.arange(8))[:, None], rtol=1e-7)
+    with pytest.raises(RuntimeError, match='diverged after 9 samples'):
+        roll_out(model, np.array([0.5]), np.zeros((9, 1)), 0.1)
 
 
 @pytest.mark.parametrize(('change', 'message'), [
@@ -146,7 +159,7 @@ def test_samples_of_another_plant_are_no_fit():
 
 
 def test_roll_outs_side_by_side_are_those_one_by_one():
-    model, rng = random_lift(2, (6,)), np.random.default_rng(3)
+    model, rng = random_lift(2, 6), np.random.default_rng(3)
     # slow enough to stay where the lift was drawn
     model = replace(model, A=0.1 * model.A)
     x0 = rng.uniform(model.states.lower, model.states.upper, (2, 3, 2))

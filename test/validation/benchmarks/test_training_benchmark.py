@@ -114,7 +114,7 @@ def test_invariant_residual_is_that_of_validation():
                         np.ones(2))
     (W, b), = parts.hidden
     model = LiftedModel(
-        NetworkObservables(((W.numpy(), b.numpy()),), parts.V.numpy(), True, 'tanh'),
+        NetworkObservables(W.numpy(), b.numpy(), parts.V.numpy(), True),
         parts.A.numpy(), np.zeros((2, 1)), plain,
         Coordinates(('u',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1)), 's',
         Provenance('two-state example'))

@@ -19,7 +19,7 @@ from koopman_ros.lifting.observables import PolynomialObservables
 @dataclass(frozen=True, eq=False)
 class InputTerms:
     """
-    What an input matrix has beside its constant: B(x) = B + sum_k phi_k(x) C_k.
+    The state-dependent part of an input matrix: B(x) = B + sum_k phi_k(x) C_k.
 
     phi are the monomials of the scaled deviations from degree 1 to a degree, so that B(0) = B.
 
@@ -40,7 +40,7 @@ class InputTerms:
     @staticmethod
     def regressors(x: Array, u: Array, degree: int) -> Array:
         """
-        Return what B and its terms are the weights of: u, phi_1(x) u, phi_2(x) u, ...
+        Return the regressors whose weights are B and its terms: u, phi_1(x) u, phi_2(x) u, ...
 
         :param x: (..., n_x) and u (..., n_u), scaled deviations.
         :param degree: of the terms; 0 for u alone.
@@ -79,11 +79,11 @@ class InputTerms:
         return np.einsum('kij,...j,...kl->...il', self.coefficients, u, J)
 
     def averaged_jacobian(self, x: Array, x_ref: Array, u: Array) -> Array:
-        """Average that along the segment from x_ref to x, both (n_x,), exactly: (n_x, n_x)."""
+        """Average that Jacobian along the segment from x_ref to x, (n_x,) each, exactly."""
         M = self._monomials.lift_and_secants(x, x_ref, x)[2]
         return np.einsum('kij,j,kl->il', self.coefficients, u, M)
 
 
 def _count(n_x: int, degree: int) -> int:
-    """Return how many monomials of n_x states there are from degree 1 to a degree."""
+    """Return the number of monomials of n_x states from degree 1 to a degree."""
     return math.comb(n_x + degree, degree) - 1
