@@ -54,7 +54,7 @@ class SensorLimits:
         'measured', 0.0, 'Change between two measurements that noise alone may bring; 0: any.',
         name='max_jump', none=ANY)
     frozen_timeout: float = parameter(
-        0.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
+        20.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
         'than half of max_jump; 0: for ever.', 's', 0.0, 86400.0)
 
 

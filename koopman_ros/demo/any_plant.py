@@ -24,7 +24,7 @@ from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.demo.results import read_run, Run
 from koopman_ros.lifting import load
 from koopman_ros.lifting.coordinates import Coordinates
-from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import preset_wiring
@@ -86,22 +86,23 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
         run_loop(scenario, bag, logs, table.show)
 
     model = load(model_path(str(preset(name, 'controller')['model'])))
-    tuning = table_of(model, {'system': name}).snapshot({})
+    rows = table_of(model, {'system': name}).rows
+    tuned = {parameter: row.default for parameter, row in rows.items()}
     run = read_run(wiring, bag)
     first = round(told.step_time / plant.sample_period)
     states, inputs = (np.stack(list(of.values()), axis=1)[first:]
                       for of in (run.measured, run.commanded))
     x_ref, u_ref = steady_state(system, setpoints)
     task = Task(system, states[0], x_ref, u_ref,
-                np.array([tuning.states[signal].weight for signal in signals.states]),
-                np.array([tuning.inputs[signal].weight for signal in signals.inputs]),
+                np.array([tuned[f'{signal}.weight'] for signal in signals.states]),
+                np.array([tuned[f'{signal}.weight'] for signal in signals.inputs]),
                 plant.sample_period / system.seconds_per_time_unit, len(states) - 1)
     best, linear = optimum(task), linear_law(task)
     cost = cost_along(task, states, inputs[:-1])
     title = (f'{system.name}: {wanted}. Cost over that of the optimum: learned '
              f'{cost / best.cost:.4f}, linear {linear.cost / best.cost:.4f}')
     _plot(picture, title, run, {_LINEAR: linear, 'optimum': best}, signals, scenario,
-          model.states, tuning)
+          model.states, tuned)
     counts = summary(bag).counts
     result: dict[str, object] = {
         'unit': {signal: signals.states[signal] for signal in setpoints},
@@ -130,7 +131,7 @@ def _unit(signals: Signals, signal: str) -> str:
 
 
 def _plot(path: Path, title: str, run: Run, courses: Mapping[str, Course], signals: Signals,
-          scenario: Scenario, box: Coordinates, tuning: ControllerParameters) -> None:
+          scenario: Scenario, box: Coordinates, tuned: Mapping[str, Any]) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
     styles: dict[str, dict[str, Any]] = {
         _LINEAR: {'color': 'tab:red'},
@@ -162,13 +163,13 @@ def _plot(path: Path, title: str, run: Run, courses: Mapping[str, Course], signa
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
         for j, ((signal, unit), panel) in enumerate(zip(
                 signals.inputs.items(), panels[len(signals.states):], strict=True)):
-            limits = tuning.inputs[signal]
-            draw_limits(panel, (limits.min, limits.max), 'limits')
+            lowest, highest = tuned[f'{signal}.min'], tuned[f'{signal}.max']
+            draw_limits(panel, (lowest, highest), 'limits')
             panel.step(run.command_seconds, shown(run.commanded[signal], unit), where='post',
                        color='tab:green', linewidth=2.5, label='learned controller')
             for name, course in courses.items():
-                values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=limits.max),
-                                 limits.min, limits.max)
+                values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=highest),
+                                 lowest, highest)
                 panel.step(later[:-1], values, where='post', label=name, **styles[name])
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
         panels[0].set_title(title, fontsize=9)

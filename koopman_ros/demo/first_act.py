@@ -51,7 +51,7 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
 
     learned, linear = (read_run(scenario.wiring, bag) for bag in bags)
     plot(output / 'closed_loop.png', learned, linear, setpoint, scenario.step_time, model,
-         reactor.coolant_parameters())
+         reactor.coolant_limits())
     counts = summary(bags[0]).counts
     result: dict[str, object] = {
         'setpoint_kelvin': setpoint,

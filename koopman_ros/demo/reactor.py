@@ -10,7 +10,7 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo.loop import Scenario
 from koopman_ros.lifting import load
-from koopman_ros.parameters.controller import ControllerParameters, InputParameters, table_of
+from koopman_ros.parameters.controller import ControllerParameters, table_of
 from koopman_ros.parameters.table import ParameterTable
 from koopman_ros.resources import model_path
 from koopman_ros.units import to_celsius
@@ -31,14 +31,10 @@ def controller_table() -> ParameterTable[ControllerParameters]:
     return table_of(load(model_path(MODEL)))
 
 
-def controller_parameters() -> ControllerParameters:
-    """Return those of a controller that was given none."""
-    return controller_table().snapshot({})
-
-
-def coolant_parameters() -> InputParameters:
-    """Return what it is tuned by for the coolant."""
-    return controller_parameters().inputs[COOLANT_TEMPERATURE]
+def coolant_limits() -> tuple[float, float]:
+    """Return the range of the coolant in degC."""
+    rows = controller_table().rows
+    return rows[f'{COOLANT_TEMPERATURE}.min'].default, rows[f'{COOLANT_TEMPERATURE}.max'].default
 
 
 def constant(name: str) -> float:

@@ -16,7 +16,6 @@ from koopman_ros.arrays import Array
 from koopman_ros.bags import read_series
 from koopman_ros.demo.reactor import COOLANT_TEMPERATURE, TEMPERATURE
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.controller import InputParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, LIMIT
 from koopman_ros.units import conversion, NANOSECONDS, to_celsius, ZERO_CELSIUS
@@ -81,7 +80,7 @@ def read_run(wiring: Wiring, *bags: Path) -> Run:
 
 
 def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: float,
-         model: LiftedModel, limits: InputParameters) -> None:
+         model: LiftedModel, limits: tuple[float, float]) -> None:
     """
     Draw both runs: temperature with set-point and training range, coolant with limits.
 
@@ -94,7 +93,7 @@ def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: floa
         upper.step(np.array([0.0, step_time, end]) / 60.0,
                    np.array([start, setpoint, setpoint]) - ZERO_CELSIUS, 'k--', where='post',
                    linewidth=1.2, label='set-point')
-        draw_limits(lower, (limits.min, limits.max), 'coolant limits')
+        draw_limits(lower, limits, 'coolant limits')
         for name, run, digits, style in (
                 ('linearised', linear, '+.2f', {'color': 'tab:red'}),
                 ('learned', learned, '+.0e', {'color': 'tab:green', 'linewidth': 2.0})):
@@ -115,7 +114,7 @@ def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: floa
 
 def plot_retraining(path: Path, history: Run, phases: Sequence[tuple[str, float]],
                     setpoint: float, present: LiftedModel, learned: LiftedModel,
-                    limits: InputParameters) -> None:
+                    limits: tuple[float, float]) -> None:
     """
     Draw the story: temperature, coolant and error over plant time, phase by phase.
 
@@ -151,7 +150,7 @@ def plot_retraining(path: Path, history: Run, phases: Sequence[tuple[str, float]
                   title='The plant drifts, is recorded, and its controller learns it anew '
                   '(disturbance observer off)')
         upper.legend(loc='lower right', ncols=2, fontsize=8)
-        draw_limits(middle, (limits.min, limits.max), 'coolant limits')
+        draw_limits(middle, limits, 'coolant limits')
         middle.step(history.command_seconds / 60.0,
                     history.commanded[COOLANT_TEMPERATURE] - ZERO_CELSIUS, where='post',
                     color='tab:blue', linewidth=1.0, label='commanded')

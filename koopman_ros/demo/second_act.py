@@ -78,7 +78,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     learned = load(new_model)
     trained = json.loads(new_model.with_suffix('.json').read_text())
     plot_retraining(output / 'retraining.png', history, phases, setpoint, present, learned,
-                    reactor.coolant_parameters())
+                    reactor.coolant_limits())
     reload = phases[-1][1]
     result: dict[str, object] = {
         'setpoint_kelvin': setpoint,

@@ -538,7 +538,7 @@ class PlantView:
         found = own.values
         measured = found.get('measured', math.nan)
         setpoint = found.get('active_setpoints', math.nan)
-        limits = self._bounds(name, own, 'min', 'max')
+        limits = self._bounds(f'mpc.{name}', own, 'min', 'max')
         span = _span([own.training, self._bounds(name, own, 'sensor_min', 'sensor_max')],
                      [measured, setpoint, *(limits or ())])
         abnormal = 'no measurement' if silent or math.isnan(measured) else ''

@@ -239,12 +239,13 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     if not report.measurement.follows:
         yield ACTUATORS, (
             f'the {now.input} does not follow its command within '
-            f'{_listed(now, "tolerance")}: the observer goes by what is measured; check the '
-            'actuator and its limits')
+            f'{_listed(now, now.controller.tuning.tolerance)}: the observer goes by what is '
+            'measured; check the actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
-            f'the disturbance estimate is at its bound of {_listed(now, "max_disturbance")} '
-            f'of {now.input}: the plant is far from its model; retrain')
+            'the disturbance estimate is at its bound of '
+            f'{_listed(now, now.controller.tuning.max_disturbance)} of {now.input}: the plant is '
+            'far from its model; retrain')
 
 
 def _out_of_reach(now: Situation, target: TargetReport) -> str:
@@ -252,8 +253,7 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     if target.state is None or target.input is None:
         return ''
     states, limits = now.controller.model.states, now.controller.tuning.limits
-    # where every state has a set-point, that is where it leads
-    for name, wanted in () if target.state is target.setpoint else zip(
+    for name, wanted in zip(
             now.signals.controlled, target.setpoint.tolist(), strict=True):
         place, unit = states.names.index(name), now.signals.states[name]
         found, width = float(target.state[place]), 2.0 * states.half_widths[place]
@@ -261,8 +261,9 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
             return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
                     f'cannot be held within the range of the {now.input}: '
                     f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
-    for (name, unit), wanted, (low, high, _) in zip(
-            now.signals.inputs.items(), target.input.tolist(), limits.each, strict=True):
+    for (name, unit), wanted, low, high in zip(
+            now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
+            limits.upper.tolist(), strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
             return (f'the set-point would need the {stem(name, unit)} at '
@@ -271,9 +272,9 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     return ''
 
 
-def _listed(now: Situation, parameter: str) -> str:
-    return ', '.join(f'{getattr(tuned, parameter):g} {now.signals.inputs[name]}'
-                     for name, tuned in now.parameters.inputs.items())
+def _listed(now: Situation, values: Array) -> str:
+    return ', '.join(f'{value:g} {unit}' for unit, value in zip(
+        now.signals.inputs.values(), values.tolist(), strict=True))
 
 
 def labelled(names: Collection[str], text: str) -> list[str]:
@@ -337,7 +338,7 @@ def _figures(now: Situation) -> dict[str, object]:
         'missed measurements': now.counts.missed,
         'measurements rejected': now.counts.refused,
         **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
-           if 'mpc' in now.parameters.levels else {}),
+           if 'mpc' in now.parameters.tuning.levels else {}),
         **{f'{what} parts of {name}': count for what, counts in (
             ('late', now.assembler.late), ('missing', now.assembler.missing),
             ('doubled', now.assembler.doubled)) for name, count in counts.items()},

@@ -82,11 +82,12 @@ def out_of_range(trace: Trace) -> Iterator[str]:
     if not highest < on.highest:
         yield f'it reached {highest:g} {unit}, and is lost from {on.highest:g} {unit} on'
     for command in trace.commands:
-        for value, (name, tuned) in zip(
-                command.values, on.parameters.inputs.items(), strict=True):
-            if not tuned.min <= value <= tuned.max:
+        for value, name, low, high in zip(
+                command.values, on.parameters.inputs, on.each_input('min'), on.each_input('max'),
+                strict=True):
+            if not low <= value <= high:
                 yield (f'the command {name} = {value:g} {input_unit} at {command.seconds:.0f} s '
-                       f'is not within {tuned.min:g} to {tuned.max:g} {input_unit}')
+                       f'is not within {low:g} to {high:g} {input_unit}')
                 return
 
 

@@ -61,6 +61,11 @@ class Plant:
         """What its controllers are started with."""
         return self.table.snapshot({**self.wired, **self.tuned})
 
+    def each_input(self, name: str) -> list[float]:
+        """Return a parameter of each input, as people read it."""
+        values = self.table.values(self.parameters)
+        return [float(values[f'{signal}.{name}']) for signal in self.parameters.inputs]
+
     @property
     def _model(self) -> str:
         return str({**preset(self.system, 'controller'), **self.tuned}['model'])
@@ -110,7 +115,7 @@ class Plant:
     @cached_property
     def rate(self) -> float:
         """Fastest change of a command, 1/s."""
-        return max(item.rate_limit for item in self.parameters.inputs.values()) or math.inf
+        return max(self.each_input('rate_limit')) or math.inf
 
     def default(self, parameter: str) -> Any:
         """Return what a parameter of its controllers is when nobody has changed it."""

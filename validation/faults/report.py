@@ -145,7 +145,7 @@ def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
 
 def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
     on = trace.on
-    state, values = on.controlled[0], on.parameters.inputs[on.inputs[0]]
+    state = on.controlled[0]
     for axes, name, unit in zip((upper, lower), (state, on.inputs[0]), on.shown_units,
                                 strict=True):
         axes.set_ylabel(f'{name} [{unit}]')
@@ -158,7 +158,7 @@ def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
                color='black', linewidth=1.0, label='set-point')
     lower.plot([command.seconds for command in trace.commands],
                [command.values[0] for command in trace.commands], label='command')
-    reports.draw_limits(lower, (values.min, values.max), 'limits')
+    reports.draw_limits(lower, (on.each_input('min')[0], on.each_input('max')[0]), 'limits')
     for axes in (upper, lower):
         axes.axvspan(trace.begin, max(trace.end, trace.begin + 2.0), alpha=0.2,
                      color='tab:red', linewidth=0.0, label='fault')

@@ -113,17 +113,18 @@ def smoothed(records: Sequence[tuple[Array, Array]]) -> list[Array]:
     has the size of the noise, which third differences tell (discrepancy principle).
     """
     found = [values.copy() for _, values in records]
-    pieces, noise = [], []
+    pieces: list[tuple[Array, Array]] = []
+    sizes: list[float] = []
     for values, (time, _) in zip(found, records, strict=True):
         D = _third_differences(time)
         for y in values.T:
             size = _noise(D, y)
             if size > 1e-9 * float(np.ptp(y) or 1.0):
                 pieces.append((D, y))
-                noise.append(size)
+                sizes.append(size)
     if not pieces:
         return found
-    lengths = np.array([len(y) for _, y in pieces])
+    lengths, noise = np.array([len(y) for _, y in pieces]), np.array(sizes)
     starts = np.cumsum(lengths) - lengths
     # all pieces as one signal, whose differences across the ends of pieces count for nothing
     joined = np.concatenate([y for _, y in pieces])

@@ -208,7 +208,7 @@ CASES = (
               partial(_without_the_cold, node='plant', usual=-20.0), worst=WINDUP),
     _constant('coolant-limited', f'the controller may not command less than {STUCK_AT:g} degC, '
               '15 min', partial(_without_the_cold, node='controller',
-                                usual=reactor.coolant_parameters().min),
+                                usual=reactor.coolant_limits()[0]),
               worst=WINDUP),
     _constant('noise', 'noise of 0.1 K, for good',
               partial(changed_for_good, parameters={'temperature.noise': 0.1}), band=0.5,

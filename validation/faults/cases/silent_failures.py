@@ -70,7 +70,7 @@ def _without_news(loop: FaultHarness, make: Maker) -> None:
     """Let measurements come without a new stamp: the inputs are held, then go to safe values."""
     altered(loop, make, 150.0)
     _expect_error(loop)
-    safe = [tuned.safe for tuned in loop.on.parameters.inputs.values()]
+    safe = loop.on.each_input('safe')
     last = [command.values for command in loop.trace.commands
             if command.seconds <= loop.trace.end][-1]
     loop.expect(max(abs(a - b) for a, b in zip(last, safe, strict=True)) < 1e-6,
@@ -94,7 +94,7 @@ def _stray(loop: FaultHarness) -> None:
     loop.run_for(2.0 * on.period)
     with loop.fault():
         for end in ('max', 'min'):
-            loop.by_hand(*(getattr(tuned, end) for tuned in on.parameters.inputs.values()))
+            loop.by_hand(*on.each_input(end))
             until = loop.now + 6.0
             while loop.now < until:
                 loop.run_for(on.period)
@@ -153,7 +153,7 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
 def _activated_again(loop: FaultHarness) -> None:
     """Deactivate and activate a controller that commands the lowest inputs by hand."""
     loop.ros.set_bool('controller/set_automatic', False)
-    lowest = tuple(tuned.min for tuned in loop.on.parameters.inputs.values())
+    lowest = tuple(loop.on.each_input('min'))
     loop.by_hand(*lowest)
     loop.wait(lambda: loop.trace.commands[-1].values == lowest, 'the inputs are not commanded')
     with loop.fault():
