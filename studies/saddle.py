@@ -26,7 +26,7 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.simulate import Change, Simulation
-from koopman_ros.jobs.backends import Backend, backend_of
+from koopman_ros.execution import Backend, backend_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters

@@ -24,9 +24,9 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.simulate import Simulation
-from koopman_ros.jobs.backends import Backend, backend_of, Tell
+from koopman_ros.execution import Backend, backend_of, Tell
 from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
-from koopman_ros.learning.starts import Recipe
+from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
@@ -55,7 +55,7 @@ EPISODES, DURATION = 400, 0.1  # in min
 # enough.
 LIFT = Growth(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
               pre_feedback=0.05, other_whitenings=(10.0,))
-RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift((16,)), 'free lift': LIFT}
+RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift(16), 'free lift': LIFT}
 STARTS = 2
 UNLIMITED = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
 # With these the laws are compared, also from where they may lose the plant.

@@ -34,10 +34,11 @@ LONGEST = ('test_studies', 'test_benchmarks', 'test_browser', 'test_learning', '
            'test_controller_process', 'test_examples', 'test_plant_node', 'test_player',
            'test_install_tree', 'test_experiment_tanks', 'test_demo',
            'test_several_states', 'test_recording', 'test_parameter_ends',
-           'test_grey', 'test_panel', 'test_retraining_tanks', 'test_laws',
-           'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_retrain',
-           'test_observer', 'test_fleet', 'test_kalman', 'test_training',
-           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom', 'test_hidden',
+           'test_grey_box', 'test_panel', 'test_retraining_tanks', 'test_laws',
+           'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_pipeline',
+           'test_observer', 'test_backends', 'test_fleet', 'test_kalman', 'test_training',
+           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom',
+           'test_unmeasured_states',
            'test_least_squares', 'test_law_check')
 
 

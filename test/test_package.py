@@ -32,16 +32,14 @@ ALLOWED = {
     'lifting': set(),
     'bags': set(),
     'estimation': {'lifting'},
-    'control': {'estimation', 'jobs', 'lifting'},
-    'learning': {'control', 'jobs', 'lifting'},
-    'identification': {'jobs', 'learning', 'lifting', 'plants'},
-    'retraining': {'bags', 'control', 'identification', 'jobs', 'learning', 'lifting', 'plants'},
+    'control': {'estimation', 'execution', 'lifting'},
+    'learning': {'bags', 'control', 'execution', 'lifting', 'plants'},
     'replay': {'bags', 'control', 'lifting', 'parameters'},
-    'parameters': {'control', 'estimation', 'jobs', 'lifting', 'plants'},
-    'jobs': set(),
-    'panel': {'bags', 'jobs', 'lifting', 'parameters', 'replay'},
-    'ros': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay'},
-    'nodes': {'bags', 'control', 'jobs', 'lifting', 'panel', 'parameters', 'plants', 'replay',
+    'parameters': {'control', 'estimation', 'execution', 'lifting', 'plants'},
+    'execution': set(),
+    'panel': {'bags', 'execution', 'lifting', 'parameters', 'replay'},
+    'ros': {'bags', 'control', 'execution', 'lifting', 'parameters', 'plants', 'replay'},
+    'nodes': {'bags', 'control', 'execution', 'lifting', 'panel', 'parameters', 'plants', 'replay',
               'ros'},
     'testing': {'ros'},
     'demo': {'bags', 'control', 'learning', 'lifting', 'parameters', 'plants', 'ros', 'testing'},
@@ -219,10 +217,13 @@ def test_nothing_installed_imports_what_is_not_and_few_packages_torch() -> None:
     users, compiled = set(), set()
     for path in ROOT.glob('koopman_ros/**/*.py'):
         roots = {name.split('.')[0] for name in _imports(path)}
-        assert not roots & {'studies', 'benchmarks', 'examples', 'support', 'test'}, path
-        users |= {path.parent.name} if 'torch' in roots else set()
-        compiled |= {path.parent.name} if roots & {'daqp', 'numba'} else set()
-    assert users == {'identification', 'learning'}
-    assert compiled == {'mpc'}
+    'control': {'estimation', 'execution', 'lifting'},
+    'learning': {'bags', 'control', 'execution', 'lifting', 'plants'},
+    'replay': {'bags', 'control', 'lifting', 'parameters'},
+    'parameters': {'control', 'estimation', 'execution', 'lifting', 'plants'},
+    'execution': set(),
+    'panel': {'bags', 'execution', 'lifting', 'parameters', 'replay'},
+    'ros': {'bags', 'control', 'execution', 'lifting', 'parameters', 'plants', 'replay'},
+    'nodes': {'bags', 'control', 'execution', 'lifting', 'panel', 'parameters', 'plants', 'replay',
     # and every package has its rule
     assert {path.parent.name for path in ROOT.glob('koopman_ros/*/__init__.py')} == set(ALLOWED)

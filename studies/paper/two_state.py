@@ -57,7 +57,7 @@ NARROW = {
 }
 WIDE_RECIPE = learning.Growth(3, hidden_first=16, max_iterations=600)
 NARROW_RECIPE = learning.Growth(3)
-PAPER_RECIPE = learning.Algorithm1(3, identity=True, hidden=(16,), max_iterations=100)
+PAPER_RECIPE = learning.Algorithm1(3, identity=True, hidden=16, max_iterations=100)
 STARTS = 2
 SYSTEM = two_state_example()
 
