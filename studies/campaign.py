@@ -17,7 +17,7 @@ from typing import Any, TypeAlias, TypeVar
 from tqdm import tqdm
 
 from koopman_ros import __version__
-from koopman_ros.jobs.backends import Backend, backend_of, Here, SchedulerLost, Tell, WorkerLost
+from koopman_ros.execution import Backend, backend_of, SchedulerLost, Serial, Tell, WorkerLost
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reports import write_figures
 
@@ -72,7 +72,7 @@ def over(backend: Backend | None, function: Callable[[Key], Found], keys: Iterab
          ) -> dict[Key, Found]:
     """Return the results of a function by key; `backend` is this process by default."""
     by_name = {str(key): key for key in keys}
-    return {by_name[name]: found for name, found in (backend or Here()).run(
+    return {by_name[name]: found for name, found in (backend or Serial()).run(
         _called, by_name, shared=function)}
 
 

@@ -8,7 +8,7 @@ import sys
 import time
 
 from koopman_ros import __version__
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 from koopman_ros.reports import write_figures
 from studies.campaign import read_options
 from studies.robustness.report import write_report

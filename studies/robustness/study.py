@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.control import Simulation
-from koopman_ros.jobs.backends import Backend
+from koopman_ros.execution import Backend
 from studies.campaign import over
 from studies.robustness import disturbances, narrow, stability
 from studies.robustness.loop import REACTOR, reactor_controller, START

@@ -10,6 +10,7 @@ from typing import Any
 import warnings
 
 import casadi
+from koopman_ros.learning.levenberg_marquardt import normal_equations
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -19,7 +20,6 @@ from benchmarks import ipopt, loop, planning, recording, solvers, training
 from benchmarks.__main__ import main
 from benchmarks.problems import build
 from benchmarks.sqp import Problem, solver_of, Sqp
-from koopman_ros.learning.levenberg_marquardt import normal_equations
 from studies.equations import EQUATIONS
 from studies.general.learners import LEARNERS
 from support.tensors import assert_close

@@ -13,7 +13,7 @@ import pytest
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.record import read_record
-from support.long_records import bags_of, source, task
+from support.long_records import bags_of, drift_error, source, task
 from support.long_records import SAMPLES as LENGTH
 from support.quick_retraining import quick_retraining
 

@@ -21,7 +21,6 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo import reactor
-from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.trainer import TrainerNode

@@ -13,6 +13,7 @@ import numpy as np
 from koopman_ros.arrays import Array
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
 from koopman_ros.learning import TrainingTask
+from koopman_ros.learning.identification import Drift
 from koopman_ros.learning.record import Source
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.solvers import runge_kutta_step
