@@ -7,8 +7,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-import pytest
-
 import koopman_ros
 
 
