@@ -176,7 +176,7 @@ def test_plugins_of_a_sourced_ros_are_left_out(tmp_path: Path) -> None:
         (about / 'entry_points.txt').write_text(f'[pytest11]\n{name} = hooks\n')
     paths = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get('PYTHONPATH'))))
     done = subprocess.run(
-        [sys.executable, '-m', 'pytest', '-q', '--collect-only', 'test/test_values.py'], cwd=ROOT,
+        [sys.executable, '-m', 'pytest', '-q', '--collect-only', 'test/test_units.py'], cwd=ROOT,
         env={**os.environ, 'PYTHONPATH': paths}, capture_output=True, text=True, timeout=240,
         check=False)
     assert done.returncode == 0, done.stdout + done.stderr

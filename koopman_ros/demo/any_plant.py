@@ -86,8 +86,8 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
         run_loop(scenario, bag, logs, table.show)
 
     model = load(model_path(str(preset(name, 'controller')['model'])))
-    table = table_of(model, {'system': name})
-    tuned = table.values(table.snapshot({}))
+    rows = table_of(model, {'system': name}).rows
+    tuned = {parameter: row.default for parameter, row in rows.items()}
     run = read_run(wiring, bag)
     first = round(told.step_time / plant.sample_period)
     states, inputs = (np.stack(list(of.values()), axis=1)[first:]
