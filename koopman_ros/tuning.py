@@ -130,14 +130,19 @@ class Tuning:
     max_gain: float = parameter(
         1000.0, 'Largest norm of a Riccati gain, in scaled coordinates, that a law may use.', '',
         0.0, 1e9, open_minimum=True)
-    # the root of the machine's precision; `ros2 param load` reads 1e-8 as a text
-    max_riccati_residual: float = parameter(
-        1.5e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
-        0.0, 1.0, open_minimum=True)
+    # a residual itself, as 1e-08, is a text to `ros2 param load`
+    min_riccati_digits: float = parameter(
+        8.0, 'Decimal digits to which a Riccati equation must be solved for a law to act.', '',
+        0.0, 15.0)
     #: own parameters of laws and estimators, by name
     plugins: Mapping[str, Any] = plugin_parameters()
 
     __repr__ = brief
+
+    @property
+    def max_riccati_residual(self) -> float:
+        """The largest relative residual of a Riccati equation with which a law may act."""
+        return 10.0 ** -self.min_riccati_digits
 
     def of_plugin(self, name: str, kind: type[Any]) -> Any:
         """Return the own parameters of a plug-in by its name; those of `kind` by default."""

@@ -51,7 +51,7 @@ def running(shared_ros: Harness) -> Harness:
     ({'temperature.topic': 'elsewhere'}, 'read-only'),
     ({'validity_margin': 2.0}, 'validity_margin = 2.0 must be at most linear_margin = '
      f'{TABLE.rows["linear_margin"].default}: change the other one first'),
-    ({'max_riccati_residual': 2.0}, 'max_riccati_residual = 2.0 must be in (0, 1]'),
+    ({'min_riccati_digits': 16.0}, 'min_riccati_digits = 16.0 must be in [0, 15]'),
 ])
 def test_change_that_does_not_fit_is_refused_with_the_reason(
         running: Harness, change: dict[str, Any], words: str) -> None:
@@ -76,8 +76,7 @@ def test_two_limits_that_cross_on_the_way_change_together(running: Harness) -> N
     ({'max_gain': 7.0, 'coolant_temperature.max': 2e9},
      'coolant_temperature.max = 2000000000.0 degC must be in '),
     # equal in K
-    *(({f'{name}min': 20.0, f'{name}max': 20.00000000000001},
-       f'{name}min = 20.0 degC must be below {name}max = ')
+    *(({f'{name}min': 20.0, f'{name}max': 20.00000000000001}, f'{name}min = 20.0 degC must be ')
       for name in ('coolant_temperature.', 'temperature.sensor_'))])
 def test_atomic_change_is_refused_as_a_whole(
         running: Harness, changes: dict[str, float], words: str) -> None:
@@ -103,7 +102,7 @@ def test_every_parameter_is_described_with_unit_and_range(running: Harness) -> N
         found = [*described[name].floating_point_range, *described[name].integer_range]
         assert found == ([limits] if (limits := range_of(row)) else [])
     lowest, weight = (described[f'coolant_temperature.{name}'] for name in ('min', 'weight'))
-    assert lowest.description.endswith(' [degC]')
+    assert lowest.description == 'Smallest command. [degC]'
     assert weight.additional_constraints == '(0, 1e+12] 1/K^2'
 
 

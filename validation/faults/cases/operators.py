@@ -67,7 +67,7 @@ _BAD: tuple[dict[str, Any], ...] = (
     {f'{_COOLANT}.weight': 0.0}, {f'{_COOLANT}.weight': math.inf}, {f'{_COOLANT}.weight': 'much'},
     {f'{_COOLANT}.min': 60.0}, {f'{_COOLANT}.max': -10.0}, {f'{_COOLANT}.max': math.nan},
     {f'{_COOLANT}.rate_limit': -1.0}, {'temperature.setpoint_ramp': -math.inf}, {'max_gain': 0.0},
-    {'max_riccati_residual': -1.0}, {'measurement_timeout': math.nan},
+    {'min_riccati_digits': -1.0}, {'measurement_timeout': math.nan},
     {'model': ''}, {'model': '/nowhere/lift.safetensors'}, {'model': 3.0})
 
 
