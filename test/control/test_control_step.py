@@ -13,7 +13,6 @@ from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, St
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
 from koopman_ros.reasons import Code
 from koopman_ros.units import NANOSECONDS as SECOND
-from studies.paper.optimal_control import exact_two_state_model
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 
 NOW = 1_785_000_000 * SECOND

@@ -22,6 +22,8 @@ from koopman_ros.estimation import (
 )
 from koopman_ros.plants import Actuator, two_state_reactor
 from koopman_ros.signals import Outputs
+from studies.robustness.disturbances import CHANGED
+from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,
     EPOCH,
@@ -38,8 +40,6 @@ from support.closed_loops import (
     START,
     UPPER,
 )
-from studies.robustness.disturbances import CHANGED
-from studies.robustness.loop import changed_reactor
 
 MODEL = shipped('reactor_nz4')
 
