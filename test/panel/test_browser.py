@@ -31,7 +31,7 @@ PHONE = (390, 844)
 # an experiment of a few seconds, and a training
 TRAINER = {
     'model_class': 'polynomial', 'training_starts': 1, 'record_at_start': False,
-    'min_free_disk': 0.0, 'experiment_on': 'setpoint', 'experiment_length': 900.0,
+    'min_free_disk': 0.0, 'gate_condition': 1e9, 'experiment_on': 'setpoint', 'experiment_length': 900.0,
     'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
     'temperature.setpoint_min': 40.0, 'temperature.setpoint_max': 50.0}
 MEASUREMENTS = 420  # that are learned from
