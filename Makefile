@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 # changed its mind about which of them governs that).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
+# The predictive law, which the first process would compile otherwise, a quarter of a minute.
+COMPILE := $(BIN)/python -c 'import koopman_ros.control.mpc.planner'
 # Where the environment forbids to keep byte code, each process would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 # All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
@@ -34,6 +36,7 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,test,bench]'
+	$(COMPILE)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
@@ -46,10 +49,12 @@ $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 
 $(VENV)/saddle.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,mpc]'
+	$(COMPILE)
 	@touch $@
 
 $(VENV)/mpc.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,mpc]'
+	$(COMPILE)
 	@touch $@
 
 $(VENV)/panel.stamp: setup.py $(LOCK) $(VENV)/run.stamp
@@ -61,7 +66,8 @@ $(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
 	@touch $@
 
 $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
-	$(INSTALL) --editable '.[ros,demo,train,bench,fast]'
+	$(INSTALL) --editable '.[ros,demo,train,bench]'
+	$(COMPILE)
 	@touch $@
 
 demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, to be run from a browser)

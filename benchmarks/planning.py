@@ -143,9 +143,9 @@ def _course(case: Case, controller: Controller, samples: int
 def _problem(case: Case, controller: Controller) -> Problem:
     """Return what the law plans, with the plant's own equations."""
     model, law = controller.model, controller.levels['mpc'].law
-    assert isinstance(law, RecedingHorizon)
+    assert isinstance(law, RecedingHorizon) and law.planner is not None
     interval = case.period / case.system.seconds_per_time_unit
-    lengths = law.lengths(interval)
+    lengths = law.planner.grid(case.period).lengths
     if len(lengths) != INTERVALS or not np.ptp(lengths) <= _UNIFORM * interval:
         raise ValueError(f'{case.plant}: the horizon has {len(lengths)} intervals of '
                          f'{lengths.min():g} to {lengths.max():g}, must be {INTERVALS} samples')

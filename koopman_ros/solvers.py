@@ -129,11 +129,11 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     more[:, n:] *= -1.0
     more += 2.0 * np.eye(2 * n)
     size = (_size(A) + _size(B)) * interval
-    H: Array = np.linalg.solve(more, less)
+    H = np.asarray(np.linalg.solve(more, less), dtype=np.float64)
     P = scale * _stable_graph(H, _ROUNDING * min(size, 1.0))
     P_step, P_push = P @ step, P @ push
     right = N.T + push.T @ P_step + P_push.T
-    K: Array = np.linalg.solve(R_d + push.T @ P_push, right)
+    K = np.asarray(np.linalg.solve(R_d + push.T @ P_push, right), dtype=np.float64)
     # the equation less P on both sides, whose terms shrink with the interval
     square, feedback = step.T @ P_step, right.T @ K
     terms = _size(Q_d) + 2.0 * _size(P_step) + _size(square) + _size(feedback)
@@ -213,7 +213,7 @@ def _stable_graph(H: Array, least: float = 0.0) -> Array:
     _, stable, real, _, vectors, _, info = dgees(_decays, H, sort_t=1)
     if info != 0 or stable != n or not (real[:n] < -max(least, _AXIS_MARGIN * size)).all():
         raise np.linalg.LinAlgError('there is no stable subspace of full size')
-    P: Array = np.linalg.solve(vectors[:n, :n].T, vectors[n:, :n].T)
+    P = np.asarray(np.linalg.solve(vectors[:n, :n].T, vectors[n:, :n].T), dtype=np.float64)
     return 0.5 * (P + P.T)
 
 

@@ -54,7 +54,7 @@ class SensorLimits:
         'measured', 0.0, 'Change between two measurements that noise alone may bring; 0: any.',
         name='max_jump', none=ANY)
     frozen_timeout: float = parameter(
-        0.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
+        20.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
         'than half of max_jump; 0: for ever.', 's', 0.0, 86400.0)
 
 
@@ -130,8 +130,9 @@ class Tuning:
     max_gain: float = parameter(
         1000.0, 'Largest norm of a Riccati gain, in scaled coordinates, that a law may use.', '',
         0.0, 1e9, open_minimum=True)
+    # the root of the machine's precision; `ros2 param load` reads 1e-8 as a text
     max_riccati_residual: float = parameter(
-        1e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
+        1.5e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
         0.0, 1.0, open_minimum=True)
     #: own parameters of laws and estimators, by name
     plugins: Mapping[str, Any] = plugin_parameters()

@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 
 from koopman_ros import plants
+from koopman_ros.control.laws import Law
 from koopman_ros.lifting import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.plugs import own_code, plug, plugged
+from koopman_ros.plugs import own_code, plug, plug_in
 from koopman_ros.resources import model_path
+from koopman_ros.tuning import Tuning
 
 MODULE = """
 import sys
@@ -25,14 +27,16 @@ class Raises:
     def __init__(self, *_, **__): raise KeyError('bug')
 class NoLaw:
     def __init__(self, *_, **__): pass
-class HalfLaw:
-    model = 5
-    def __init__(self, *_): pass
-    def compute(self, *_): pass
+from koopman_ros.control.laws import Law
+from koopman_ros.estimation import Estimator
+class HalfLaw(Law): pass
+class HalfEstimator(Estimator):
+    def predict(self, estimate, u, seconds): pass
 def nothing(*_, **__): return None
 number = 3
 """
-NAMES = ('OneArgument', 'Exits', 'Raises', 'NoLaw', 'HalfLaw', 'nothing', 'number', 'missing')
+NAMES = ('OneArgument', 'Exits', 'Raises', 'NoLaw', 'HalfLaw', 'HalfEstimator', 'nothing',
+         'number', 'missing')
 MODULES = {'exits': 'import sys\nsys.exit(3)', 'stops': 'raise GeneratorExit',
            'broken': 'def', 'fails': '1 / 0'}
 
@@ -59,6 +63,16 @@ def test_law_or_estimator_that_is_none_is_refused(parameter: str, name: str) -> 
 
 
 @pytest.mark.usefixtures('modules')
+@pytest.mark.parametrize(('parameter', 'value', 'missing'), [
+    ('levels', ('own_plugs:HalfLaw',), 'lacks compute'),
+    ('estimator', 'own_plugs:HalfEstimator', 'lacks correct, restart')])
+def test_a_refusal_names_the_methods_that_a_class_lacks(
+        parameter: str, value: object, missing: str) -> None:
+    table = table_of(load(model_path('reactor_nz4')))
+    assert missing in table.check(table.snapshot({parameter: value}))
+
+
+@pytest.mark.usefixtures('modules')
 @pytest.mark.parametrize('name', ['Exits', 'Raises', 'nothing'])
 def test_plant_that_cannot_be_built_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f'the plant {name} '):
@@ -76,13 +90,16 @@ def test_an_interrupt_is_none_of_its_failures(
     (tmp_path / 'plug_interrupted.py').write_text('raise KeyboardInterrupt')
     monkeypatch.syspath_prepend(tmp_path)
 
-    def interrupted() -> Any:
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
         plug('plug_interrupted:x', 'law', {})
+    class Interrupted(Law):
+        def compute(self, *_: Any) -> Any: ...
+
+        def __init__(self, *_: Any) -> None:
+            raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        plugged('a', 'law', {'a': interrupted}, (), ())
+        plug_in('a', 'law', {'a': Interrupted}, Law, Tuning())
 
 
 def test_names_of_code_in_a_value() -> None:

@@ -27,7 +27,7 @@ class MessageDefinitionError(LookupError):
 
 @dataclass(frozen=True)
 class MessageDefinition:
-    """What a reader needs to know of a message type to decode it without ROS."""
+    """A message type as a reader without ROS needs it."""
 
     type_name: str  #: full name, e.g. ``sensor_msgs/msg/Temperature``
     text: str  #: the definition followed by those of all its fields (encoding ``ros2msg``)
@@ -50,39 +50,28 @@ def message_definition(type_name: str) -> MessageDefinition:
         raise MessageDefinitionError(
             f'message type {type_name!r} is not a full name: write {package}/msg/{name}')
     text = _read(package, f'{name}.msg', type_name)
-    full_text = text + _dependencies(text, package, seen=set())
-    return MessageDefinition(type_name, full_text, _type_hash(package, name))
+    description = json.loads(_read(package, f'{name}.json', type_name))
+    for entry in description.get('type_hashes', ()):
+        if entry['type_name'] == type_name:
+            return MessageDefinition(type_name, text + _dependencies(text, package, set()),
+                                     entry['hash_string'])
+    raise MessageDefinitionError(
+        f'the type description {name}.json of {package} carries no hash of {type_name}: '
+        f'reinstall the package {_debian(package)}')
 
 
 def _dependencies(text: str, package: str, seen: set[str]) -> str:
     """Return the delimited definitions of all field types of `text` that are not in `seen`."""
     parts = []
-    for dependency in _field_types(text, package):
-        if dependency in seen:
+    for kind in sorted(kind if '/' in kind else f'{package}/{kind}'
+                       for kind in {*_FIELD_TYPE.findall(text)} - _PRIMITIVES):
+        if kind in seen:
             continue
-        seen.add(dependency)
-        inner_package, name = _split(dependency)
-        inner = _read(inner_package, f'{name}.msg', dependency)
-        parts.append(_DELIMITER.format(name=dependency) + inner)
-        parts.append(_dependencies(inner, inner_package, seen))
+        seen.add(kind)
+        inner_package, name = _split(kind)
+        inner = _read(inner_package, f'{name}.msg', kind)
+        parts += [_DELIMITER.format(name=kind), inner, _dependencies(inner, inner_package, seen)]
     return ''.join(parts)
-
-
-def _field_types(text: str, package: str) -> list[str]:
-    """Return the non-primitive field types of a definition as 'package/Name', sorted."""
-    found = {match for match in _FIELD_TYPE.findall(text) if match not in _PRIMITIVES}
-    return sorted(name if '/' in name else f'{package}/{name}' for name in found)
-
-
-def _type_hash(package: str, name: str) -> str:
-    type_name = f'{package}/msg/{name}'
-    description = json.loads(_read(package, f'{name}.json', type_name))
-    for entry in description.get('type_hashes', ()):
-        if entry['type_name'] == type_name:
-            return entry['hash_string']
-    raise MessageDefinitionError(
-        f'the type description {name}.json of {package} carries no hash of {type_name}: '
-        f'reinstall the package {_debian(package)}')
 
 
 def _split(type_name: str) -> tuple[str, str]:

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import heapq
 import os
 from pathlib import Path
+from typing import NamedTuple
 import warnings
 
-from mcap.records import Channel
-from mcap.summary import Summary
+from mcap.records import Channel, Schema
 from rosbags.interfaces import Qos
 
 from koopman_ros.bags.bag_files import locate
-from koopman_ros.bags.decoding import BagMessage, Decoders, type_name, UndecodableError
+from koopman_ros.bags.decoding import BagMessage, Decoders, UndecodableError
 from koopman_ros.bags.mcap_file import BagReadError, opened, stored_messages, summary_section
 from koopman_ros.bags.metadata import parse_offered_qos
 from koopman_ros.wire import full_type_name
@@ -99,19 +99,21 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
     empty or not MCAP.
     """
     files, complete = locate(path, recover=True)
-    parts = [_indexed_summary(file) or _scanned_summary(file) for file in files]
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
-    offered_qos: dict[str, tuple[Qos, ...]] = {}
-    for part in parts:
-        counts.update(part.counts)
-        types.update(part.types)
-        offered_qos.update(part.offered_qos)
-    starts = [part.start_ns for part in parts if part.start_ns is not None]
-    ends = [part.end_ns for part in parts if part.end_ns is not None]
-    return BagSummary(dict(counts), types, offered_qos, min(starts, default=None),
-                      max(ends, default=None),
-                      complete=complete and all(part.complete for part in parts))
+    offers: dict[str, tuple[Qos, ...]] = {}
+    times_ns: list[int] = []
+    for file in files:
+        content = _indexed(file) or _scanned(file)
+        complete = complete and content.complete
+        times_ns += content.times_ns
+        for channel, schema, count in content.channels:
+            counts[channel.topic] += count
+            types[channel.topic] = full_type_name(schema.name) if schema else ''
+            if offered := parse_offered_qos(channel.metadata.get('offered_qos_profiles', '')):
+                offers[channel.topic] = offered
+    return BagSummary(dict(counts), types, offers, min(times_ns, default=None),
+                      max(times_ns, default=None), complete)
 
 
 def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
@@ -133,64 +135,50 @@ def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bo
                 yield decoders.undecoded(stored)
 
 
-def _indexed_summary(file: Path) -> BagSummary | None:
-    """Return the summary at the end of a closed file, None where a part of it is left out."""
+class _Content(NamedTuple):
+    """Channels with their number of messages, first and last log time [ns], of one file."""
+
+    channels: list[tuple[Channel, Schema | None, int]]
+    times_ns: list[int]
+    complete: bool
+
+
+def _indexed(file: Path) -> _Content | None:
+    """
+    Return the content by the summary at the end of a closed file, None where that is incomplete.
+
+    The MCAP specification leaves channels, schemas and counts to the writer; an empty map of
+    counts means that they are not available.
+    """
     with opened(file) as stream:
-        content = summary_section(stream)
-    if content is None or content.statistics is None or not _is_whole(content):
+        found = summary_section(stream)
+    if found is None or (statistics := found.statistics) is None:
         return None
-    statistics = content.statistics
-    counts: Counter[str] = Counter()
-    types = {}
-    for channel in content.channels.values():
-        schema = content.schemas.get(channel.schema_id)
-        counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
-        types[channel.topic] = full_type_name(schema.name) if schema else ''
-    empty = statistics.message_count == 0
-    return BagSummary(
-        dict(counts), types, _offered_qos(content.channels.values()),
-        None if empty else statistics.message_start_time,
-        None if empty else statistics.message_end_time, complete=True)
+    counts, schemas = statistics.channel_message_counts, {0: None, **found.schemas}
+    if (not counts.keys() <= found.channels.keys()
+            or sum(counts.values()) != statistics.message_count
+            or any(channel.schema_id not in schemas for channel in found.channels.values())):
+        return None
+    return _Content(
+        [(channel, schemas[channel.schema_id], counts.get(channel.id, 0))
+         for channel in found.channels.values()],
+        [statistics.message_start_time, statistics.message_end_time]
+        if statistics.message_count else [], complete=True)
 
 
-def _is_whole(content: Summary) -> bool:
-    """
-    Check that a summary section has all channels with messages, their schemas and their counts.
-
-    The MCAP specification leaves each of them to the writer; an empty map of counts means that
-    they are not available.
-    """
-    statistics = content.statistics
-    return (statistics is not None
-            and statistics.channel_message_counts.keys() <= content.channels.keys()
-            and sum(statistics.channel_message_counts.values()) == statistics.message_count
-            and all(channel.schema_id in content.schemas or channel.schema_id == 0
-                    for channel in content.channels.values()))
-
-
-def _scanned_summary(file: Path) -> BagSummary:
-    """Return the summary of all complete records, counted message by message."""
-    counts: Counter[str] = Counter()
-    types: dict[str, str] = {}
-    channels: dict[str, Channel] = {}
-    start_ns = end_ns = None
+def _scanned(file: Path) -> _Content:
+    """Return the content by all complete records, counted message by message."""
+    channels: dict[int, tuple[Channel, Schema | None]] = {}
+    counts: Counter[int] = Counter()
+    first = last = None
     complete = True
     try:
-        for stored in stored_messages(file, recover=False):
-            topic, time_ns = stored.channel.topic, stored.log_time_ns
-            counts[topic] += 1
-            types[topic] = type_name(stored)
-            channels[topic] = stored.channel
-            start_ns = time_ns if start_ns is None else min(start_ns, time_ns)
-            end_ns = time_ns if end_ns is None else max(end_ns, time_ns)
+        for schema, channel, time_ns, _, _ in stored_messages(file, recover=False):
+            channels[channel.id] = channel, schema
+            counts[channel.id] += 1
+            first = time_ns if first is None else min(first, time_ns)
+            last = time_ns if last is None else max(last, time_ns)
     except BagReadError:
         complete = False
-    return BagSummary(
-        dict(counts), types, _offered_qos(channels.values()), start_ns, end_ns, complete)
-
-
-def _offered_qos(channels: Iterable[Channel]) -> dict[str, tuple[Qos, ...]]:
-    """Return the offers on each topic, as far as they were kept and can be read."""
-    offers = {channel.topic: parse_offered_qos(channel.metadata.get('offered_qos_profiles', ''))
-              for channel in channels}
-    return {topic: offered for topic, offered in offers.items() if offered}
+    return _Content([(*found, counts[number]) for number, found in channels.items()],
+                    [] if first is None or last is None else [first, last], complete)

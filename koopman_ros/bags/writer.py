@@ -3,14 +3,13 @@
 
 """Crash-safe recording: serialized messages into a bag that rosbag2 and MCAP readers open."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
 import math
 import operator
 import os
 from pathlib import Path
-import time
 from typing import Self
 
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
@@ -22,9 +21,6 @@ from koopman_ros.bags import metadata
 from koopman_ros.bags.message_definitions import MessageDefinition
 from koopman_ros.units import NANOSECONDS
 
-_COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD,
-                 'lz4': CompressionType.LZ4}
-_MAX_TIME_NS = 2**63 - 1
 _SEQUENCE_MODULUS = 2**32
 # A message in a chunk beside its data: opcode, length, channel, sequence, two times.
 _MESSAGE_HEAD_BYTES = 31
@@ -48,52 +44,29 @@ class BagWriter:
 
     `compression` of the chunks is 'none', 'zstd' or 'lz4'. The default is that of rosbag2: every
     reader can open it, and there is no codec between a damaged file and its messages. With 'zstd'
-    the bag of a control loop has about a third of the size. A chunk ends when it exceeds
-    `max_chunk_bytes`, or with the first `write` after it has been open for `max_chunk_age_s` [s of
-    `clock`] (0: after each message, infinity: never). A process that is killed loses no more than
-    the open chunk; a recorder whose topics may fall silent calls `flush` from a timer. A cut file
-    is read by `read_messages` with `recover`, and by mcap's `NonSeekingReader` with
+    the bag of a control loop has about a third of the size. A process that is killed loses no more
+    than the open chunk, which ends with :meth:`flush`, or beyond `max_chunk_bytes`. A cut file is
+    read by `read_messages` with `recover`, and by mcap's `NonSeekingReader` with
     `log_time_order=False` until that raises `EndOfFile`.
 
     Not thread-safe: one thread at a time may use a writer. Raises FileExistsError if `path`
-    exists, ValueError for an option out of range and for a single file that is to be split.
-    An error in the background is raised by the next `flush` or `close`.
+    exists, ValueError for a single file that is to be split. An error in the background is raised
+    by the next `flush` or `close`.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        compression: str = 'none',
-        max_file_bytes: int = 0,
-        max_file_duration_s: float = 0.0,
-        max_chunk_bytes: int = 2**20,
-        max_chunk_age_s: float = 1.0,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        if compression not in _COMPRESSIONS:
-            raise ValueError(
-                f'compression {compression!r} is not one of {", ".join(_COMPRESSIONS)}')
-        for name, value, least, most in (
-                ('max_file_bytes', max_file_bytes, 0, math.inf),
-                ('max_file_duration_s', max_file_duration_s, 0, _MAX_TIME_NS / NANOSECONDS),
-                ('max_chunk_bytes', max_chunk_bytes, 1, math.inf),
-                ('max_chunk_age_s', max_chunk_age_s, 0, math.inf)):
-            if not least <= value <= most:
-                raise ValueError(f'{name} {value} is outside [{least}, {most:g}]')
+    def __init__(self, path: str | os.PathLike[str], *, compression: str = 'none',
+                 max_file_bytes: int = 0, max_file_duration_s: float = 0.0,
+                 max_chunk_bytes: int = 2**20) -> None:
         self.path = Path(path)
         self._is_directory = self.path.suffix != '.mcap'
         if (max_file_bytes or max_file_duration_s) and not self._is_directory:
             raise ValueError(
                 f'{str(self.path)!r} is one file, which is not split: give the name of a folder, '
                 'without .mcap')
-        self._compression = compression
+        self._compression = CompressionType[compression.upper()]
         self._max_file_bytes = max_file_bytes or math.inf
         self._max_file_ns = round(max_file_duration_s * NANOSECONDS) or math.inf
         self._max_chunk_bytes = max_chunk_bytes
-        self._max_chunk_age_s = max_chunk_age_s
-        self._clock = clock
-        self._chunk_opened_s: float | None = None
         self._topics: dict[str, metadata.RecordedTopic] = {}
         self._closed = False
         self._completed: list[metadata.RecordedFile] = []
@@ -115,59 +88,38 @@ class BagWriter:
     def add_topic(self, topic: str, definition: MessageDefinition,
                   offered_qos: Sequence[Qos] = ()) -> None:
         """
-        Announce a topic by its absolute name; again with the same definition does nothing.
+        Announce a topic by its absolute name, with the offers of its publishers; once.
 
-        `offered_qos` has one profile for each publisher known when the recording starts. Raises
-        ValueError for a relative name, for another definition of the topic or of the type than
-        before, and on a closed writer.
+        Raises ValueError on a closed writer.
         """
-        self._check_open('add a topic to')
-        if not topic.startswith('/'):
-            raise ValueError(
-                f'topic {topic!r} is not an absolute name: resolve it first, '
-                f'such as node.resolve_topic_name({topic!r})')
-        for known in self._topics.values():
-            same_name = known.name == topic or known.definition.type_name == definition.type_name
-            if same_name and known.definition != definition:
-                raise ValueError(
-                    f'topic {topic!r} of type {definition.type_name} ({definition.type_hash}) '
-                    f'contradicts topic {known.name!r} of type {known.definition.type_name} '
-                    f'({known.definition.type_hash}): record it in a bag of its own')
+        self._check_open()
         if topic not in self._topics:
             self._topics[topic] = metadata.RecordedTopic(topic, definition, tuple(offered_qos))
             self._file.add_topic(self._topics[topic])
 
-    def write(self, topic: str, data: bytes | bytearray | memoryview, log_time_ns: int,
-              publish_time_ns: int | None = None) -> None:
+    def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None
+              ) -> None:
         """
         Append one message, byte for byte, in CDR with its encapsulation header.
 
         `log_time_ns` is the time of receipt [ns], `publish_time_ns` that of sending [ns], the same
-        by default. Raises ValueError for an unknown topic, for a time outside [0, 2**63) ns and on
-        a closed writer, TypeError for data that is not bytes.
+        by default. Raises KeyError for a topic that was not announced, ValueError for a time
+        outside [0, 2**63) ns and on a closed writer.
         """
-        self._check_open('write to')
-        recorded = self._topics.get(topic)
-        if recorded is None:
-            raise ValueError(
-                f'topic {topic!r} is not in the bag {str(self.path)!r}: call add_topic first')
-        if not isinstance(data, (bytes, bytearray, memoryview)):
-            raise TypeError(
-                f'data for {topic!r} must be serialized (bytes), got {type(data).__name__}: '
-                'subscribe with raw=True or call rclpy.serialization.serialize_message')
-        log_time_ns = _checked_time('log_time_ns', log_time_ns)
-        publish_time_ns = (log_time_ns if publish_time_ns is None
-                           else _checked_time('publish_time_ns', publish_time_ns))
+        self._check_open()
+        log_time_ns, publish_time_ns = map(operator.index, (
+            log_time_ns, log_time_ns if publish_time_ns is None else publish_time_ns))
+        for time_ns in (log_time_ns, publish_time_ns):
+            if not 0 <= time_ns < 2**63:
+                raise ValueError(f'message on {topic!r}: the time {time_ns} ns is outside '
+                                 '[0, 2**63) ns')
+        recorded = self._topics[topic]
         if self._is_full(log_time_ns):
             self._split()
         self._file.write(
             topic, bytes(data), log_time_ns, publish_time_ns, recorded.message_count)
         recorded.message_count += 1
-        now_s = self._clock()
-        if self._chunk_opened_s is None:
-            self._chunk_opened_s = now_s
-        if (self._file.open_chunk_bytes > self._max_chunk_bytes
-                or now_s - self._chunk_opened_s >= self._max_chunk_age_s):
+        if self._file.open_chunk_bytes > self._max_chunk_bytes:
             self.flush()
 
     def flush(self) -> None:
@@ -176,9 +128,8 @@ class BagWriter:
 
         Raises ValueError on a closed writer.
         """
-        self._check_open('flush')
+        self._check_open()
         self._file.flush()
-        self._chunk_opened_s = None
         self._raise_background_error()
 
     def close(self) -> None:
@@ -235,21 +186,15 @@ class BagWriter:
         if self._completion is not None and self._completion.done():
             self._completion.result()
 
-    def _check_open(self, action: str) -> None:
+    def _check_open(self) -> None:
         if self._closed:
-            raise ValueError(
-                f'cannot {action} the bag {str(self.path)!r}: it is closed; start another one')
+            raise ValueError(f'the bag {str(self.path)!r} is closed: start another one')
 
 
 class _McapFile:
-    """
-    Write the messages of one file, chunk by chunk, without any checks.
+    """One file that is being written, chunk by chunk; `content` describes it so far."""
 
-    `content` describes the file so far. A chunk ends with :meth:`flush`. Raises FileExistsError
-    for a path that exists.
-    """
-
-    def __init__(self, path: Path, compression: str) -> None:
+    def __init__(self, path: Path, compression: CompressionType) -> None:
         self.path = path
         self.content = metadata.RecordedFile(path.name)
         self.open_chunk_bytes = 0
@@ -262,7 +207,7 @@ class _McapFile:
         # Chunk checksums alone leave the bytes between chunks unchecked: a damaged record type
         # there would make a reader skip a whole chunk without a word.
         self._mcap = Writer(self._stream, chunk_size=_NO_LIMIT, enable_data_crcs=True,
-                            compression=_COMPRESSIONS[compression])
+                            compression=compression)
         try:
             self._mcap.start(profile=Profile.ROS2, library=f'koopman_ros {__version__}')
             # rosbag2 too writes the record at both ends. The last one counts; the first one lets
@@ -334,11 +279,3 @@ class _McapFile:
     def _add_metadata_record(self) -> None:
         text = metadata.dump_metadata(metadata.bag_metadata([self.content]))
         self._mcap.add_metadata('rosbag2', {'serialized_metadata': text})
-
-
-def _checked_time(name: str, time_ns: int) -> int:
-    time_ns = operator.index(time_ns)
-    if not 0 <= time_ns <= _MAX_TIME_NS:
-        raise ValueError(f'{name} {time_ns} is outside [0, {_MAX_TIME_NS}] ns: '
-                         'give nanoseconds since the epoch of the clock in use')
-    return time_ns

@@ -10,7 +10,6 @@ import math
 import os
 from pathlib import Path
 from typing import Any
-from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +43,6 @@ _MAX_ENTRIES = 100  # metrics, or reasons
 _MAX_REASON = 300  # characters of a refusal, which may quote the file
 
 Tensors = dict[str, NDArray[Any]]
-# Models whose files had this SHA-256, so that equal files share one model while it is in use.
-_loaded: WeakValueDictionary[str, LiftedModel] = WeakValueDictionary()
 
 
 class ModelFileError(ValueError):
@@ -73,16 +70,9 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
 
 
 def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
-    """
-    Read a model as :func:`load`, with the SHA-256 of its file.
-
-    Files with the same content are one model in memory.
-    """
+    """Read a model as :func:`load`, with the SHA-256 of its file."""
     path = Path(path)
     content = _read(path)
-    digest = hashlib.sha256(content).hexdigest()
-    if (model := _loaded.get(digest)) is not None:
-        return model, digest
     try:
         model = _parsed(content)
         check(model)
@@ -96,7 +86,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
             reason = reason[:_MAX_REASON] + '...'
         raise ModelFileError(f'{path} is not a usable model file: {reason}; restore it from a '
                              'backup, or train the model again') from error
-    return _loaded.setdefault(digest, model), digest
+    return model, hashlib.sha256(content).hexdigest()
 
 
 def check(model: LiftedModel) -> None:

@@ -330,8 +330,8 @@ class LoopViewModel:
             level='' if no_controller else level_words(self._level),
             fallback=bool(self._level) and self._level not in (best, 'manual'),
             reason='' if reason == 'none' or no_controller else reason,
-            states=tuple(own.state(name in self.signals.controlled, self._bounds(own),
-                                   self._bounds(own, 'sensor_'), no_plant)
+            states=tuple(own.state(name in self.signals.controlled, self._bounds(own, 'mpc.{}.{}'),
+                                   self._bounds(own, '{}.sensor_{}'), no_plant)
                          for name, own in self._states.items()),
             inputs=tuple(own.input(self._bounds(own), no_controller)
                          for own in self._inputs.values()),
@@ -345,10 +345,14 @@ class LoopViewModel:
         low, high = self._bounds(self._inputs[name]) or (-math.inf, math.inf)
         return min(max(value, low), high)
 
-    def _bounds(self, own: SignalValues, kind: str = '') -> Range | None:
-        """Return the parameters ``min`` and ``max`` of a signal; None without a finite one."""
+    def _bounds(self, own: SignalValues, name: str = '{}.{}') -> Range | None:
+        """
+        Return two parameters of the controller as a range; None where neither is finite.
+
+        :param name: of the parameters, with places for the signal and for ``min`` or ``max``.
+        """
         given = self._parameters.get(CONTROLLER, {})
-        lower, upper = (given.get(f'{own.name}.{kind}{end}') for end in ('min', 'max'))
+        lower, upper = (given.get(name.format(own.name, end)) for end in ('min', 'max'))
         if not (lower and upper and isinstance(lower.value, int | float)
                 and isinstance(upper.value, int | float)):
             return None

@@ -47,7 +47,7 @@ class LoadedModel:
     def about(self) -> str:
         """The model in a few words."""
         return (f'model {self.name}: {self.model.kind}, trained for {ranges(self.model)}; '
-                f'{self.model.provenance.acceptance}')
+                f'acceptance: {self.model.provenance.acceptance}')
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,12 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.declaration import group, parameter, per_signal, signal_value, UNBOUNDED
 from koopman_ros.parameters.table import (
     ConfigurationError,
-    group,
     in_own_units,
-    parameter,
     ParameterTable,
-    per_signal,
-    signal_value,
     Specification,
-    UNBOUNDED,
 )
 from koopman_ros.parameters.wire import (
     CommandedPlaces,

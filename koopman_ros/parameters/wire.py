@@ -14,8 +14,9 @@ import re
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.declaration import parameter
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.table import ConfigurationError, parameter
+from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.reasons import Words
 from koopman_ros.resources import config_directory
 from koopman_ros.units import check_unit, conversion, Display, Displays

@@ -16,6 +16,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account
+from koopman_ros.bags.limits import bounded_reading
 from koopman_ros.identification import (
     DriftModel,
     Identified,
@@ -201,9 +202,10 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
     source = Source(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    record = read_record(source, task.most_samples, task.seed,
-                         hidden=bool(task.hidden_states or task.equations),
-                         tick=_reading(on_progress, source), backend=backend)
+    with bounded_reading(task.bags):
+        record = read_record(source, task.most_samples, task.seed,
+                             hidden=bool(task.hidden_states or task.equations),
+                             tick=_reading(on_progress, source), backend=backend)
     account = record.account
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '

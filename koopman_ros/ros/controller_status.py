@@ -184,7 +184,7 @@ def _action(now: Situation) -> str:
 
 def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     """Yield every warning with the name of its condition, the most urgent first."""
-    report, states = now.report, now.controller.model.states
+    report, states, tuning = now.report, now.controller.model.states, now.controller.tuning
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         yield CONNECTIONS, now.complaint
@@ -236,8 +236,9 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
         yield SETPOINT, short
     if not report.measurement.follows:
         yield ACTUATORS, (
-            f'the {now.input} does not follow its command within {_listed(now, tuning.tolerance)}: '
-            'the observer uses the measured input; check the actuator and its limits')
+            f'the {now.input} does not follow its command within '
+            f'{_listed(now, tuning.tolerance)}: the observer uses the measured input; check the '
+            'actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
             'the disturbance estimate is at its bound of '

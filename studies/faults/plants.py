@@ -61,6 +61,11 @@ class Plant:
         """What its controllers are started with."""
         return self.table.snapshot({**self.wired, **self.tuned})
 
+    def each_input(self, name: str) -> list[float]:
+        """Return a parameter of each input, as people read it."""
+        values = self.table.values(self.parameters)
+        return [float(values[f'{signal}.{name}']) for signal in self.parameters.inputs]
+
     @property
     def _model(self) -> str:
         return str({**preset(self.system, 'controller'), **self.tuned}['model'])

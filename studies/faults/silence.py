@@ -73,7 +73,7 @@ def stray(loop: FaultHarness) -> None:
     loop.run_for(2.0 * on.period)
     with loop.fault():
         for end in ('max', 'min'):
-            loop.by_hand(*(getattr(tuned, end) for tuned in on.parameters.inputs.values()))
+            loop.by_hand(*on.each_input(end))
             until = loop.now + 6.0
             while loop.now < until:
                 loop.run_for(on.period)
@@ -120,18 +120,21 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
 
 
 def activated_again(loop: FaultHarness) -> None:
-    """Deactivate and activate a controller that commands the lowest inputs by hand."""
+    """Deactivate and activate a controller that commands lower inputs by hand."""
     loop.ros.set_bool('controller/set_automatic', False)
-    lowest = tuple(loop.on.range(name)[0] for name in loop.on.inputs)
-    loop.by_hand(*lowest)
-    loop.wait(lambda: loop.trace.commands[-1].values == lowest, 'the inputs are not commanded')
+    wanted = tuple(0.5 * (loop.on.range(name)[0] + last) for name, last in zip(
+        loop.on.inputs, loop.trace.commands[-1].values, strict=True))
+    loop.by_hand(*wanted)
+    loop.wait(lambda: np.allclose(loop.trace.commands[-1].values, wanted, rtol=0.0, atol=1e-6),
+              'the inputs are not commanded')
     with loop.fault():
         _transit(loop, Transition.TRANSITION_DEACTIVATE)
         loop.run_for(5.0)
         _transit(loop, Transition.TRANSITION_ACTIVATE)
         before = len(loop.trace.commands)
         loop.wait(lambda: len(loop.trace.commands) > before + 3, 'no command after activation')
-    loop.ros.set_bool('controller/set_automatic', True)
+        # the plant is far away until then, however long the answer takes
+        loop.ros.set_bool('controller/set_automatic', True)
     loop.request_until_tracked(*loop.on.setpoint)
 
 

@@ -153,8 +153,9 @@ class WithWindow:
 def horizon(case: Case) -> int:
     """Return how many samples the law `mpc` looks ahead."""
     law = RecedingHorizon(case.truth, case.tuning(case.truth), MPCParameters())
-    interval = case.period / case.system.seconds_per_time_unit
-    return round(float(np.sum(law.lengths(interval))) / interval)
+    assert law.planner is not None
+    lengths = law.planner.grid(case.period).lengths
+    return round(float(np.sum(lengths) / lengths[0]))
 
 
 def true_filter(case: Case) -> ExtendedKalmanFilter:

@@ -384,15 +384,6 @@ def test_short_and_full_names_are_one_type(tmp_path: Path, schema: str, named: s
     assert next(bags.read_messages(path)).type_name == 'std_msgs/msg/Float64'
 
 
-@pytest.mark.parametrize(('short', 'full'), [
-    ('sensor_msgs/Temperature', 'sensor_msgs/msg/Temperature'),
-    ('sensor_msgs/msg/Temperature', 'sensor_msgs/msg/Temperature'),
-    ('my_srvs/srv/Ask_Event', 'my_srvs/srv/Ask_Event'), ('Temperature', 'Temperature'),
-    ('', ''), ('/x', '/x'), ('x/', 'x/')])
-def test_full_name_of_a_type(short: str, full: str) -> None:
-    assert wire.full_type_name(short) == full
-
-
 def test_topics_that_are_not_decoded_come_as_bytes_in_a_whole_bag(tmp_path: Path) -> None:
     """Of a service event, rosbag2 stores the text of the .srv file."""
     path = tmp_path / 'run.mcap'

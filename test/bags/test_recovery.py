@@ -36,7 +36,7 @@ def samples(samples: list[Sample]) -> list[Sample]:
 @pytest.fixture
 def path(tmp_path: Path, write_bag: WriteBag) -> Path:
     """Return a bag of four chunks in a folder, and where its file is."""
-    return write_bag(tmp_path / 'run', max_chunk_age_s=0.85) / 'run_0.mcap'
+    return write_bag(tmp_path / 'run') / 'run_0.mcap'
 
 
 def records(content: bytes, opcode: int | None = None) -> list[tuple[int, int]]:
@@ -84,7 +84,7 @@ def information(path: Path) -> dict[str, Any]:
 def test_cut_file_reads_up_to_its_last_whole_chunk(
     tmp_path: Path, write_bag: WriteBag, samples: list[Sample], compression: str
 ) -> None:
-    whole = write_bag(tmp_path / 'whole.mcap', compression=compression, max_chunk_age_s=0.85)
+    whole = write_bag(tmp_path / 'whole.mcap', compression=compression)
     content = whole.read_bytes()
     chunks = messages_by_chunk_end(whole)
     assert len(chunks) >= 4
@@ -102,24 +102,6 @@ def test_cut_file_reads_up_to_its_last_whole_chunk(
         left = summary(cut_file)
         assert (left.message_count, left.complete) == (expected, False), cut
         assert left.end_ns == (samples[expected - 1].log_time_ns if expected else None)
-
-
-@COMPRESSIONS
-def test_flipped_byte_is_noticed_and_survived(
-    tmp_path: Path, write_bag: WriteBag, samples: list[Sample], compression: str
-) -> None:
-    damaged = write_bag(
-        tmp_path / 'damaged.mcap', compression=compression, max_chunk_age_s=0.85)
-    content = damaged.read_bytes()
-    (data_end, _), = records(content, Opcode.DATA_END)
-    for place in range(MAGIC_SIZE, data_end, 97):
-        damaged.write_bytes(
-            content[:place] + bytes([content[place] ^ 0x40]) + content[place + 1:])
-        with pytest.raises(BagReadError, match=r'is damaged .*: set recover to true'):
-            list(read_messages(damaged))
-        found = [m.data for m in read_messages(damaged, recover=True)]
-        remaining = iter([s.data for s in samples])
-        assert all(data in remaining for data in found), place  # in order, none invented
 
 
 def test_damage_after_the_first_chunk_keeps_the_first_chunk(
@@ -185,11 +167,11 @@ def test_killed_at_any_message_it_loses_the_open_chunk_only(
         tmp_path: Path, compression: str) -> None:
     path = tmp_path / 'run'
     # as long as the writer lives, its files are what a kill would leave
-    with BagWriter(path, compression=compression, max_file_duration_s=2.0,
-                   max_chunk_age_s=0.5, clock=(PERIOD * 1e-9 * k for k in range(10**6)).__next__
-                   ) as writer:
+    with BagWriter(path, compression=compression, max_file_duration_s=2.0) as writer:
         for k in range(60):
             write_numbers(writer, (k,), PERIOD)
+            if k % 5 == 4:
+                writer.flush()
             # the metadata is renamed from a .tmp, which may vanish while it is copied
             shutil.copytree(path, left := tmp_path / f'left_{k}',
                             ignore=shutil.ignore_patterns('*.tmp'))

@@ -4,9 +4,7 @@
 """What is written, when, and what is refused; the readers of mcap and rosbags; definitions."""
 
 from collections.abc import Callable
-from dataclasses import replace
 import importlib
-import math
 from pathlib import Path
 import sys
 from typing import Any
@@ -131,17 +129,8 @@ def test_metadata_begins_empty_and_ends_complete(
         'rosbag2_bagfile_information': last}
 
 
-@pytest.mark.parametrize(('age_s', 'chunks'), [(0.0, 12), (1.0, 4), (math.inf, 1)])
-def test_chunk_ends_with_its_age(tmp_path: Path, age_s: float, chunks: int) -> None:
-    # Half a second a message: a chunk of 1 s holds the messages at 0, 0.5 and 1 s.
-    now_s = iter(np.arange(12) * 0.5)
-    path = record(tmp_path / 'run.mcap', range(12), max_chunk_age_s=age_s,
-                  clock=lambda: float(next(now_s)))
-    assert content(path).statistics.chunk_count == chunks
-
-
 def test_flushed_messages_are_in_the_file(tmp_path: Path) -> None:
-    writer = bags.BagWriter(tmp_path / 'run.mcap', max_chunk_age_s=math.inf)
+    writer = bags.BagWriter(tmp_path / 'run.mcap')
     write_numbers(writer, (1, 2))
     assert list(bags.read_messages(writer.path, recover=True)) == []
     writer.flush()
@@ -162,47 +151,28 @@ def test_existing_path_is_never_overwritten(tmp_path: Path, name: str) -> None:
     assert {f: f.read_bytes() for f in tmp_path.rglob('*') if f.is_file()} == before
 
 
-INTEGER = replace(NUMBER, type_name='std_msgs/msg/Int64', text='int64 data\n')
-CHANGED = replace(NUMBER, text='float32 data\n')
-
-
-@pytest.mark.parametrize(('method', 'arguments', 'kind', 'words'), [
-    ('add_topic', ('/x', INTEGER), ValueError,
-     r"'/x' of type std_msgs/msg/Int64 .* contradicts topic '/x' of type std_msgs/msg/Float64"),
-    ('add_topic', ('/y', CHANGED), ValueError,
-     r"contradicts topic '/x' .* in a bag of its own"),
-    ('add_topic', ('x', NUMBER), ValueError,
-     r"'x' is not an absolute name.*resolve_topic_name\('x'\)"),
-    ('write', ('/y', b'', 1), ValueError, r"'/y' is not in the bag '.*run\.mcap': call add_topic"),
-    ('write', ('/x', 1.5, 1), TypeError, r"'/x' must be serialized .* got float: subscribe"),
-    ('write', ('/x', b'', -1, 0), ValueError,
-     r'log_time_ns -1 is outside \[0, 9223372036854775807\] ns'),
-    ('write', ('/x', b'', 0, -7), ValueError, 'publish_time_ns -7 is outside'),
-    ('write', ('/x', b'', 2**63, 0), ValueError, 'log_time_ns 9223372036854775808 is outside'),
-    ('write', ('/x', b'', 1.5), TypeError, 'float'),
-])
-def test_what_is_refused_leaves_no_trace(
-    tmp_path: Path, method: str, arguments: tuple, kind: type[Exception], words: str
-) -> None:
+@pytest.mark.parametrize(('arguments', 'kind'), [
+    (('/y', b'', 1), KeyError), (('/x', 1.5, 1), TypeError), (('/x', b'', -1, 0), ValueError),
+    (('/x', b'', 0, -7), ValueError), (('/x', b'', 2**63, 0), ValueError)])
+def test_refused_message_leaves_no_trace(
+        tmp_path: Path, arguments: tuple[Any, ...], kind: type[Exception]) -> None:
     with bags.BagWriter(tmp_path / 'run.mcap') as writer:
         writer.add_topic('/x', NUMBER)
-        with pytest.raises(kind, match=words):
-            getattr(writer, method)(*arguments)
+        with pytest.raises(kind):
+            writer.write(*arguments)
     assert list(bags.read_messages(writer.path)) == []
-    assert len(content(writer.path).channels) == 1
 
 
 def test_closed_writer_refuses(tmp_path: Path) -> None:
     writer = bags.BagWriter(tmp_path / 'run')
     writer.add_topic('/x', NUMBER)
-    # not before the bag is whole
+    # not before the bag is complete
     assert not (writer.path / 'metadata.yaml').exists()
     writer.close()
     before = (writer.path / 'run_0.mcap').read_bytes()
-    for verb, method, arguments in (('write to', writer.write, ('/x', number(1.5), 3)),
-                                    ('add a topic to', writer.add_topic, ('/y', NUMBER)),
-                                    ('flush', writer.flush, ())):
-        with pytest.raises(ValueError, match=rf"cannot {verb} the bag '.*run': it is closed"):
+    for method, arguments in ((writer.write, ('/x', number(1.5), 3)),
+                              (writer.add_topic, ('/y', NUMBER)), (writer.flush, ())):
+        with pytest.raises(ValueError, match='is closed'):
             method(*arguments)
     writer.close()
     assert (writer.path / 'run_0.mcap').read_bytes() == before
@@ -214,23 +184,15 @@ def test_exception_inside_with_keeps_the_recording(tmp_path: Path) -> None:
     assert [m.log_time_ns for m in bags.read_messages(tmp_path / 'run')] == [1]
 
 
-@pytest.mark.parametrize(('name', 'options'), [
-    ('run.mcap', {'compression': 'zip'}), ('run.mcap', {'max_chunk_bytes': 0}),
-    ('run.mcap', {'max_chunk_age_s': -1.0}), ('run.mcap', {'max_chunk_age_s': math.nan}),
-    # one file is not split
-    ('run.mcap', {'max_file_bytes': 1}), ('run.mcap', {'max_file_duration_s': 1.0}),
-    ('run', {'max_file_bytes': -1}), ('run', {'max_file_duration_s': -1.0}),
-    ('run', {'max_file_duration_s': math.nan}), ('run', {'max_file_duration_s': math.inf}),
-])
-def test_bad_options_make_no_file(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=name if 'mcap' in name and (
-            'max_file' in str(options)) else next(iter(options))):
-        bags.BagWriter(tmp_path / name, **options)
+@pytest.mark.parametrize('options', [{'max_file_bytes': 1}, {'max_file_duration_s': 1.0}])
+def test_one_file_is_not_split(tmp_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match='is not split'):
+        bags.BagWriter(tmp_path / 'run.mcap', **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
-    one, two = (record(tmp_path / folder / 'run.mcap', range(100), max_chunk_age_s=math.inf)
+    one, two = (record(tmp_path / folder / 'run.mcap', range(100))
                 for folder in ('one', 'two'))
     assert one.read_bytes() == two.read_bytes()
 

@@ -21,7 +21,7 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.control.laws import LawResult, Linear
-from koopman_ros.control.supervisor import SafeStateRecovery
+from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.estimation import (
     DisturbanceObserver,
     Estimate,
@@ -66,7 +66,7 @@ class UnprintableError(Exception):
 FAILURES = [ZeroDivisionError('of zero'), np.linalg.LinAlgError('singular'), SystemExit(3),
             GeneratorExit(), UnprintableError(), None, 'a text', np.full(1, np.nan)]
 # results that have the right type and wrong parts
-RESULTS = [LawResult(np.zeros(2), figures=None), LawResult(np.zeros(2), plan='x'),
+RESULTS = [LawResult(np.zeros(2), info=None), LawResult(np.zeros(2), plan='x'),
            LawResult(np.zeros(2), failure='x'), LawResult(np.zeros(5)), LawResult(None),
            LawResult(np.array([1.0, np.inf]))]
 ESTIMATES = [Estimate(np.zeros(5), np.zeros(2)), Estimate(np.zeros(2), np.zeros(1)),
@@ -260,7 +260,6 @@ def test_the_loop_goes_on_when_an_estimator_works_again(monkeypatch):
         run.do(Measurement((10 + k) * SECOND, center + 1e-4 * k))
     with monkeypatch.context() as broken:
         broken.setattr(DisturbanceObserver, 'correct', Failing(ZeroDivisionError('once')))
-        # a regular step and the general one share it
         report = run.do(Measurement(15 * SECOND, center - 1e-4)).report
         assert (report.level, report.reason.code) == ('hold', Code.CALCULATION_FAILED)
         assert 'ZeroDivisionError' in report.reason.values['error']
@@ -295,7 +294,7 @@ def test_the_covariance_stays_positive_definite_over_any_gap(kind, seconds):
     """At the pendulum's unstable top a gap multiplies variances by up to exp(40)."""
     controller = tuned('pendulum', 'angle')
     level = next(iter(controller.levels.values()))
-    estimator = kind(level.model, level.estimator.tuning)
+    estimator = kind(level.model, level.estimator.outputs, level.estimator.tuning, None)
     x, u = np.zeros(2), np.zeros(1)
     estimate = estimator.restart(None, x, u)
     rng = np.random.default_rng(0)
@@ -324,7 +323,7 @@ def test_a_recovery_that_has_come_to_the_training_data_by_itself_is_over():
 @pytest.mark.parametrize('levels', [('mpc', 'sdre', 'linear'), ('mpc', 'linear')])
 def test_plans_that_are_always_late_do_not_keep_the_safe_input(levels):
     """A sensor that was broken for a while; the deadline is missed by every plan."""
-    run = Checked(tuned('reactor', levels=levels, law_deadline=1e-9, hold_timeout=5.0))
+    run = Checked(tuned('reactor', levels=levels, hold_timeout=5.0, **{'mpc.time_limit': 1e-9}))
     center = run.controller.model.states.center
     for k in range(60):
         value = center + 0.01 * (k % 3)

@@ -524,7 +524,7 @@ def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, control
     w = np.array(w) / model.states.scale
     places = [model.states.names.index(name) for name in controlled]
     found = reachable_target(
-        model, np.array(places), level.target(np.array(asked), w, limits, None), w,
+        model, np.array(places), level.target(np.array(asked), w, None), w,
         model.inputs.to_deviation(limits.lower), model.inputs.to_deviation(limits.upper))
     # linear: all steady states are x = -A^-1 (B u + w), so that bounded least squares has it
     slope = -np.linalg.solve(model.A, model.B)
@@ -539,5 +539,5 @@ def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, control
     if model.n_u > 1:
         # which is where the law goes
         estimate = Estimate(np.zeros(model.n_x), w)
-        target = level.compute(np.array(asked), estimate, limits, None, 1.0, None)[0]
+        target = level.compute(np.array(asked), estimate, None, 1.0, None, None)[0]
         assert target.u == pytest.approx(found.u)

@@ -14,27 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
 from sensor_msgs.msg import Temperature
-from std_msgs.msg import Float32, Float64
 import yaml
 
-from koopman_ros.bags import read_series
 from koopman_ros.lifting import load
 from koopman_ros.nodes import controller, plant, trainer
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from koopman_ros.testing.process import NodeProcess
-from koopman_ros.units import to_kelvin
-from koopman_ros.wire import Place
 from support.installation import Installation, ROOT, run, underlay
 from support.nodes import run_here
 
 OVEN = ROOT / 'examples' / 'oven'
 PAGE = (ROOT / 'docs' / 'own_plant.md').read_text()
 # node and arguments of each command on the page that takes a file, in the order there
-RECORD, SIMULATE, TRAIN, CONTROL, RUN, AGAIN, FROM_BAG, ON_TOPICS = (
+RECORD, SIMULATE, TRAIN, CONTROL, RUN, *_ = (
     (node, tuple(shlex.split(text))) for node, text in re.findall(
         r'^ros2 run koopman_ros (\w+) --ros-args (--params-file .*)$', PAGE, re.MULTILINE))
 ACCEPTED = r'the new model \(.+?\) is accepted: error on held-out records ([\d.]+) K, ' \
@@ -116,48 +110,6 @@ def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
     ros.wait_until(arrived, lambda: f'{[message.temperature for message in measured[-5:]]}')
     # derived by hand: the tangent at 290 degC, in the middle of the range, would end 33 K lower
     assert measured[-1].temperature == pytest.approx(goal, abs=1.0)
-
-
-def write_day(recorded: Path, bag: Path) -> None:
-    """Write a record as rosbag2 would, of an oven with the topics of the page."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    signals = {'/temperature': ('/oven/thermocouple', 'std_msgs/msg/Float32'),
-               '/power': ('/oven/meter', 'std_msgs/msg/Float64MultiArray'),
-               '/power_setpoint': ('/oven/heater', 'std_msgs/msg/Float64')}
-    layout = store.types['std_msgs/msg/MultiArrayLayout']([], 0)
-    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for topic, (name, kind) in signals.items():
-            joint, unit = 'sensor_msgs/msg/JointState', 'W'
-            series = read_series(recorded, topic if topic == '/temperature' else Place(
-                topic, joint, 'position[power]', unit))
-            connection = writer.add_connection(name, kind, typestore=store)
-            for stamp, value in zip(series.stamp_ns.tolist(), series.values, strict=True):
-                message = store.types[kind](
-                    layout, np.array([230.0, 1e-3 * value])) if 'Array' in kind else (
-                    store.types[kind](value))
-                # the command is heard after the measurement that it answers
-                writer.write(connection, stamp + 1000 * (name == '/oven/heater'),
-                             store.serialize_cdr(message, kind))
-
-
-def test_bag_of_other_topics_is_trained_from_and_its_lift_controls_them(
-        overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
-    write_day(recorded, folder / 'day_1')
-    lift, linear = train(ros, overlay, FROM_BAG, 'model_class:=polynomial')
-    assert lift < 0.25 < 1.0 < linear
-    commands = ros.listen(Float64, '/oven/heater')
-    start(ros, overlay, ON_TOPICS)
-    thermocouple = ros.speak(Float32, '/oven/thermocouple', to='controller')
-    model = load(folder / 'existing.safetensors')
-    celsius = float(model.states.center[0]) - to_kelvin(0.0)
-
-    def commanded() -> bool:
-        thermocouple.publish(Float32(data=celsius))
-        return len(commands) > 3
-
-    ros.wait_until(commanded)
-    # in W, what holds the middle of the range
-    assert commands[-1].data == pytest.approx(float(model.inputs.center[0]), rel=0.05)
 
 
 QUICK = {'autostart': 'true', 'system': 'oven'}

@@ -79,8 +79,9 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law(ros: Harness, tmp_p
     recorded = ros.listen(String, topics.CONTROLLER_EVENTS)
     internals = ros.listen(JointState, topics.CONTROLLER_STATE)
     ros.start('controller', {
-        'system': 'none', 'model': file, 'levels': "['pi']", 'temperature.pi_gain': 3.0,
-        'temperature.pi_time': 60.0, 'coolant_temperature.safe': 5.0, 'transfer_time': 10.0,
+        'system': 'none', 'model': file, 'levels': "['pi']", 'pi.temperature.gain': 3.0,
+        'pi.temperature.integral_time': 60.0, 'coolant_temperature.safe': 5.0,
+        'transfer_time': 10.0,
         'temperature.noise': 0.02, 'model_check_factor': 0.0})
     ros.speak(Temperature, 'setpoint', to='controller').publish(temperature(SETPOINT))
     ros.start('plant', {

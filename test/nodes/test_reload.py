@@ -24,7 +24,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.control import State
-from koopman_ros.control.laws import receding_horizon
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters import model_checks
@@ -172,9 +171,9 @@ BAD_MODELS = {
     'gain beyond its bound': (
         replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),
     'refused by its training': (
-        replace(SHIPPED, provenance=replace(SHIPPED.provenance, refused=('too large an error',))),
-        'was refused by its training (too large an error): train it again, or set '
-        'load_refused_model'),
+        replace(SHIPPED, provenance=replace(
+            SHIPPED.provenance, accepted=False, reasons=('too large an error',))),
+        'was refused (too large an error): train it again, or set load_refused_model'),
     'numbers that overflow': (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
 }
 
@@ -213,14 +212,14 @@ def test_unsuitable_model_is_refused_with_the_reason(
 
     assert running.reload() == (
         True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
-        '53.85 degC')
+        '53.85 degC; acceptance: never judged')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
 
 
 def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a package of the best one is missing, no other model would help."""
-    monkeypatch.setattr(receding_horizon, 'PACKAGE', 'no_such_solver')
+    monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', None)
     center = SHIPPED.states.center
 
     def situation(*levels: str) -> model_checks.Situation:

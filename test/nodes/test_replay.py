@@ -134,7 +134,7 @@ def tune_and_swap(operator: Operator) -> None:
             ({'coolant_temperature.weight': 0.3}, True),
             ({'coolant_temperature.weight': -1.0}, False),
             ({'levels': ['none', 'linear']}, False),
-            ({'levels': ['mpc', 'sdre', 'linear'], 'temperature.max': 46.2}, True),
+            ({'levels': ['mpc', 'sdre', 'linear'], 'mpc.temperature.max': 46.2}, True),
             ({'setpoint_filter': 15.0, 'disturbance_bandwidth': 0.05}, True),
             ({'model': str(operator.model), 'coolant_temperature.weight': 0.5}, True),
             ({'model': 'none'}, False)):

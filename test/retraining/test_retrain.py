@@ -137,9 +137,11 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     # nothing replaces the output, and the same data and seed give the same numbers
     assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
     refused = load(retrained.model_file)
-    assert refused.provenance.refused == retrained.reasons
+    assert refused.provenance.accepted is False
+    assert refused.provenance.reasons == retrained.reasons
     again = tmp_path / 'again.safetensors'
-    save(replace(refused, provenance=replace(refused.provenance, refused=())), again)
+    save(replace(refused, provenance=replace(
+        refused.provenance, accepted=True, reasons=())), again)
     assert again.read_bytes() == present.read_bytes()
 
 
@@ -244,7 +246,7 @@ def test_a_task_survives_json():
 
 @pytest.mark.parametrize(('values', 'error', 'words'), [
     ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
-    ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is a device, not a regular file'),
+    ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is not a regular file'),
     ({'model': 'two.safetensors'}, ValueError, r'has the states x0 \[K\], x1 \[K\], the task has '
      r'temperature \[K\]: give the same'),
     ({'inputs': (replace(INPUTS[0], unit='degC'),)}, ValueError, r'inputs coolant_temperature '

@@ -3,7 +3,7 @@
 
 """Control laws, by the names under which a tuning chooses them."""
 
-from koopman_ros.control.laws.base import Law, LawResult, Weights
+from koopman_ros.control.laws.base import Law, LawResult, Plan, Weights
 from koopman_ros.control.laws.pi import ProportionalIntegral
 from koopman_ros.control.laws.riccati import (
     averaged,
@@ -20,5 +20,6 @@ LAWS: dict[str, type[Law] | str] = {
     'mpc': 'koopman_ros.control.mpc:RecedingHorizon',
     'sdre': StateDependentRiccati, 'linear': Linear, 'pi': ProportionalIntegral}
 
-__all__ = ['LAWS', 'Feedback', 'Form', 'Law', 'LawResult', 'Linear', 'ProportionalIntegral',
-           'StateDependentRiccati', 'Weights', 'averaged', 'feedback', 'recentred']
+__all__ = ['LAWS', 'Feedback', 'Form', 'Law', 'LawResult', 'Linear', 'Plan',
+           'ProportionalIntegral', 'StateDependentRiccati', 'Weights', 'averaged', 'feedback',
+           'recentred']

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,8 +18,12 @@ from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plugs import contained
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.tuning import Tuning
+
+if TYPE_CHECKING:
+    from koopman_ros.control.mpc.planner import Planner
 
 _PACKAGES = 'numba daqp'
 # Largest change of a scaled input after which a plan has converged, and with which it may be used.
@@ -63,19 +68,25 @@ class RecedingHorizon(Law):
                              f'{np.asarray(parameters.lower).tolist()} and '
                              f'{np.asarray(parameters.upper).tolist()}')
         self._riccati = StateDependentRiccati(model, tuning, None)
-        self.planner = None
+        #: what computes the plans; None where it cannot be loaded
+        self.planner: Planner | None = None
+        self._unusable: Reason | None = None
         try:
-            # compiles, or loads what was compiled before
+            # compiles, or loads the code compiled before
             from koopman_ros.control.mpc.planner import Planner
         except ImportError:
+            self._unusable = reason(Code.PACKAGE_MISSING, package=_PACKAGES)
+            return
+        except RuntimeError as error:
+            # numba finds no folder for the compiled code
+            self._unusable = reason(Code.LAW_RAISED, error=contained(error))
             return
         self.planner = Planner(model, tuning, self.weights, *(
             np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
 
     def unusable(self) -> Reason | None:
-        """Return that its packages are not installed."""
-        return None if self.planner is not None else reason(
-            Code.PACKAGE_MISSING, package=_PACKAGES)
+        """Return that its packages are not installed, or do not work."""
+        return self._unusable
 
     def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
                 previous: Array | None) -> LawResult:
@@ -86,7 +97,7 @@ class RecedingHorizon(Law):
         """
         planner = self.planner
         if planner is None:
-            return LawResult(None, self.unusable())
+            return LawResult(None, self._unusable)
         if not interval > 0.0:
             return self._riccati.compute(estimate, target, None, interval, previous)
         began, limit = time.perf_counter(), self.parameters.time_limit or math.inf

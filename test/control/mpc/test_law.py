@@ -7,6 +7,7 @@ import json
 import math
 import sys
 import time
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -329,6 +330,18 @@ def test_without_a_package_the_next_level_acts_with_the_advice(monkeypatch, pack
     why = loop.reports[-1].reason
     assert (why.code, why.cause.code) == (Code.LAW_FAILED, Code.PACKAGE_MISSING)
     assert why.cause.values['package'] == 'numba daqp'
+
+
+def test_where_nothing_can_be_compiled_the_next_level_acts_with_the_reason(monkeypatch):
+    class Broken(ModuleType):
+        def __getattr__(self, name: str) -> object:
+            raise RuntimeError('cannot cache function: no locator available')
+
+    monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', Broken('planner'))
+    found = law(OSCILLATOR[1])
+    assert found.unusable().code is Code.LAW_RAISED
+    assert 'locator' in found.unusable().values['error']
+    assert compute(found, [1.0, 0.0]).failure == found.unusable()
 
 
 def test_plan_that_takes_too_long_costs_one_sample(monkeypatch):

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Laws of one's own in one file, over ROS: one with a parameter, one that raises, one refused."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import pytest
+
+from koopman_ros.testing import Harness
+from support.controller_bench import Bench, PURE, STATUS, STEADY
+from support.nodes import value
+
+LAWS = """
+from dataclasses import dataclass
+
+from koopman_ros.control.laws import Law, LawResult
+from koopman_ros.declaration import column, parameter
+
+
+@dataclass(frozen=True)
+class Parameters:
+    gain: float = parameter(2.0, 'Proportional gain.', 'K/K', 0.0, 50.0)
+    bias: object = column('inputs', 0.0, 'Added to the command.', minimum=-10.0, maximum=10.0)
+
+
+class Proportional(Law):
+    Parameters = Parameters
+
+    def compute(self, estimate, target, memory, interval, previous):
+        error = (target.x - estimate.x) * self.model.states.scale
+        u = self.model.inputs.to_physical(target.u) + self.parameters.gain * error
+        return LawResult(u + self.parameters.bias)
+
+
+class Raises(Law):
+    def compute(self, estimate, target, memory, interval, previous):
+        return {}['nothing']
+
+
+class WithoutCompute(Law):
+    pass
+"""
+
+
+@pytest.fixture
+def own_laws(tmp_path: Path) -> Iterator[Harness]:
+    (tmp_path / 'own_laws.py').write_text(LAWS)
+    with Harness(tmp_path, {'PYTHONPATH': str(tmp_path)}) as bench:
+        yield bench
+
+
+def test_a_law_of_ones_own_acts_by_its_own_parameters(own_laws: Harness) -> None:
+    bench = Bench(own_laws, {
+        **PURE, 'levels': ['own_laws:Proportional', 'linear'], 'Proportional.gain': 3.0,
+        'coolant_temperature.rate_limit': 0.0})
+    at_rest = bench.measure(STEADY, 2.0).temperature
+    assert bench.measure(STEADY + 0.5, 3.0).temperature == pytest.approx(at_rest - 1.5, abs=0.02)
+    set_parameters = own_laws.set_parameters_atomically
+    assert set_parameters('controller', **{'Proportional.gain': 1.0}).successful
+    assert bench.measure(STEADY + 0.5, 4.0).temperature == pytest.approx(at_rest - 0.5, abs=0.02)
+    assert set_parameters('controller', **{
+        'Proportional.coolant_temperature.bias': 0.25}).successful
+    assert bench.measure(STEADY + 0.5, 5.0).temperature == pytest.approx(at_rest - 0.25, abs=0.02)
+    refused = set_parameters('controller', **{'Proportional.gain': 51.0})
+    assert not refused.successful
+    assert 'Proportional.gain = 51.0' in refused.reason
+    status = bench.status()
+    assert (status.level, value(status, 'active law')) == (
+        DiagnosticStatus.OK, 'own_laws:Proportional')
+
+
+def test_a_law_that_raises_hands_over_to_the_next_level(own_laws: Harness) -> None:
+    bench = Bench(own_laws, {'levels': ['own_laws:Raises', 'sdre', 'linear']})
+    bench.measure(STEADY, 2.0)
+    status = own_laws.wait_for_status(STATUS, lambda s: 'KeyError' in s.message)
+    assert value(status, 'active law') == 'learned law'
+    bench.measure(STEADY, 3.0)
+
+
+def test_a_law_without_compute_is_refused_at_the_start(own_laws: Harness) -> None:
+    process = own_laws.start('controller', {'levels': ['own_laws:WithoutCompute']})
+    assert own_laws.wait_for_end(process) != 0
+    assert 'lacks compute' in process.output()
