@@ -83,7 +83,7 @@ class _Status:
     def show(self, status: TaskStatus) -> None:
         """Show a status."""
         self._message.set_text(status.message or 'no status received')
-        self._mark.set_text('▲ WARNING' if status.level == WARN else '■ ERROR')
+        self._mark.set_text({OK: '', WARN: '▲ WARNING'}.get(status.level, '■ ERROR'))
         show_if(self._mark, status.level > OK)
 
 

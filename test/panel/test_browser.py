@@ -31,8 +31,8 @@ PHONE = (390, 844)
 # an experiment of a few seconds, and a training
 TRAINER = {
     'model_class': 'polynomial', 'training_starts': 1, 'record_at_start': False,
-    'min_free_disk': 0.0, 'experiment_on': 'setpoint', 'experiment_length': 900.0,
-    'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
+    'min_free_disk': 0.0, 'gate_condition': 1e9, 'experiment_on': 'setpoint',
+    'experiment_length': 900.0, 'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
     'temperature.setpoint_min': 40.0, 'temperature.setpoint_max': 50.0}
 MEASUREMENTS = 420  # that are learned from
 TRIES = 3
@@ -203,7 +203,7 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         expect(comparison).to_contain_text('✖ cancelled')
         press(comparison, 'Compare on the last hour')
         expect(comparison).to_contain_text('The recorded commands are reproduced.',
-                                           timeout=3.0 * PATIENCE)
+                                           timeout=5.0 * PATIENCE)
         expect(comparison.locator('img.picture')).to_be_visible()
         model = card(page, 'Model')
         activated(page, 'Activate the new model …')
