@@ -58,8 +58,8 @@ setup(
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'daqp', 'distributed', 'do-mpc==5.1.2',
-                  'nicegui>=3', 'playwright', 'psutil', 'pysindy==2.1.0'],
+        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'psutil',
+                  'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'colcon-common-extensions',
