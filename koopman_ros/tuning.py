@@ -139,11 +139,6 @@ class Tuning:
 
     __repr__ = brief
 
-    @property
-    def max_riccati_residual(self) -> float:
-        """The largest relative residual of a Riccati equation with which a law may act."""
-        return 10.0 ** -self.min_riccati_digits
-
     def of_plugin(self, name: str, kind: type[Any]) -> Any:
         """Return the own parameters of a plug-in by its name; those of `kind` by default."""
         found = self.plugins.get(short_name(name))

@@ -51,7 +51,7 @@ def running(shared_ros: Harness) -> Harness:
     ({'temperature.topic': 'elsewhere'}, 'read-only'),
     ({'validity_margin': 2.0}, 'validity_margin = 2.0 must be at most linear_margin = '
      f'{TABLE.rows["linear_margin"].default}: change the other one first'),
-    ({'min_riccati_digits': 16.0}, 'min_riccati_digits = 16.0 must be in [0, 15]'),
+    ({'max_riccati_residual': 2.0}, 'max_riccati_residual = 2.0 must be in (0, 1]'),
 ])
 def test_change_that_does_not_fit_is_refused_with_the_reason(
         running: Harness, change: dict[str, Any], words: str) -> None:
