@@ -80,9 +80,9 @@ def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None
     count = 0
     with opened(file) as stream:
         try:
-            for stored in _messages(stream):
+            for stored in _messages(stream, topics):
                 count += 1
-                if topics is None or stored.channel.topic in topics:
+                if stored is not None:
                     yield (stored._replace(data=zstandard.decompress(stored.data))
                            if stored.data.startswith(_ZSTD_MAGIC) else stored)
             found = None if recover else summary_section(stream)
@@ -175,10 +175,14 @@ class _WholeReads:
         return self._stream.read(length)
 
 
-def _messages(stream: BinaryIO) -> Iterator[StoredMessage]:
-    """Yield the messages up to the end of the data; raise any exception for a damaged record."""
+def _messages(stream: BinaryIO, topics: Collection[str] | None) -> Iterator[StoredMessage | None]:
+    """
+    Yield the messages up to the end of the data, None for those of other topics.
+
+    Any exception is that of a damaged record.
+    """
     schemas: dict[int, Schema] = {}
-    channels: dict[int, tuple[Schema | None, Channel]] = {}
+    channels: dict[int, tuple[Schema | None, Channel] | None] = {}
     for records in _uncompressed(stream):
         end = 0
         while end < len(records):
@@ -192,14 +196,16 @@ def _messages(stream: BinaryIO) -> Iterator[StoredMessage]:
                 if length < _MESSAGE_HEAD.size:
                     raise EOFError('a message that is cut short')
                 number, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(records, start)
-                yield StoredMessage(*channels[number], log_ns, publish_ns,
-                                    records[start + _MESSAGE_HEAD.size:end])
+                found = channels[number]
+                yield None if found is None else StoredMessage(
+                    *found, log_ns, publish_ns, records[start + _MESSAGE_HEAD.size:end])
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(_stream(records[start:end]))
                 schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(_stream(records[start:end]))
-                channels[channel.id] = schemas.get(channel.schema_id), channel
+                channels[channel.id] = None if topics is not None and (
+                    channel.topic not in topics) else (schemas.get(channel.schema_id), channel)
 
 
 def _uncompressed(stream: BinaryIO) -> Iterator[bytes]:
