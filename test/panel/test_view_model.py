@@ -159,15 +159,6 @@ def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
     assert now.states[0].span[1] >= 60.0
 
 
-def test_the_first_of_the_levels_is_no_fallback() -> None:
-    for levels, fallback in ((('mpc', 'sdre'), True), (('sdre', 'linear'), False), (None, False)):
-        own = view()
-        if levels:
-            own.take_parameters('controller', {'levels': parameter('levels', levels)})
-        own.take_record('measurement', {'mode': 'automatic', 'level': 'sdre'}, NOW)
-        assert own.snapshot(NOW).fallback is fallback
-
-
 def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
     own = view()
     own.take_parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})
@@ -238,20 +229,21 @@ def test_a_snapshot_stays_what_it_was() -> None:
 # Levels, silences, alarms and marks.
 
 
-def test_a_fallback_has_its_reason() -> None:
+@pytest.mark.parametrize(('levels', 'level', 'mode', 'reason', 'shown', 'fallback'), [
+    (None, 'sdre', 'automatic', 'none', 'learned law', False),
+    (('mpc', 'sdre'), 'sdre', 'automatic', 'none', 'learned law', True),
+    (('sdre', 'linear'), 'hold', 'automatic', 'the sensor is frozen', 'hold', True),
+    (('sdre', 'linear'), 'manual', 'manual', 'none', 'manual', False)])
+def test_a_fallback_has_its_reason(levels: tuple[str, ...] | None, level: str, mode: str,
+                                   reason: str, shown: str, fallback: bool) -> None:
     own = view()
-    answered(own)
-    own.take_status(CONTROL, OK, 'automatic', {'reason': 'none'}, NOW)
+    if levels:
+        own.take_parameters(CONTROLLER, {'levels': parameter('levels', levels)})
+    answered(own, level, mode)
+    own.take_status(CONTROL, OK, mode, {'reason': reason}, NOW)
     now = own.snapshot(NOW)
     assert (now.mode, now.level, now.fallback, now.reason) == (
-        'automatic', 'learned law', False, '')
-    answered(own, 'hold')
-    own.take_status(CONTROL, ERROR, 'held: check', {'reason': 'the sensor is frozen'}, NOW)
-    now = own.snapshot(NOW)
-    assert (now.level, now.fallback, now.reason) == ('hold', True, 'the sensor is frozen')
-    answered(own, 'manual', 'manual')
-    now = own.snapshot(NOW)
-    assert (now.mode, now.fallback) == ('manual', False)
+        mode, shown, fallback, '' if reason == 'none' else reason)
 
 
 @pytest.mark.parametrize('fields', [
