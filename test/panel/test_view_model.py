@@ -326,8 +326,8 @@ def test_nodes_of_another_loop_are_ignored() -> None:
     assert all('other line' not in alarm.text for alarm in now.standing)
     for name, values in ((CONTROL, {'reason': 'none'}),
                          ('trainer: training', {'model_file': 'a'})):
-        status = now.status(name)
-        assert (status.level, status.message, status.values) == (ERROR, LOST, values)
+        task = now.status(name)
+        assert (task.level, task.message, task.values) == (ERROR, LOST, values)
     assert 'last command' in now.inputs[0].abnormal
     # one that is back is shown again
     status(own, 'line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
