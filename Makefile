@@ -70,14 +70,14 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(COMPILE)
 	@touch $@
 
-demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, to be run from a browser)
+demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in a closed loop: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, operated from a browser)
 	$(BIN)/python -m koopman_ros.demo $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel)
 
-demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
+demo-retrain: $(VENV)/retrain.stamp  ## retrain the controller of a plant that drifts -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
 
 demo-saddle: SEEDS = 5
-demo-saddle: $(VENV)/saddle.stamp  ## an unstable reactor is learned from its temperature alone, recorded under a PI law, and held, SEEDS=5, a quarter of an hour -> out/demo-saddle
+demo-saddle: $(VENV)/saddle.stamp  ## learn an unstable reactor from its temperature under PI control, and hold it, SEEDS=5, a quarter of an hour -> out/demo-saddle
 	$(BIN)/python -m studies.saddle_act --seeds $(SEEDS)
 
 # Types are checked beside the tests. Tests across processes wait most of their time, so that there
@@ -100,35 +100,35 @@ lint: $(VENV)/test.stamp  ## style and type checks
 models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
 	$(BIN)/python -m studies.shipped_models
 
-studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figures, report -> out/studies
+studies: $(VENV)/train.stamp  ## run the paper's experiments, SEEDS=20: figures, report -> out/studies
 	$(BIN)/python -m studies.paper --seeds $(SEEDS)
 
-studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, ten seeds -> out/studies-sensors
+studies-sensors: $(VENV)/train.stamp  ## learn from noisy sensor data, ten seeds -> out/studies-sensors
 	$(BIN)/python -m studies.paper --sensors --seeds 10
 
-studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
+studies-robustness: $(VENV)/bench.stamp  ## compute margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
 	$(BIN)/python -m studies.robustness
 
 studies-general: SEEDS = 10
-studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
+studies-general: $(VENV)/bench.stamp  ## test the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
 	$(BIN)/python -m studies.general --seeds $(SEEDS)
 
 studies-unstable: SEEDS = 10
-studies-unstable: $(VENV)/bench.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
+studies-unstable: $(VENV)/bench.stamp  ## learn an unstable reactor under a pre-feedback, SEEDS=10, six minutes
 	$(BIN)/python -m studies.unstable --seeds $(SEEDS)
 
 studies-saddle: SEEDS = 10
-studies-saddle: $(VENV)/saddle.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
+studies-saddle: $(VENV)/saddle.stamp  ## hold the unstable reactor from its temperature alone, SEEDS=10, half an hour
 	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
 
 studies-partial: SEEDS = 10
-studies-partial: $(VENV)/bench.stamp  ## three plants beside do-mpc and a plain LQG, two of them measured in part, SEEDS=10, five minutes -> out/studies-partial
+studies-partial: $(VENV)/bench.stamp  ## compare with do-mpc and LQG on three partly measured plants, SEEDS=10, five minutes -> out/studies-partial
 	$(BIN)/python -m studies.partly_measured --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## speed beside other programs and on a cluster, an hour (BENCH=--quick: seven minutes) -> out/bench
+bench: $(VENV)/bench.stamp  ## compare the speed with other programs, twenty minutes (BENCH=--quick: two minutes) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)
 
-faults: $(VENV)/mpc.stamp  ## put faults into the loops of the reactor, of two tank plants and of a reactor at its saddle, and soak both reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
+faults: $(VENV)/mpc.stamp  ## inject 167 faults into running loops of five plants, and run two reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
 	$(BIN)/python -m studies.faults $(FAULTS)
 
 docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs

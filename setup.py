@@ -56,9 +56,8 @@ setup(
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
-        'bench': ['argon2-cffi', 'casadi==3.8.2', 'control', 'daqp', 'distributed',
-                  'do-mpc==5.1.2', 'itsdangerous', 'limits', 'nicegui>=3', 'numba', 'playwright',
-                  'psutil', 'pysindy==2.1.0'],
+        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'numba', 'psutil',
+                  'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'argon2-cffi',

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The control step, plans of `mpc`, and the loop across processes, each beside its like."""
+"""Plans of the law `mpc`, and the loop across processes, each beside its like."""
 
 from collections.abc import Iterator
 import contextlib
@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 from sensor_msgs.msg import Temperature
 
-from benchmarks import planning, process, step
+from benchmarks import planning, process
 from koopman_ros.demo import reactor
 from koopman_ros.reports import table
 from koopman_ros.ros import topics
@@ -25,11 +25,8 @@ from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, NodeProcess
 from koopman_ros.units import NANOSECONDS
 
-PACKAGES = ('numpy', 'scipy', 'torch', 'control', 'daqp', 'casadi', 'do-mpc')
+PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')
 MEANING = {
-    'step_us': 'median time of a control step, by n_z; step has the 99th percentiles, too',
-    'step_ratio_to_naive': 'how many times as long the same law takes by torch jacrev and '
-                           'control.dlqr, by n_z; medians of processor time',
     'plan_us': 'median and 99th percentile of processor time of the law mpc with 30 intervals, '
                'targets given, by lift; plan has those of the whole control step, too',
     'plan_ratio_to_do_mpc': 'how many times as long do-mpc takes (IPOPT, targets given, the '
@@ -54,8 +51,6 @@ _RETRY = 0.01  # s between measurements before the first answer
 class Plan:
     """One extent of the measurements."""
 
-    coordinates: tuple[int, ...]  #: the n_z of the lifts
-    steps: int  #: timed control steps with each lift
     rounds: int  #: of latency, fifty measurements of each side in one
     starts: int  #: of the controller
     plant_seconds: float  #: length of the lock-step loop
@@ -63,15 +58,14 @@ class Plan:
     compiled: bool  #: whether the other solvers are compiled
 
 
-PLANS = {'quick': Plan((2, 3, 4, 5, 6), 200, 4, 2, 600.0, 80, False),
-         'default': Plan((2, 3, 4, 5, 6), 1500, 30, 5, 3600.0, 800, True)}
+PLANS = {'quick': Plan(4, 2, 600.0, 80, False),
+         'default': Plan(30, 5, 3600.0, 800, True)}
 
 
 def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
-    """Measure the control step and the loop, each beside its like."""
+    """Measure plans and the loop, each beside its like."""
     figures['meaning'] = MEANING
     with tempfile.TemporaryDirectory() as name:
-        yield _steps(figures, plan, Path(name))
         yield _plans(figures, plan, Path(name))
         with Harness(Path(name), name='probe') as harness:
             with _answering(harness) as (nodes, probes):
@@ -86,17 +80,6 @@ def _found(job: Any, *arguments: Any, folder: Path) -> dict[str, Any]:
     if outcome.failure:
         raise RuntimeError(f'{job.__module__} failed: {outcome.failure}')
     return {name: one for event in outcome.events for name, one in event.items()}
-
-
-def _steps(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
-    found = _found(step.compare_all, plan.coordinates, plan.steps, folder=folder)
-    ratio = {n_z: one['naive_cpu_median_us'] / one['cpu_median_us'] for n_z, one in found.items()}
-    figures.update(step=found, step_ratio_to_naive=ratio,
-                   step_us={n_z: one['median_us'] for n_z, one in found.items()})
-    columns = ('median_us', 'p99_us', 'naive_median_us', 'naive_p99_us')
-    return table(('control step', 'ratio', *columns), [
-        (f'n_z = {n_z}', f'{ratio[n_z]:.1f}', *(f'{one[column]:.0f}' for column in columns))
-        for n_z, one in found.items()])
 
 
 def _plans(figures: dict[str, Any], plan: Plan, folder: Path) -> str:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from koopman_ros.arrays import Array
-from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.network import Layout, Pass
-from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
+from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.network import Layout, Pass
+from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.plants import one_state_reactor, two_state_example
 
 WHITENING = 1.0

@@ -13,7 +13,11 @@ from torch import Tensor
 
 from benchmarks.problems import Case, WHITENING
 from benchmarks.process import allow, Tell
-from koopman_ros.learning.levenberg_marquardt import minimise, normal_equations, NormalEquations
+from koopman_ros.learning.lift.levenberg_marquardt import (
+    minimise,
+    normal_equations,
+    NormalEquations,
+)
 
 # Of constant and falling rates from 0.003 to 0.03 this was the best over both systems.
 _ADAM_RATE = 1e-2

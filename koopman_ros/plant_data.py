@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is known and recorded of a plant: names and units, episodes, samples with derivatives."""
+"""Data of a plant: names and units, episodes, samples with derivatives."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ['Episode', 'Plant', 'Samples', 'averaged', 'cut', 'split_by_episode',
 @dataclass(frozen=True)
 class Plant:
     """
-    What is known of the plant beside its data.
+    Names, units, nominal point and input matrix of a plant.
 
     :raises ValueError: naming what does not fit the names, or a time unit that there is not.
     """
@@ -152,7 +152,7 @@ class Episode:
         return areas[last] + (times - knots[last])[:, None] * mean
 
     def _later(self, u: Array, times: Array) -> Array:
-        """Return what inputs (n, n_u) have become at `times` (n,), before any other change."""
+        """Return the inputs (n, n_u) at `times` (n,), before any other change."""
         return np.where(self.linear, self.inputs_at(times), u) if any(self.linear) else u
 
     def part(self, start: int, stop: int) -> Episode:

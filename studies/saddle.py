@@ -7,7 +7,6 @@ The two-state reactor held at its saddle from its temperature alone, and what th
 Run it as ``python -m studies.saddle`` (needs the `train` and `mpc` requirements).
 """
 
-import argparse
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 import itertools
@@ -27,14 +26,14 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.simulate import Change, Simulation
-from koopman_ros.jobs.backends import Backend, backend_of
+from koopman_ros.execution import Backend, backend_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from koopman_ros.reports import table
 from koopman_ros.signals import Outputs
+from studies.campaign import over, read_options
 from studies.general.systems import SADDLE
-from studies.options import add_scheduler, add_seeds, over, read
 from studies.true_model import TrueModel
 from studies.unstable import LIMITS, MARGIN, REACHED, SADDLE_TEMPERATURE, steady, SYSTEM
 
@@ -230,12 +229,9 @@ def disturbance_rows(models: list[LiftedModel], backend: Backend | None = None
 
 def main(args: list[str] | None = None) -> int:
     """Learn from several seeds and print the tables."""
-    parser = argparse.ArgumentParser(
-        prog='python -m studies.saddle',
-        description='Hold the two-state reactor at its saddle from its temperature alone.')
-    add_seeds(parser)
-    add_scheduler(parser, '')
-    options = read(parser, args)
+    options = read_options(
+        args, 'saddle', 'Hold the two-state reactor at its saddle from its temperature alone.',
+        seeds=10, scheduler='')
     with backend_of(options.scheduler) as backend:
         _report(options.seeds, backend)
     return 0

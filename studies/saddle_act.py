@@ -292,8 +292,8 @@ def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) 
     return Controller(model, Tuning.for_model(
         model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,
         controlled=('temperature',), transfer_time=0.0,
-        plugins={'mpc': MPCParameters(upper=upper),
-                 'pi': PIParameters(np.full(n_x, PI_GAIN), np.full(n_x, PI_TIME))},
+        plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(
+            np.full(n_x, PI_GAIN if alone else 0.0), np.full(n_x, PI_TIME))},
         noise=np.array([1e-4, NOISE])[-n_y:],
         wander=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
         **({'setpoint_ramp': np.array([RAMP])} if alone else

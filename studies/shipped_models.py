@@ -17,8 +17,7 @@ import numpy as np
 
 from koopman_ros.control.law_check import LOOPS
 from koopman_ros.learning import Growth, roll_out, train
-from koopman_ros.learning.progress import training_progress
-from koopman_ros.learning.starts import Watch
+from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
@@ -30,6 +29,7 @@ from koopman_ros.plants import (
     RandomStepDesign,
 )
 from studies.paper.reactor import SYSTEM, TRAINING, training_samples
+from studies.progress import training_progress
 
 SEED = 2026
 SADDLE = 'two_state_saddle'  # the reactor of two states where it runs away by itself

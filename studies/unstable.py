@@ -7,7 +7,6 @@ The two-state reactor about its saddle, learned under a pre-feedback: figures, c
 Run it as ``python -m studies.unstable`` (needs the `train` and `bench` requirements).
 """
 
-import argparse
 from dataclasses import replace
 import sys
 import time
@@ -25,9 +24,9 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.simulate import Simulation
-from koopman_ros.jobs.backends import Backend, backend_of, Tell
+from koopman_ros.execution import Backend, backend_of, Tell
 from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
-from koopman_ros.learning.starts import Recipe
+from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
@@ -40,10 +39,10 @@ from koopman_ros.plants import (
 )
 from koopman_ros.plants.optimum import cost_along, Course, optimum, Task
 from koopman_ros.reports import table
+from studies.campaign import read_options
 from studies.equations import EQUATIONS
 from studies.general.systems import SADDLE
 from studies.least import least_course
-from studies.options import add_scheduler, add_seeds, read
 
 # the range about the saddle, in mol/L and K, holds another steady state with its coolant of 300 K,
 # an unstable focus
@@ -56,7 +55,7 @@ EPISODES, DURATION = 400, 0.1  # in min
 # enough.
 LIFT = Growth(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
               pre_feedback=0.05, other_whitenings=(10.0,))
-RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift((16,)), 'free lift': LIFT}
+RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift(16), 'free lift': LIFT}
 STARTS = 2
 UNLIMITED = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
 # With these the laws are compared, also from where they may lose the plant.
@@ -165,12 +164,9 @@ def steady(temperature: float) -> tuple[Array, Array]:
 
 def main(args: list[str] | None = None) -> int:
     """Learn from several seeds and print a row for each, judged on fresh samples."""
-    parser = argparse.ArgumentParser(
-        prog='python -m studies.unstable',
-        description='Learn the two-state reactor about its saddle under a pre-feedback.')
-    add_seeds(parser)
-    add_scheduler(parser, '')
-    options = read(parser, args)
+    options = read_options(
+        args, 'unstable', 'Learn the two-state reactor about its saddle under a pre-feedback.',
+        seeds=10, scheduler='')
     with backend_of(options.scheduler) as backend:
         return _report(options.seeds, backend)
 

@@ -27,17 +27,18 @@ from support.disturbance import disturb_training
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_node_benchmarks', 'test_browser', 'test_learning', 'test_replay',
-           'test_training_benchmark', 'test_training_node', 'test_shipped_models',
-           'test_parallel', 'test_site_benchmark', 'test_own_plant', 'test_fault_campaign',
+LONGEST = ('test_studies', 'test_benchmarks', 'test_browser', 'test_learning', 'test_replay',
+           'test_training_node', 'test_shipped_models',
+           'test_parallel', 'test_own_plant', 'test_fault_campaign',
            'test_processes', 'test_managed', 'test_partly_measured', 'test_classes',
            'test_controller_process', 'test_examples', 'test_plant_node', 'test_player',
-           'test_install_tree', 'test_experiment_tanks', 'test_demo', 'test_panel_benchmark',
-           'test_several_states', 'test_campaign', 'test_recording', 'test_parameter_ends',
-           'test_grey', 'test_panel', 'test_laws',
-           'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_retrain',
-           'test_observer', 'test_cluster', 'test_fleet', 'test_kalman', 'test_training',
-           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom', 'test_hidden',
+           'test_install_tree', 'test_experiment_tanks', 'test_demo',
+           'test_several_states', 'test_recording', 'test_parameter_ends',
+           'test_grey_box', 'test_panel', 'test_retraining_tanks', 'test_laws',
+           'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_pipeline',
+           'test_observer', 'test_backends', 'test_fleet', 'test_kalman', 'test_training',
+           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom',
+           'test_unmeasured_states',
            'test_least_squares', 'test_law_check')
 
 

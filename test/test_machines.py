@@ -7,7 +7,8 @@ import os
 import subprocess
 import sys
 
-from koopman_ros.learning import scaling, train
+from koopman_ros.learning import train
+from koopman_ros.learning.lift import scaling
 import machines
 from support import disturbance
 from support.small_plants import BENT, bent_samples, bits, SMALL

@@ -209,37 +209,6 @@ def test_sampled_random_pairs_against_scipy(h):
         assert_solves(solve_riccati(*problem, interval=h), *quadrature(*problem, h))
 
 
-@pytest.mark.parametrize('h', [0.1, 1.0, 5.0])
-@pytest.mark.parametrize(('a', 'b', 'q', 'r'), [
-    (1.0, 2.0, 3.0, 0.5), (-1.0, 2.0, 3.0, 0.5), (-0.957887316, 2.092050209, 1.0, 0.1)])
-def test_sampled_scalar_plants_in_closed_form(a, b, q, r, h):
-    phi, phi_2 = np.exp(a * h), np.exp(2.0 * a * h)
-    gamma = b / a * (phi - 1.0)
-    # integrals of e^2at, e^at (e^at - 1) and (e^at - 1)^2
-    once, twice = (phi - 1.0) / a, (phi_2 - 1.0) / (2.0 * a)
-    Q, N, R = q * twice, q * b / a * (twice - once), (
-        r * h + q * (b / a) ** 2 * (twice - 2.0 * once + h))
-    # (p (1 - phi^2) - Q) (R + gamma^2 p) + (gamma phi p + N)^2 = 0
-    p = max(np.roots([gamma ** 2, (1.0 - phi_2) * R - Q * gamma ** 2 + 2.0 * gamma * phi * N,
-                      N * N - Q * R]))
-    solution = solve_riccati(*(np.array([[value]]) for value in (a, b, q, r)), interval=h)
-    assert solution.status is RiccatiStatus.SOLVED
-    assert solution.P[0, 0] == pytest.approx(p, rel=1e-10)
-    assert solution.K[0, 0] == pytest.approx(
-        (gamma * p * phi + N) / (R + gamma ** 2 * p), rel=1e-10)
-
-
-@pytest.mark.parametrize('h', [0.01, 0.5, 4.0])
-def test_sampled_double_integrator_by_hand(h):
-    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    solution = solve_riccati(A, B, np.eye(2), 0.2 * np.eye(1), interval=h)
-    assert_solves(
-        solution, np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h / 2.0], [h]]),
-        np.array([[h, h ** 2 / 2.0], [h ** 2 / 2.0, h + h ** 3 / 3.0]]),
-        np.array([[h ** 3 / 6.0], [h ** 4 / 8.0 + h ** 2 / 2.0]]),
-        np.array([[0.2 * h + h ** 5 / 20.0 + h ** 3 / 3.0]]))
-
-
 def test_what_the_sampled_regulator_costs_is_its_solution_and_least():
     """Summed over 100 intervals of 10 Runge-Kutta steps each, for several gains at once."""
     A, B, Q, R = random_problem(3, 1, seed=4)
@@ -317,30 +286,6 @@ def test_the_interval_against_an_exponential_of_blocks(h):
         whole = expm(h * np.block([[F, np.eye(N)], [np.zeros((N, 2 * N))]]))
         assert np.linalg.norm(D - F @ whole[:N, N:]) <= 1e-13 * max(
             np.linalg.norm(D), h * np.linalg.norm(F))
-
-
-@pytest.mark.parametrize('h', [1e-12, 1e-3, 0.3, 3.0])
-def test_the_interval_of_an_integrator_chain_by_hand(h):
-    """Of x1' = x2, x2' = u: polynomials of the interval."""
-    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    D, W = over_interval(A, B, np.diag([2.0, 3.0]), np.array([[5.0]]), h)
-    np.testing.assert_allclose(D, [[0.0, h, h ** 2 / 2.0], [0.0, 0.0, h], [0.0] * 3], rtol=1e-14)
-    np.testing.assert_allclose(W, [
-        [2.0 * h, h ** 2, h ** 3 / 3.0],
-        [h ** 2, 2.0 * h ** 3 / 3.0 + 3.0 * h, h ** 4 / 4.0 + 1.5 * h ** 2],
-        [h ** 3 / 3.0, h ** 4 / 4.0 + 1.5 * h ** 2, h ** 5 / 10.0 + h ** 3 + 5.0 * h]],
-        rtol=1e-13)
-
-
-@pytest.mark.parametrize('h', [1e-12, 1e-3, 0.3, 3.0, 40.0])
-@pytest.mark.parametrize('a', [-2.0, -1e-9, 1.5])
-def test_the_interval_of_one_state_by_hand(a, h):
-    """Its input does nothing, so that e^(a t) alone is left."""
-    D, W = over_interval(*(np.array([[value]]) for value in (a, 0.0, 1.0, 1.0)), h)
-    assert D[0, 0] == pytest.approx(np.expm1(a * h), rel=2e-13)
-    assert W[0, 0] == pytest.approx(np.expm1(2.0 * a * h) / (2.0 * a), rel=2e-13)
-    assert W[1, 1] == pytest.approx(h, rel=1e-14)
-    assert W[0, 1] == D[0, 1] == 0.0
 
 
 # Runge-Kutta steps.

@@ -87,7 +87,7 @@ design = RandomStepDesign(
     input_lower=-strongest, input_upper=strongest, state_lower=-1.4 * corner,
     state_upper=1.4 * corner, hold_time=(0.01, 0.02), sample_period=0.01, rtol=1e-9)
 samples = box_episodes(beam, design, episodes=60, duration=0.05, seed=1, starts=(-corner, corner))
-recipes = {'neural drift': NeuralDrift((8,), max_iterations=100),
+recipes = {'neural drift': NeuralDrift(8, max_iterations=100),
            'identity lift': Growth(3, hidden_first=8, max_iterations=40)}
 found = compare(describe(beam), samples, recipes, starts=1, loops=16)
 print(found)

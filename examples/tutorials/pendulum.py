@@ -86,7 +86,7 @@ figure.savefig(OUT / 'pendulum_samples.png')
 
 # %%
 found = compare(describe(system), samples, {
-    'neural drift': NeuralDrift((12,), max_iterations=150),
+    'neural drift': NeuralDrift(12, max_iterations=150),
     'identity lift': Growth(4, hidden_first=8, max_iterations=40),
     'free lift': Growth(2, identity=False, hidden_first=8, max_iterations=40)},
     starts=1, loops=16)

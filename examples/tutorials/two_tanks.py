@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, simulate, Tuning
-from koopman_ros.identification import identify, weak_forms
-from koopman_ros.learning import roll_out
+from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
+from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.lifting import load, save
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import (
@@ -33,7 +33,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
 )
 from koopman_ros.reports import draw_limits, DRAWN_RANGE, legend
-from koopman_ros.retraining import decide, learn_lift, Thresholds
 
 # a notebook has arguments of its own
 OUT = Path(*[word for word in sys.argv[1:2] if word[0] != '-'] or ['out/tutorials'])
@@ -95,7 +94,8 @@ figure.savefig(OUT / 'two_tanks_record.png')
 unknown = np.full(2, np.nan)
 plant = Plant('two tanks', LEVELS, ('m', 'm'), PUMPS, ('V', 'V'), 's', nominal_state=unknown,
               nominal_input=unknown, B=None)
-found = identify(plant, [episode], degrees=(1, 2, 3), methods=weak_forms(20))
+found = identify(plant, [episode], degrees=(1, 2, 3),
+                 methods={'weak form': WeakForm(WeakFormParameters((20,)))})
 print(f'drift of degree {found.drift.degree}, found by {found.method}')
 print(f'noise: {1e3 * found.noise.round(6)} mm, in truth {1e3 * NOISE} mm')
 print(f'B:\n{found.drift.input_matrix.round(6)}, in truth\n{truth.B.round(6)} m/(V s)')

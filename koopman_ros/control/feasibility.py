@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.fallback import Level
@@ -108,6 +107,9 @@ class Feasibility:
 
     def _nearer(self, held: Array, goal: Array) -> Array:
         """Move the inputs within their range for the least squares of what is left to a goal."""
+        # in here: it takes longer to import than the rest of the step
+        from scipy.optimize import lsq_linear
+
         model, half = self.level.model, 0.5 * (self.box.upper - self.box.lower)
         lower, upper = (model.inputs.to_deviation(end) for end in (
             self.level.limits.lower, self.level.limits.upper))

@@ -22,7 +22,7 @@ from koopman_ros.control.law_loops import (
     Rate,
 )
 from koopman_ros.control.laws import Law, StateDependentRiccati, Weights
-from koopman_ros.jobs.backends import Backend, Here
+from koopman_ros.execution import Backend, Serial
 from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
 from koopman_ros.lifting.training_data import MAX_TRIED_LOOPS
 from koopman_ros.solvers import solve_riccati
@@ -232,7 +232,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
         return watch(sum(shares.values()) / len(parts))
 
     found = []
-    with contextlib.closing((backend or Here()).run(
+    with contextlib.closing((backend or Serial()).run(
             judge_loops, parts, shared=given, watch=watching)) as judged:
         for name, part in judged:
             shares[name] = 1.0

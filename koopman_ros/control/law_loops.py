@@ -16,7 +16,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, Linear, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.estimation import Estimate
-from koopman_ros.jobs.backends import Tell
+from koopman_ros.execution import Tell
 from koopman_ros.lifting import LiftedModel, NetworkObservables
 from koopman_ros.lifting.model import NODES, WEIGHTS
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati

@@ -1,16 +1,19 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lifts learned from samples, their baselines and held-out figures; in torch, never in a node."""
+"""
+From records of a plant to an accepted model; in torch, never in a node.
 
-from koopman_ros.learning.baselines import Algorithm1, Edmd, Linearisation
-from koopman_ros.learning.comparison import compare, Comparison, Contender, Judge
-from koopman_ros.learning.drift import NeuralDrift
-from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.shards import read_samples, Shard, write_samples
-from koopman_ros.learning.starts import Progress
-from koopman_ros.learning.training import NoUsefulLift, train, Trained
-from koopman_ros.learning.validation import (
+Nodes start ``python -m koopman_ros.learning``.
+"""
+
+from koopman_ros.learning.acceptance import decide, Decision, Thresholds
+from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
+from koopman_ros.learning.fleet import Outcome, retrain_fleet
+from koopman_ros.learning.lift.algorithm_1 import Algorithm1
+from koopman_ros.learning.lift.edmd import Edmd, Linearisation
+from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.metrics import (
     evaluate,
     Figures,
     Fit,
@@ -18,9 +21,18 @@ from koopman_ros.learning.validation import (
     roll_out,
     rollout_rmse,
 )
+from koopman_ros.learning.lift.multistart import Progress
+from koopman_ros.learning.lift.neural_drift import NeuralDrift
+from koopman_ros.learning.lift.training import NoUsefulLift, train, Trained
+from koopman_ros.learning.model_selection import compare, Comparison, Contender, Judge
+from koopman_ros.learning.pipeline import retrain, Retrained
+from koopman_ros.learning.report import write_report
+from koopman_ros.learning.task import TrainingTask
 
 __all__ = [
-    'Algorithm1', 'Comparison', 'Contender', 'Edmd', 'Figures', 'Fit', 'Growth', 'Judge',
-    'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Progress', 'Shard', 'Trained', 'compare',
-    'evaluate', 'fit', 'read_samples', 'roll_out', 'rollout_rmse', 'train', 'write_samples',
+    'Algorithm1', 'Comparison', 'Contender', 'Decision', 'Edmd', 'Figures', 'Fit', 'Growth',
+    'Judge', 'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Outcome', 'Progress', 'Retrained',
+    'Thresholds', 'Trained', 'TrainingTask', 'compare', 'compare_classes', 'decide',
+    'drift_samples', 'evaluate', 'fit', 'learn_lift', 'retrain', 'retrain_fleet',
+    'roll_out', 'rollout_rmse', 'train', 'write_report',
 ]

@@ -5,7 +5,7 @@
 
 import sys
 
-from koopman_ros.jobs.training import JobState
+from koopman_ros.execution.training import JobState
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import (
     trainer_signals,

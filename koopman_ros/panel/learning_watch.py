@@ -14,7 +14,7 @@ import time
 
 import yaml
 
-from koopman_ros.jobs.replaying import ReplayJob
+from koopman_ros.execution.job import ReplayJob
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.training_report import (
     Comparison,
@@ -92,7 +92,7 @@ class LearningWatch:
             '-r', f'{topic}:={self._resolve(topic)}')]
         try:
             self._job = ReplayJob(['--ros-args', '--params-file', str(file), '-r',
-                                   f'__ns:={self._namespace}', *remaps], folder / 'log')
+                                   f'__ns:={self._namespace}', *remaps])
         except OSError as error:
             self._folder.cleanup()
             return Answer(False, f'the replay cannot be started: {error}')

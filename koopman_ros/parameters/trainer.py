@@ -4,7 +4,8 @@
 """Parameters of the trainer node, which records bags, and of the player, which plays them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+import contextlib
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -12,21 +13,24 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.declaration import (
+    column,
+    NO_LOWER,
+    NO_UPPER,
+    parameter,
+    per_signal,
+    plugin_parameters,
+    UNBOUNDED,
+    value_column,
+)
+from koopman_ros.execution import scheduler_refusal
 from koopman_ros.experiment import Experiment
-from koopman_ros.jobs.backends import scheduler_refusal
+from koopman_ros.identification_methods import parameters_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
 from koopman_ros.parameters.equations import named_ranges, refused
-from koopman_ros.parameters.table import (
-    ConfigurationError,
-    in_own_units,
-    parameter,
-    ParameterTable,
-    per_signal,
-    signal_value,
-    UNBOUNDED,
-)
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.parameters.wire import (
     InputPlaces,
     preset,
@@ -36,44 +40,14 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
+from koopman_ros.plugs import short_name
 from koopman_ros.units import conversion, display_unit
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
 FIRST = 'first'  # as `sibling`, the first plant of a fleet whose lift is accepted
 
 
-@dataclass(frozen=True)
-class StateParameters(StatePlaces):
-    """A measured state, and what an experiment may do to it."""
-
-    experiment_min: float = signal_value(
-        -UNBOUNDED, 'measurement below which the experiment is aborted')
-    experiment_max: float = signal_value(
-        UNBOUNDED, 'measurement above which the experiment is aborted')
-    setpoint_min: float = signal_value(
-        0.0, 'lowest set-point of an experiment on set-points')
-    setpoint_max: float = signal_value(
-        0.0, 'highest set-point of an experiment on set-points')
-
-
-@dataclass(frozen=True)
-class InputParameters(InputPlaces):
-    """An input, and what an experiment does with it."""
-
-    experiment_min: float = signal_value(
-        0.0, 'lowest value of a step')
-    experiment_max: float = signal_value(
-        0.0, 'highest value of a step')
-    experiment_rate_limit: float = parameter(
-        0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
-    safe: float = signal_value(
-        0.0, 'what is safe whatever happened; the experiment starts and ends with it')
-    delay: float = parameter(
-        0.0, 'dead time of the actuator: a command acts this long after it was given', 's', 0.0,
-        3600.0)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrainerParameters:
     """Snapshot of the trainer's parameters, in the units that people read."""
 
@@ -165,6 +139,11 @@ class TrainerParameters:
     input_matrix_degree: int = parameter(
         0, 'degree of the polynomial in the states that a learned B is, where what an input does '
         'depends on them; 0 for a constant B', '', 0, 5)
+    identification_methods: tuple[str, ...] = parameter(
+        ('weak_form', 'total_variation'), 'methods that estimate the drift where all states are '
+        'measured, of which held-out segments choose: weak_form, total_variation, or module:Class',
+        code=True)
+    methods: Mapping[str, Any] = plugin_parameters()
     hidden_states: int = parameter(
         0, 'most states of the plant that are not measured, which a lift is learned with; 0 where '
         'all are', '', 0, 4)
@@ -186,8 +165,27 @@ class TrainerParameters:
         1e4, 'largest condition number of the coordinates of a new lift', '', 1.0, 1e12,
         open_minimum=True)
 
-    states: Mapping[str, StateParameters] = per_signal(StateParameters)
-    inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
+    states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
+    measured_min: Array = value_column(
+        'states', -UNBOUNDED, 'measurement below which the experiment is aborted',
+        name='experiment_min', none=NO_LOWER)
+    measured_max: Array = value_column(
+        'states', UNBOUNDED, 'measurement above which the experiment is aborted',
+        name='experiment_max', none=NO_UPPER)
+    setpoint_min: Array = value_column(
+        'states', 0.0, 'lowest set-point of an experiment on set-points')
+    setpoint_max: Array = value_column(
+        'states', 0.0, 'highest set-point of an experiment on set-points')
+    inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    experiment_min: Array = value_column('inputs', 0.0, 'lowest value of a step')
+    experiment_max: Array = value_column('inputs', 0.0, 'highest value of a step')
+    experiment_rate_limit: Array = column(
+        'inputs', 0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
+    safe: Array = value_column(
+        'inputs', 0.0, 'what is safe whatever happened; the experiment starts and ends with it')
+    delay: Array = column(
+        'inputs', 0.0, 'dead time of the actuator: a command acts this long after it was given',
+        's', 0.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
@@ -199,54 +197,52 @@ class TrainerParameters:
         if missing := self.missing(signals, on_setpoints):
             raise ValueError('the bounds of the experiment are not known: give '
                              + ', '.join(missing))
-        units = {name: signals.states[name] for name in signals.controlled
-                 } if on_setpoints else signals.inputs
-        of: Mapping[str, Any] = self.states if on_setpoints else self.inputs
-        low, high = ((f'{"setpoint" if on_setpoints else "experiment"}_{end}')
-                     for end in ('min', 'max'))
+        names, lower, upper = self._steps(signals, on_setpoints)
+        rate = np.zeros(len(names)) if on_setpoints else self.experiment_rate_limit
         return Experiment(
-            duration=self.experiment_length,
-            names=tuple(units), lower=in_own_units(of, low, units),
-            upper=in_own_units(of, high, units),
-            rate=np.array([getattr(of[name], 'experiment_rate_limit', 0.0) or UNBOUNDED
-                           for name in units]),
-            home=in_own_units(self.inputs, 'safe', units) if setpoints is None else setpoints,
+            duration=self.experiment_length, names=names, lower=lower, upper=upper,
+            rate=np.where(rate > 0.0, rate, UNBOUNDED),
+            home=self.safe if setpoints is None else setpoints,
             hold_shortest=self.experiment_shortest_hold,
-            hold_longest=self.experiment_longest_hold,
-            measured=tuple(signals.states),
-            measured_lower=in_own_units(self.states, 'experiment_min', signals.states),
-            measured_upper=in_own_units(self.states, 'experiment_max', signals.states),
+            hold_longest=self.experiment_longest_hold, measured=tuple(signals.states),
+            measured_lower=self.measured_min, measured_upper=self.measured_max,
             seed=self.experiment_seed)
+
+    def _steps(self, signals: Signals, on_setpoints: bool) -> tuple[tuple[str, ...], Array, Array]:
+        """Return names, lowest and highest values of the signals that are stepped."""
+        if not on_setpoints:
+            return tuple(signals.inputs), self.experiment_min, self.experiment_max
+        rows = [list(signals.states).index(name) for name in signals.controlled]
+        return signals.controlled, self.setpoint_min[rows], self.setpoint_max[rows]
 
     def missing(self, signals: Signals, on_setpoints: bool = False) -> list[str]:
         """Return the parameters without which there is no experiment, with their units."""
         what = 'setpoint' if on_setpoints else 'experiment'
-        stepped = {name: self.states[name] for name in signals.controlled
-                   } if on_setpoints else self.inputs
-        units = signals.units
-        return [f'{name}.{row} [{display_unit(units[name])}]' for name, row in [
-            *((name, f'{what}_{end}') for name, item in stepped.items() for end in ('min', 'max')
-              if getattr(item, f'{what}_min') == getattr(item, f'{what}_max')),
-            *((name, f'experiment_{end}') for name, item in self.states.items()
-              for end, none in (('min', -UNBOUNDED), ('max', UNBOUNDED))
-              if getattr(item, f'experiment_{end}') == none)]]
+        steps = zip(*self._steps(signals, on_setpoints), strict=True)
+        bounds = zip(signals.states, self.measured_min, self.measured_max, strict=True)
+        rows = [*((name, f'{what}_{end}') for name, low, high in steps if low == high
+                  for end in ('min', 'max')),
+                *((name, f'experiment_{end}') for name, low, high in bounds
+                  for end, bound in (('min', low), ('max', high)) if np.isinf(bound))]
+        return [f'{name}.{row} [{display_unit(signals.units[name])}]' for name, row in rows]
 
     def setpoint_ranges(self, signals: Signals) -> dict[str, tuple[float, float]]:
         """Return the lowest and highest set-point of states that have a range, in their units."""
-        lows, highs = (in_own_units(self.states, f'setpoint_{end}', signals.states).tolist()
-                       for end in ('min', 'max'))
-        return {name: (low, high)
-                for name, low, high in zip(signals.states, lows, highs, strict=True)
-                if name in signals.controlled and low < high}
+        names, lows, highs = self._steps(signals, on_setpoints=True)
+        return {name: (low, high) for name, low, high in zip(
+            names, lows.tolist(), highs.tolist(), strict=True) if low < high}
 
     def training(self) -> dict[str, Any]:
-        """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
+        """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""
         return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
                 'seed': self.training_seed, 'starts': self.training_starts,
                 'most_samples': self.training_samples,
                 'input_matrix_degree': self.input_matrix_degree,
                 'hidden_states': self.hidden_states, 'equations': self.equations,
                 'constants': named_ranges(self.constants_estimated),
+                'methods': self.identification_methods,
+                'method_parameters': {name: asdict(own) for name, own in self.methods.items()
+                                      if name in map(short_name, self.identification_methods)},
                 'margin': self.gate_margin, 'condition': self.gate_condition,
                 'scheduler': self.scheduler, 'device': self.device}
 
@@ -278,9 +274,14 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
                              f'{name}.{high}': shown(float(box.upper[i]))}
                 if box is present.inputs:
                     defaults[f'{name}.safe'] = shown(float(box.center[i]))
+    methods: dict[str, type[Any]] = {}
+    for names in ((), given.get('identification_methods', ())):
+        # what is no method, the check of the parameters refuses
+        with contextlib.suppress(ValueError):
+            methods |= parameters_of(tuple(filter(None, names)))
     return ParameterTable(
         TrainerParameters, partial(_cross_check, signals), partial(_plan, signals),
-        signals={'states': signals.states, 'inputs': signals.inputs},
+        signals={'states': signals.states, 'inputs': signals.inputs}, plugins=methods,
         defaults={**defaults, **own, 'system': system})
 
 
@@ -326,6 +327,10 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
     if reason := scheduler_refusal(values.scheduler):
         return reason
+    try:
+        parameters_of(values.identification_methods)
+    except ValueError as error:
+        return f'identification_methods = {list(values.identification_methods)}: {error}'
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
     n_x, n_u = len(signals.states), len(signals.inputs)

@@ -11,7 +11,7 @@ from typing import Any
 
 import rclpy
 
-from koopman_ros.jobs.training import JobState, RetrainingJob
+from koopman_ros.execution.training import JobState, TrainingJob
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.parameters.wire import SIGNALS, Wiring
@@ -89,7 +89,7 @@ def _one_scheduler(schedulers: Mapping[str, str]) -> str:
 
 def _retrain(task: Mapping[str, object], arrived: Sequence[int]) -> JobState:
     """Retrain in a process of its own; tell of the plants as they end."""
-    job = RetrainingJob(task)
+    job = TrainingJob(task)
     told: set[str] = set()
     progress = Progress(lambda text: print(text, file=sys.stderr, flush=True))
     try:

@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from koopman_ros.jobs.training import class_lines, constant_lines, JobState, RetrainingJob, scalars
+from koopman_ros.execution.training import (
+    class_lines,
+    constant_lines,
+    JobState,
+    scalars,
+    TrainingJob,
+)
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
 from koopman_ros.parameters.wire import preset, system_of, Wiring
@@ -37,7 +43,7 @@ def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
 
 def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
                 bags: Iterable[str]) -> dict[str, Any]:
-    """Return the fields of a :class:`koopman_ros.retraining.Task` of a trainer's parameters."""
+    """Return the fields of a `koopman_ros.learning.TrainingTask` of a trainer's parameters."""
     def found(place: Place) -> dict[str, str]:
         return {**asdict(place), 'topic': node.resolve_topic_name(place.topic)}
 
@@ -56,7 +62,8 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
                    for name, unit in states.items()],
         'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
                     'measured': found(wiring.applied[name]),
-                    'delay': settings.inputs[name].delay} for name, unit in inputs.items()],
+                    'delay': delay} for (name, unit), delay in zip(
+                        inputs.items(), settings.delay.tolist(), strict=True)],
         'setpoints': settings.setpoint_ranges(wiring.signals),
         'tolerance': settings.synchronisation_tolerance,
         'input_gain': {state: dict(zip(inputs, row, strict=True))
@@ -97,7 +104,7 @@ class Training:
         self.settings = settings  # of the next training
         self._node, self._wiring = node, wiring
         self._recorded, self._on_end = recorded, on_end
-        self._job: RetrainingJob | None = None
+        self._job: TrainingJob | None = None
         self._state: JobState | None = None
         self._progress = Progress(node.get_logger().info)
         self._diagnostics = node.diagnostics.add('training', self._status)
@@ -113,7 +120,7 @@ class Training:
                 if bag]
         if not bags:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
-        self._job = RetrainingJob(task_fields(self._node, settings, self._wiring, bags))
+        self._job = TrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
         self._progress = Progress(self._node.get_logger().info)
         self._timer.reset()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the campaign leaves behind: a page and a picture for people, figures for programs."""
+"""The report of the campaign: a page and a picture for people, figures for programs."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from studies.faults.plants import PLANTS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FIGURE = 'cases.png'
 # Drawn, because they tell most.
 TELLING = ('nan-long', 'bias', 'feed-warm', 'controller-killed-in-a-step', 'plant-reset',
            'actuator-saturated', 'two_tanks-silent-one', 'quadruple_tank-frozen-one')
 _BEFORE, _AFTER = 30.0, 300.0  # s around the fault
+_HEAD = ('case', 'fault', 'worst error', 'worst step', 'back after [s]', 'left', '')
 
 
 def write(folder: Path, results: Mapping[str, dict[str, Any]],
           runs: Mapping[str, dict[str, Any]] | None = None,
           traces: Mapping[str, Trace] | None = None) -> bool:
     """
-    Write a page, figures and, where traces are given, a picture of what has been run so far.
+    Write a page, figures and, where traces are given, a picture of all cases so far.
 
-    :return: whether nothing is held against any case that could be tried, nor an endurance run.
+    :return: whether every case that could be tried was survived, and every endurance run.
     """
     figures: dict[str, Any] = {
         'machine': reports.machine(), 'cases': len(results),
@@ -39,8 +39,9 @@ def write(folder: Path, results: Mapping[str, dict[str, Any]],
         'skipped': sum('skipped' in result for result in results.values()),
         'results': results, **(runs or {})}
     reports.write_figures(folder / 'summary.json', figures)
-    picture = FIGURE if _draw(traces or {}, folder / FIGURE) else ''
-    reports.write_page(folder / 'report.md', 'Fault campaign', _sections(figures, picture))
+    drawn = _draw(traces or {}, folder / 'cases.png')
+    reports.write_page(folder / 'report.md', 'Fault campaign', [
+        *_sections(figures), *(['![Some of the cases](cases.png)'] if drawn else [])])
     return figures['survived'] + figures['skipped'] == len(results) and all(
         run['survived'] for run in (runs or {}).values())
 
@@ -48,9 +49,7 @@ def write(folder: Path, results: Mapping[str, dict[str, Any]],
 def line(result: dict[str, Any]) -> str:
     """Write a case as one line of the terminal."""
     *_, error, step, back, _, verdict = _row('', result)
-    units = (result.get('unit', ''), result.get('input_unit', ''))
-    figures = (f'worst error {error:>6} {units[0]}, step {step:>5} {units[1]}, '
-               f'back after {back:>5} s')
+    figures = f'worst error {error}, step {step}, back after {back} s'
     return '; '.join([f'{verdict:12} {figures}' if error else verdict,
                       *result.get('reasons', ())])
 
@@ -62,19 +61,16 @@ def by_plant(results: Mapping[str, dict[str, Any]]) -> str:
     return ', '.join(f'{name} {survived[name]} of {count}' for name, count in counts.items())
 
 
-def _sections(figures: dict[str, Any], picture: str) -> Iterator[str]:
+def _sections(figures: dict[str, Any]) -> Iterator[str]:
     results = figures['results']
     skipped = f', {figures["skipped"]} skipped' if figures['skipped'] else ''
     yield (f'{figures["survived"]} of {figures["cases"]} cases survived{skipped}: '
            f'{by_plant(results)}. Plant and controller are real processes; times are plant time.')
-    yield ('A case is survived when every command was finite, within its range and without a '
-           'bump, the plant was not lost and came back to its set-points in time, diagnostics '
-           'said what they should, the commands follow from the records to the bit, and no '
-           'process failed. The worst error is the largest of a true state from its set-point, '
-           'steps of the set-point included; the worst step is that of an input between two '
-           'commands.')
-    present = {PLANTS[result['plant']] for result in results.values()}
-    on = [plant for plant in PLANTS.values() if plant in present]
+    yield ('A case is survived if every command was finite, within its range and without a bump, '
+           'the plant was not lost and came back to its set-points in time, diagnostics reported '
+           'the fault, the commands follow from the records to the bit, and no process failed.')
+    on = [plant for plant in PLANTS.values()
+          if plant.name in {result['plant'] for result in results.values()}]
     yield reports.table(
         ('plant', 'back within', 'in at most [s]', 'lost from', 'fastest command'),
         ((plant.name, f'{plant.band:g} {plant.unit}', f'{plant.recovery:g}',
@@ -84,17 +80,12 @@ def _sections(figures: dict[str, Any], picture: str) -> Iterator[str]:
         own = {name: result for name, result in results.items() if result['plant'] == plant.name}
         for group in dict.fromkeys(result['group'] for result in own.values()):
             yield f'## {plant.name}: {group}'
-            yield reports.table(
-                ('case', 'what is done', f'worst error [{plant.unit}]',
-                 f'worst step [{plant.input_unit}]', 'back after [s]', f'left [{plant.unit}]', ''),
-                (_row(name, result) for name, result in own.items()
-                 if result['group'] == group), (2, 3, 4, 5))
-    if picture:
-        yield f'![Some of the cases]({picture})'
+            yield reports.table(_HEAD, (_row(name, result) for name, result in own.items()
+                                        if result['group'] == group), (2, 3, 4, 5))
     failed = [f'**{name}**: {"; ".join(result["reasons"])}' for name, result in results.items()
               if result.get('reasons')]
     if failed:
-        yield '## What failed'
+        yield '## Failures'
         yield reports.bullets(failed)
     for name, run in figures.items():
         if name.startswith('soak'):
@@ -105,19 +96,20 @@ def _row(name: str, result: dict[str, Any]) -> tuple[str, ...]:
     does = '; '.join([result['does'], *result['notes']])
     if 'skipped' in result:
         return name, does, '', '', '', '', f'skipped: {result["skipped"]}'
-    back = result['time_to_recover_s']
-    return (name, does, f'{result["worst_error"]:.3g}', f'{result["worst_step"]:.2f}',
+    back, unit = result['time_to_recover_s'], result.get('unit', '')
+    return (name, does, f'{result["worst_error"]:.3g} {unit}',
+            f'{result["worst_step"]:.2f} {result.get("input_unit", "")}',
             f'{back:.0f}' if math.isfinite(back) else 'never',
-            f'{result["offset_at_the_end"]:.2g}',
+            f'{result["offset_at_the_end"]:.2g} {unit}',
             'survived' if result['survived'] else '**failed**')
 
 
 def _endurance_sections(name: str, run: dict[str, Any]) -> Iterator[str]:
     yield f'## Endurance: {name}'
     yield (f'{"Survived" if run["survived"] else "**Failed**"}: {run["hours"]:g} h of plant time '
-           f'in {run["wall_seconds"]:.0f} s with {sum(run["events"].values())} events. The '
-           f'reactor was {run["mean_error_K"]:.2f} K from its set-point on average and never '
-           f'above {run["hottest_degC"]:.1f} °C.')
+           f'in {run["wall_seconds"]:.0f} s with {sum(run["events"].values())} events. The mean '
+           f'error was {run["mean_error_K"]:.2f} K, the highest temperature '
+           f'{run["hottest_degC"]:.1f} °C.')
     yield reports.bullets(run['reasons'])
     for title, counts in (('messages', run['answers']), ('recorded', run['recorded']),
                           ('event', dict(sorted(run['events'].items())))):
@@ -131,39 +123,37 @@ def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
     """Draw the first controlled state and the first input of telling cases, if there are any."""
     shown = {name: trace for name in TELLING if (trace := traces.get(name)) is not None
              and trace.commands and math.isfinite(trace.end)}
-    if not shown:
-        return False
-    size = (3.2 * len(shown), 5.2)
-    with reports.drawing(path, 2, len(shown), size=size, sharex='col') as (_, panels):
-        for upper, lower, name in zip(panels, panels[len(shown):], shown, strict=False):
-            _draw_case(upper, lower, shown[name])
-            upper.set_title(name, fontsize='medium')
-        for panel in (panels[0], panels[len(shown)]):
-            panel.legend(fontsize='small')
-    return True
+    if shown:
+        with reports.drawing(path, 2, len(shown), size=(3.2 * len(shown), 5.2),
+                             sharex='col') as (_, panels):
+            for upper, lower, name in zip(panels, panels[len(shown):], shown, strict=False):
+                _draw_case(upper, lower, shown[name])
+                upper.set_title(name, fontsize='medium')
+            for panel in (panels[0], panels[len(shown)]):
+                panel.legend(fontsize='small')
+    return bool(shown)
 
 
 def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
     on = trace.on
     state = on.controlled[0]
-    for axes, name, unit in zip((upper, lower), (state, on.inputs[0]), on.shown_units,
-                                strict=True):
-        axes.set_ylabel(f'{name} [{unit}]')
     times = [seconds for seconds, _ in trace.samples]
     true = [states[on.states.index(state)] for _, states in trace.samples]
+    since, wanted = zip(*((seconds, values[0]) for seconds, values in trace.setpoints),
+                        strict=True)
     upper.plot(times, true, label='true')
-    since = [seconds for seconds, _ in trace.setpoints]
-    wanted = [setpoint[0] for _, setpoint in trace.setpoints]
     upper.step([*since, times[-1]], [*wanted, wanted[-1]], where='post', linestyle='--',
                color='black', linewidth=1.0, label='set-point')
     lower.plot([command.seconds for command in trace.commands],
                [command.values[0] for command in trace.commands], label='command')
     reports.draw_limits(lower, on.range(on.inputs[0]), 'limits')
-    for axes in (upper, lower):
+    for axes, name, unit in zip((upper, lower), (state, on.inputs[0]), on.shown_units,
+                                strict=True):
+        axes.set_ylabel(f'{name} [{unit}]')
         axes.axvspan(trace.begin, max(trace.end, trace.begin + 2.0), alpha=0.2,
                      color='tab:red', linewidth=0.0, label='fault')
-    upper.set_xlim(trace.begin - _BEFORE, min(trace.end + _AFTER, times[-1]))
     near = [*wanted, *(value for seconds, value in zip(times, true, strict=True)
                        if seconds > trace.begin - _BEFORE)]
-    upper.set_ylim(min(near) - 2.0 * on.band, max(near) + 2.0 * on.band)
+    upper.set(xlim=(trace.begin - _BEFORE, min(trace.end + _AFTER, times[-1])),
+              ylim=(min(near) - 2.0 * on.band, max(near) + 2.0 * on.band))
     lower.set_xlabel('plant time [s]')

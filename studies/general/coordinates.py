@@ -14,15 +14,14 @@ from scipy.integrate import solve_ivp
 from koopman_ros.arrays import Array
 from koopman_ros.control import averaged, recentred
 from koopman_ros.learning import NoUsefulLift, rollout_rmse, train
-from koopman_ros.learning.validation import drift_error
+from koopman_ros.learning.lift.metrics import drift_error
 from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plant_data import Samples, split_by_episode
 from koopman_ros.plants import describe
+from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import LEARNERS, RECIPES
 from studies.general.loops import judged, known, loops, STARTS
 from studies.general.systems import Case, CASES
-from studies.paper.campaign import Experiment
-from studies.paper.datasets import Metrics, Models
 
 PLACE = 'coordinates'  # of its figures in the summary
 SEEDS = 3  # as many of those of the study

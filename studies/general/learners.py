@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from koopman_ros.learning import Edmd, Growth, NeuralDrift, NoUsefulLift, train
-from koopman_ros.learning.starts import Recipe
+from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 
@@ -93,7 +93,7 @@ RECIPES: dict[str, Callable[[int], Recipe]] = {
     'identity lift': lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS),
     'free lift': lambda n_x: Growth(
         n_x, identity=False, hidden_first=16, max_iterations=_STEPS),
-    'neural drift': lambda n_x: NeuralDrift((16,), max_iterations=_STEPS),
+    'neural drift': lambda n_x: NeuralDrift(16, max_iterations=_STEPS),
 }
 LEARNERS: dict[str, Learner] = {
     'linear': _polynomial(1),

@@ -15,8 +15,8 @@ from koopman_ros.control import Feedback, feedback, Form, run_closed_loop, Targe
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants.optimum import optimum, Task
 from koopman_ros.solvers import solve_riccati
+from studies.campaign import Metrics
 from studies.general.systems import Case, CASES
-from studies.paper.datasets import Metrics
 
 STARTS = 20
 OPTIMA = 5  # of the first of them, as the least cost takes a second to find

@@ -11,11 +11,10 @@ from koopman_ros.learning import fit, rollout_rmse
 from koopman_ros.lifting.model_file import MAX_COORDINATES
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import describe
+from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import Learned, LEARNERS
 from studies.general.loops import judged, known, loops, STARTS
 from studies.general.systems import Case, CASES
-from studies.paper.campaign import Experiment
-from studies.paper.datasets import Metrics, Models
 
 _HELD_OUT = 40  # episodes that no training has seen
 LQR, SDRE = 'LQR on the truth', 'natural SDRE on the truth'

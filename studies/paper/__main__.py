@@ -7,50 +7,53 @@ The paper's experiments, and those on data from a sensor: figures, tables and a 
 Run it as ``python -m studies.paper`` (needs the `train` and `demo` requirements).
 """
 
-import argparse
 from pathlib import Path
-import signal
 import sys
-import time
 from typing import Any
 
-from studies.options import add_scheduler, add_seeds, read
-from studies.paper.campaign import (
-    conclude,
-    run_campaign,
-    SENSOR_EXPERIMENTS,
-)
+from studies import campaign as campaigns
+from studies.campaign import Campaign, Experiment, read_options, run_campaign
+from studies.paper import reactor, scalar, sensors, two_state
 from studies.paper.figures import draw_figures
 from studies.paper.report import write_report
 
+# Each experiment with the place of its figures in the summary; the slow ones first.
+EXPERIMENTS: dict[str, Experiment] = {
+    'reactor': reactor.run,
+    'two_state': two_state.run,
+    'narrow': two_state.run_narrow,
+    'paper_algorithm/reactor': reactor.run_paper,
+    'paper_algorithm/two_state': two_state.run_paper,
+    'scalar': scalar.run,
+}
+# The same for what the paper leaves open: data from a sensor.
+SENSOR_EXPERIMENTS: dict[str, Experiment] = {
+    'sensors/drifted': sensors.run_drifted,
+    'sensors/noisy': sensors.run_noisy,
+    'sensors/noise_free': sensors.run_noise_free,
+    'sensors/two_state': sensors.run_two_state,
+}
+
 
 def main(args: list[str] | None = None) -> int:
-    """Run the experiments and write what they found."""
-    parser = argparse.ArgumentParser(
-        prog='python -m studies.paper',
-        description="Reproduce the paper's experiments, or learn from sensor data, each from "
-        'several seeds.')
-    add_seeds(parser, 20)
-    parser.add_argument('--sensors', action='store_true', help='learn from noisy, sampled data '
-                        "instead of the paper's experiments")
-    parser.add_argument('--output', type=Path, help='folder for figures and report (default: '
-                        'out/studies, or out/studies-sensors)')
-    add_scheduler(parser)
-    options = read(parser, args)
-    options.output = options.output or Path(
-        'out/studies-sensors' if options.sensors else 'out/studies')
-    # a request to end is an interrupt: what is done is reported
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    start = time.monotonic()
-    campaign = run_campaign(options.seeds, SENSOR_EXPERIMENTS if options.sensors else None,
-                            options.scheduler)
+    """Run the experiments and write the report."""
+    options = read_options(
+        args, 'paper', "Reproduce the paper's experiments, or learn from sensor data, each from "
+        'several seeds.', 'out/studies', 20, 'joblib',
+        flags={'sensors': "learn from noisy, sampled data instead of the paper's experiments "
+                          '(default folder: out/studies-sensors)'})
+    output: Path = options.output
+    if options.sensors and output == Path('out/studies'):
+        output = Path('out/studies-sensors')
 
-    def report(summary: dict[str, Any]) -> str:
-        figures = draw_figures(campaign, options.output)
-        write_report(summary, figures, options.output / 'report.md')
-        return f'{len(figures)} figures'
+    def report(campaign: Campaign, summary: dict[str, Any]) -> str:
+        pictures = draw_figures(campaign, output)
+        write_report(summary, pictures, output)
+        return f'{len(pictures)} figures'
 
-    return conclude(campaign, options.seeds, start, options.output, report)
+    return campaigns.conclude(options.seeds, output, lambda: run_campaign(
+        options.seeds, SENSOR_EXPERIMENTS if options.sensors else EXPERIMENTS,
+        options.scheduler), report)
 
 
 if __name__ == '__main__':

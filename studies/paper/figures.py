@@ -15,9 +15,8 @@ from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign
 from koopman_ros.reports import drawing, DRAWN_RANGE, legend, LIMIT, Picture
+from studies.campaign import Campaign
 from studies.paper import reactor, scalar, two_state
-from studies.paper.campaign import Campaign
-from studies.paper.datasets import random_step_episodes
 
 # The paper's colours.
 EXACT: dict[str, Any] = {'color': 'black', 'linewidth': 1.8}
@@ -25,6 +24,7 @@ LEARNED: dict[str, Any] = {'color': 'tab:green', 'linestyle': '--', 'linewidth':
 LINEAR: dict[str, Any] = {'color': 'tab:red', 'linewidth': 1.2}
 _LIFTED: dict[str, Any] = {'color': 'tab:red', 'linestyle': '--', 'linewidth': 1.8}
 FIGURE_SEED = 0
+_loops: dict[int, ClosedLoop] = {}  # by the identity of the model, which the campaign keeps
 FIGURE_NARROW_BOX = '[4,5.5]x[4,5.5]'
 
 
@@ -33,17 +33,17 @@ def draw_figures(campaign: Campaign, folder: Path) -> list[Picture]:
     drawn = []
     for name, experiments, draw in (
             ('01_scalar_example', ('scalar',), _scalar),
-            ('02_two_state_derivatives', ('two_state',), _wide_derivatives),
-            ('03_two_state_control', ('two_state',), _wide_control),
+            ('02_two_state_derivatives', ('two_state',), partial(_both_derivatives, 'wide')),
+            ('03_two_state_control', ('two_state',), partial(_both_control, 'wide')),
             ('04_reactor_in_range', ('reactor',), partial(_roll_outs, reactor.IN_RANGE, 'within')),
             ('05_reactor_out_of_range', ('reactor',), partial(
                 _roll_outs, reactor.OUT_OF_RANGE, 'that leave')),
             ('06_reactor_set_point', ('reactor',), _set_point),
-            ('07_wide_box', ('two_state',), _wide_box),
-            ('08_narrow_derivatives', ('narrow',), _narrow_derivatives),
-            ('09_narrow_control', ('narrow', 'two_state'), _narrow_control),
-            ('10_narrow_box', ('narrow',), _narrow_box),
-            ('11_both_boxes', ('narrow', 'two_state'), _both_boxes),
+            ('07_wide_box', ('two_state',), partial(_boxes_of, ('wide',))),
+            ('08_narrow_derivatives', ('narrow',), partial(_both_derivatives, 'narrow')),
+            ('09_narrow_control', ('narrow', 'two_state'), partial(_both_control, 'narrow')),
+            ('10_narrow_box', ('narrow',), partial(_boxes_of, ('narrow',))),
+            ('11_both_boxes', ('narrow', 'two_state'), partial(_boxes_of, ('wide', 'narrow'))),
             ('12_sensors', ('sensors/noisy', 'sensors/noise_free', 'sensors/drifted',
                             'sensors/two_state'), _sensors)):
         if all(name in campaign.models for name in experiments):
@@ -68,11 +68,18 @@ def worst_narrow(campaign: Campaign) -> tuple[int, LiftedModel]:
     return seed, campaign.models['narrow'][seed][FIGURE_NARROW_BOX]
 
 
-def _loop(campaign: Campaign, model: LiftedModel) -> ClosedLoop:
+def _lift(campaign: Campaign, where: str) -> tuple[int, LiftedModel]:
+    """Return seed and lift of the wide box, or of the narrow one."""
+    if where == 'narrow':
+        return worst_narrow(campaign)
+    return min(campaign.models['two_state']), _model(campaign, 'two_state', 'wide')
+
+
+def _loop(model: LiftedModel) -> ClosedLoop:
     """Regulate the two-state example with R = 1 by one of the models, once for all figures."""
-    if id(model) not in campaign.loops:
-        campaign.loops[id(model)] = two_state.close_loop(model, 1.0)
-    return campaign.loops[id(model)]
+    if id(model) not in _loops:
+        _loops[id(model)] = two_state.close_loop(model, 1.0)
+    return _loops[id(model)]
 
 
 def _scalar(campaign: Campaign, path: Path) -> str:
@@ -127,24 +134,19 @@ def _derivatives(model: LiftedModel, box: two_state.Box, path: Path) -> float:
     return float(np.max(np.abs(exact - linear)) / np.max(np.abs(exact)))
 
 
-def _wide_derivatives(campaign: Campaign, path: Path) -> str:
-    off = _derivatives(_model(campaign, 'two_state', 'wide'), two_state.WIDE, path)
-    return ('Time derivatives of the lifted coordinates (scaled) along a training trajectory; '
-            f'the two sides differ by at most {off:.1e} of the largest.')
-
-
-def _narrow_derivatives(campaign: Campaign, path: Path) -> str:
-    seed, model = worst_narrow(campaign)
-    off = _derivatives(model, two_state.NARROW[FIGURE_NARROW_BOX], path)
-    return (f'As figure 2, for the narrow box, seed {seed}: within the box the two sides differ '
-            f'by at most {off:.1e} of the largest, and nothing warns.')
+def _both_derivatives(where: str, campaign: Campaign, path: Path) -> str:
+    seed, model = _lift(campaign, where)
+    box = two_state.WIDE if where == 'wide' else two_state.NARROW[FIGURE_NARROW_BOX]
+    off = _derivatives(model, box, path)
+    return (f'Rates of the lifted coordinates along a training trajectory in the {where} box, '
+            f'seed {seed}; the two sides differ by at most {off:.1e} of the largest.')
 
 
 def _control(campaign: Campaign, path: Path, label: str, learned: LiftedModel
              ) -> tuple[ClosedLoop, ...]:
     """Draw the control by a learned lift beside those by linearisation and exact lift."""
     linear = _model(campaign, 'two_state', 'linear')
-    loops = _loop(campaign, linear), two_state.exact_loop(1.0), _loop(campaign, learned)
+    loops = _loop(linear), two_state.exact_loop(1.0), _loop(learned)
     with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
         for name, style, loop in zip(('linearisation', 'exact lift', label),
                                      (LINEAR, EXACT, LEARNED), loops, strict=True):
@@ -157,24 +159,19 @@ def _control(campaign: Campaign, path: Path, label: str, learned: LiftedModel
     return loops
 
 
-def _wide_control(campaign: Campaign, path: Path) -> str:
-    linear, exact, learned = _control(
-        campaign, path, 'learned lift', _model(campaign, 'two_state', 'wide'))
-    return ('Control of the two-state example from (5, 5), R = 1. Costs: exact '
-            f'{exact.cost:.2f}, learned {learned.cost:.2f}, linearised {linear.cost:.2f}.')
-
-
-def _narrow_control(campaign: Campaign, path: Path) -> str:
-    seed, model = worst_narrow(campaign)
-    *_, loop = _control(campaign, path, f'learned on {FIGURE_NARROW_BOX}', model)
-    end = loop.failure or f'x2 ends at {loop.states[-1, 1]:.3g}'
-    return f'The same control with a lift learned on the narrow box, seed {seed}: {end}.'
+def _both_control(where: str, campaign: Campaign, path: Path) -> str:
+    seed, model = _lift(campaign, where)
+    linear, exact, learned = _control(campaign, path, f'lift of the {where} box', model)
+    end = learned.failure or f'{learned.cost:.2f}'
+    return (f'Control of the two-state example from (5, 5), R = 1, by a lift of the {where} box, '
+            f'seed {seed}. Costs: exact {exact.cost:.2f}, learned {end}, linearised '
+            f'{linear.cost:.2f}.')
 
 
 def _roll_outs(design: RandomStepDesign, where: str, campaign: Campaign, path: Path) -> str:
     models = {name: _model(campaign, 'reactor', name) for name in ('nz=3', 'linear')}
     states, inputs = models['nz=3'].states, models['nz=3'].inputs
-    truth = random_step_episodes(reactor.SYSTEM, design, 1, 60.0, 77)
+    truth = reactor.random_steps_of(design, 1, 60.0, 77)
     assert truth.time is not None
     errors = {}
     with drawing(path, 2, 1, size=(8.0, 5.5), sharex=True, height_ratios=(3, 1)
@@ -238,28 +235,18 @@ def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, ClosedLoop
         legend(figure, [axes], 3)
 
 
-def _wide_box(campaign: Campaign, path: Path) -> str:
-    loop = _loop(campaign, _model(campaign, 'two_state', 'wide'))
-    _boxes(path, [('wide box', 'gold', two_state.WIDE, loop, 'tab:red')])
-    return 'The wide training box holds the whole path of the controlled system.'
-
-
-def _narrow_box(campaign: Campaign, path: Path) -> str:
-    seed, model = worst_narrow(campaign)
-    box, loop = two_state.NARROW[FIGURE_NARROW_BOX], _loop(campaign, model)
-    _boxes(path, [('narrow box', 'gold', box, loop, 'tab:red')])
-    return (f'The narrow training box, seed {seed}: the path starts in it and leaves it, by up '
-            f'to {loop.distance(model):.2g} times half its width.')
-
-
-def _both_boxes(campaign: Campaign, path: Path) -> str:
-    _, narrow = worst_narrow(campaign)
-    wide = _model(campaign, 'two_state', 'wide')
-    _boxes(path, [
-        ('wide box', 'white', two_state.WIDE, _loop(campaign, wide), 'tab:green'),
-        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX], _loop(campaign, narrow),
-         'tab:red')])
-    return 'Both boxes and paths in one picture: the same start, another training range.'
+def _boxes_of(where: tuple[str, ...], campaign: Campaign, path: Path) -> str:
+    lifts = {name: _lift(campaign, name) for name in where}
+    boxes = {'wide': two_state.WIDE, 'narrow': two_state.NARROW[FIGURE_NARROW_BOX]}
+    colors = {'wide': ('gold', 'tab:green'), 'narrow': ('grey', 'tab:red')}
+    loops = {name: _loop(model) for name, (_, model) in lifts.items()}
+    _boxes(path, [(f'{name} box', 'white' if name == 'wide' and len(where) > 1 else
+                   colors[name][0], boxes[name], loops[name], colors[name][1])
+                  for name in where])
+    left = ', '.join(f'that of the {name} box by {max(0.0, loops[name].distance(model)):.2g}'
+                     for name, (_, model) in lifts.items())
+    return ('Training boxes and the paths of the controlled system, which leave them by up to so '
+            f'many half widths: {left}.')
 
 
 def _sensors(campaign: Campaign, path: Path) -> str:

@@ -15,9 +15,11 @@ from koopman_ros.plants import (
     describe,
     equilibrium_input,
     one_state_reactor,
+    random_steps,
     RandomStepDesign,
+    sample_derivatives,
 )
-from studies.paper.datasets import Metrics, Models, random_step_episodes
+from studies.campaign import Metrics, Models
 from studies.paper.optimal_control import scalar_optimal_cost
 
 SYSTEM = one_state_reactor()
@@ -46,6 +48,13 @@ EDMD_DEGREE = 5
 def training_samples(seed: int) -> Samples:
     """Simulate 240 episodes of 1 min under random coolant steps from anywhere in the box."""
     return box_episodes(SYSTEM, TRAINING, 240, 1.0, seed)
+
+
+def random_steps_of(design: RandomStepDesign, episodes: int, duration: float, seed: int
+                    ) -> Samples:
+    """Simulate random coolant steps from T_ss, each episode of so many min, with rates."""
+    return sample_derivatives(SYSTEM, [
+        random_steps(SYSTEM, design, duration, seed + number) for number in range(episodes)])
 
 
 def close_loop(model: LiftedModel) -> ClosedLoop:
@@ -130,7 +139,7 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
 
 def _all_judged(models: dict[str, LiftedModel], seed: int) -> Metrics:
     fresh = (training_samples(1000 + seed), *(
-        random_step_episodes(SYSTEM, design, 10, 30.0, 10_000 * seed + 5_000)
+        random_steps_of(design, 10, 30.0, 10_000 * seed + 5_000)
         for design in (IN_RANGE, OUT_OF_RANGE)))
     return {f'{name}/{figure}': value for name, model in models.items()
             for figure, value in judged(model, *fresh).items()}

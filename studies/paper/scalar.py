@@ -8,7 +8,7 @@ import numpy as np
 from koopman_ros.learning import fit, Growth, train
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import describe, scalar_example
-from studies.paper.datasets import Metrics, Models
+from studies.campaign import Metrics, Models
 
 RANGE = (0.0, 5.0)
 PARTS = {'rw_in': RANGE, 'rw_5_6': (5.0, 6.0), 'rw_6_8': (6.0, 8.0)}

@@ -11,13 +11,20 @@ from koopman_ros import experiment as experiments
 from koopman_ros import plants
 from koopman_ros.arrays import Array
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, simulate, Tuning
-from koopman_ros.identification import DriftModel, Identified, identify
-from koopman_ros.learning import NoUsefulLift, roll_out, Trained
+from koopman_ros.learning import (
+    decide,
+    Decision,
+    learn_lift,
+    NoUsefulLift,
+    roll_out,
+    Thresholds,
+    Trained,
+)
+from koopman_ros.learning.identification import DriftModel, Identified, identify
 from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import ControlAffineSystem, describe, RandomStepDesign
-from koopman_ros.retraining import decide, Decision, learn_lift, Thresholds
-from studies.paper.datasets import Metrics, Models
+from studies.campaign import Metrics, Models
 from studies.paper.reactor import SETPOINT, SYSTEM
 
 NOISE = 0.1  # K

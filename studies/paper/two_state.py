@@ -24,7 +24,7 @@ from koopman_ros.control import (
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign, two_state_example
-from studies.paper.datasets import Metrics, Models
+from studies.campaign import Metrics, Models
 from studies.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,
@@ -57,7 +57,7 @@ NARROW = {
 }
 WIDE_RECIPE = learning.Growth(3, hidden_first=16, max_iterations=600)
 NARROW_RECIPE = learning.Growth(3)
-PAPER_RECIPE = learning.Algorithm1(3, identity=True, hidden=(16,), max_iterations=100)
+PAPER_RECIPE = learning.Algorithm1(3, identity=True, hidden=16, max_iterations=100)
 STARTS = 2
 SYSTEM = two_state_example()
 

@@ -3,12 +3,12 @@
 
 """Run the study (needs the `demo`, `mpc` and `bench` requirements): table, figures, picture."""
 
-import argparse
 from collections.abc import Callable
 import sys
 
-from koopman_ros.reports import machine, write_figures, write_page
-from studies.options import add_output, add_plants, add_seeds, read
+from koopman_ros.reports import machine, write_figures
+from studies import report
+from studies.campaign import read_options
 from studies.partly_measured.cases import CASES
 from studies.partly_measured.contenders import Contender, LINEAR, OWN
 from studies.partly_measured.dompc import WithFilter, WithWindow
@@ -22,13 +22,9 @@ _PACKAGES = ('numpy', 'casadi', 'do-mpc', 'daqp', 'control')
 
 def main(args: list[str] | None = None) -> int:
     """Run every controller on every plant from several seeds."""
-    parser = argparse.ArgumentParser(
-        prog='python -m studies.partly_measured',
-        description='Control plants that are measured in part, beside do-mpc and an LQG.')
-    add_plants(parser, CASES)
-    add_seeds(parser)
-    add_output(parser, 'out/studies-partial')
-    options = read(parser, args, CASES)
+    options = read_options(
+        args, 'partly_measured', 'Control plants that are measured in part, beside do-mpc and an '
+        'LQG.', 'out/studies-partial', 10, plants=CASES)
     found = {}
     for plant in options.plants or CASES:
         case = CASES[plant]
@@ -43,9 +39,8 @@ def main(args: list[str] | None = None) -> int:
     write_figures(options.output / 'summary.json', {
         'machine': machine(*_PACKAGES), 'seeds': options.seeds, 'plants': figures})
     picture = draw(found, CASES, options.output / 'partly_measured.png')
-    write_page(options.output / 'report.md', 'Plants measured in part',
-               [text, str(picture)], _PACKAGES)
-    print(f'{options.seeds} seeds; processor time of a step, estimator and all\n\n{text}\n\n'
+    report.write(options.output, 'Plants measured in part', [text], [picture], _PACKAGES)
+    print(f'{options.seeds} seeds; processor time of a step with its estimator\n\n{text}\n\n'
           f'{options.output} holds all figures and a picture')
     return 0
 

@@ -3,35 +3,30 @@
 
 """Run the study (needs the `train`, `demo` and `bench` requirements): report and figures."""
 
-import argparse
 from pathlib import Path
 import sys
 import time
 
 from koopman_ros import __version__
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 from koopman_ros.reports import write_figures
-from studies.options import add_output, add_scheduler, read
+from studies.campaign import read_options
 from studies.robustness.report import write_report
 from studies.robustness.study import study
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the study and write what it found."""
-    parser = argparse.ArgumentParser(
-        prog='python -m studies.robustness',
-        description='Compute margins, region of attraction, disturbances, noise and the guard '
-        'against narrow data.')
-    add_output(parser, 'out/studies-robustness')
-    add_scheduler(parser, '')
-    options = read(parser, args)
+    """Run the study and write the report."""
+    options = read_options(
+        args, 'robustness', 'Compute margins, region of attraction, disturbances, noise and the '
+        'fallback of narrow data.', 'out/studies-robustness', scheduler='')
     output: Path = options.output
     start = time.monotonic()
     with backend_of(options.scheduler) as backend:
-        found = study(lambda line: print(line, file=sys.stderr, flush=True), backend)
+        found = study(backend)
     seconds = round(time.monotonic() - start, 1)
-    summary = {'package_version': __version__, 'wall_seconds': seconds, **found.figures}
-    write_figures(output / 'summary.json', summary)
+    write_figures(output / 'summary.json', {
+        'package_version': __version__, 'wall_seconds': seconds, **found.figures})
     write_report(found, output)
     print(f'wrote {output}/report.md, summary.json and figures in {seconds:.0f} s')
     return 0

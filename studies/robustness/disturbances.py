@@ -13,7 +13,7 @@ import numpy as np
 
 from koopman_ros.control import at, perfect, Sensor, Simulation, Timed
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
-from studies.paper.datasets import Metrics
+from studies.campaign import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import at_setpoint, changed_reactor, on_plant, REACTOR, START
 

@@ -13,8 +13,8 @@ from koopman_ros.control import at, Controller, Simulation
 from koopman_ros.learning import Growth, Linearisation, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign
+from studies.campaign import Metrics
 from studies.paper import two_state
-from studies.paper.datasets import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import REACTOR, START
 

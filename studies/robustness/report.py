@@ -14,7 +14,8 @@ import numpy as np
 from koopman_ros.arrays import Array
 from koopman_ros.control import Simulation
 from koopman_ros.reasons import level_words
-from koopman_ros.reports import drawing, DRAWN_RANGE, legend, Picture, table, write_page
+from koopman_ros.reports import drawing, DRAWN_RANGE, legend, Picture, table
+from studies import report
 from studies.paper import two_state
 from studies.robustness import disturbances, narrow
 from studies.robustness.loop import BANDWIDTH, shipped_model, START
@@ -39,7 +40,7 @@ def write_report(found: Found, folder: Path) -> None:
     """Write tables and pictures."""
     figures = found.figures
     ends = found.grids[True], found.grids[False], found.two_state_grid
-    write_page(folder / 'report.md', 'How far the loop can be pushed', [
+    report.write(folder, 'How far the loop can be pushed', [
         '## Margins, smallest over the trained range', _margin_table(found),
         f'In simulation at {START:.1f} K with the default parameters, 3 % below and above:',
         _table(figures['verified']),
@@ -60,10 +61,9 @@ def write_report(found: Found, folder: Path) -> None:
         '(wide):', _table(figures['narrow']['reactor']),
         'The shipped lift after UA −40 %:', _table(figures['narrow']['heat_transfer_-40%']),
         'The two-state example, by the box of its data:', _table(figures['narrow']['two_state']),
-        '## Figures', *(str(draw(found, folder / f'{name}.png')) for name, draw in (
+        ], [draw(found, folder / f'{name}.png') for name, draw in (
             ('margins', _draw_margins), ('noise', _draw_noise),
-            ('attraction', _draw_attraction), ('narrow', _draw_narrow)))],
-        ('torch', 'numpy', 'scipy'))
+            ('attraction', _draw_attraction), ('narrow', _draw_narrow))])
 
 
 def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -74,7 +74,7 @@ def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def _heading(name: str) -> str:
     """Return the name of a figure with its unit in brackets."""
-    words, unit = name.replace('ladder', 'fallback').split('_'), ''
+    words, unit = name.split('_'), ''
     if 'to' in words:  # the time until a deviation is no larger
         words, unit = [word for word in words if word != 'seconds'], ' [s]'
     elif words[-1] == 'kelvin':
@@ -173,8 +173,8 @@ def _draw_attraction(found: Found, path: Path) -> Picture:
                      ylabel='temperature at the start [K]')
         for name, label, style in (
                 ('physics_kelvin', 'no coolant saves it above', 'k-'),
-                ('ladder_kelvin', 'the loop with fallback', 'o--'),
-                ('no_ladder_kelvin', 'the learned law alone', 'x:')):
+                ('fallback_kelvin', 'the loop with fallback', 'o--'),
+                ('no_fallback_kelvin', 'the learned law alone', 'x:')):
             axes[2].plot(list(found.boundaries), [m[name] for m in found.boundaries.values()],
                          style, label=label)
         axes[2].set(title='hottest start that comes back', xlabel='coolant at the start [K]',

@@ -18,7 +18,7 @@ from koopman_ros.estimation import Estimate
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
 from koopman_ros.units import NANOSECONDS
-from studies.paper.datasets import Metrics
+from studies.campaign import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import at_setpoint, COOLANT, COOLANT_RANGE, PERIOD, REACTOR
 

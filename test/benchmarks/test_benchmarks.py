@@ -10,16 +10,16 @@ from typing import Any
 import warnings
 
 import casadi
+from koopman_ros.learning.levenberg_marquardt import normal_equations
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
-from benchmarks import ipopt, loop, planning, recording, solvers, step, training
+from benchmarks import ipopt, loop, planning, recording, solvers, training
 from benchmarks.__main__ import main
 from benchmarks.problems import build
 from benchmarks.sqp import Problem, solver_of, Sqp
-from koopman_ros.learning.levenberg_marquardt import normal_equations
 from studies.equations import EQUATIONS
 from studies.general.learners import LEARNERS
 from support.tensors import assert_close
@@ -40,7 +40,7 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> Any:
             ((100, 8),), 0.8, 10.0, 4e3, 1, ('one-state reactor',)))
         patch.setattr(training, 'SOLVERS', {
             name: training.SOLVERS[name] for name in ('ours', 'ipopt', 'adam')})
-        patch.setitem(loop.PLANS, 'quick', loop.Plan((2, 4), 60, 1, 1, 50.0, 12, False))
+        patch.setitem(loop.PLANS, 'quick', loop.Plan(1, 1, 50.0, 12, False))
         patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
         patch.setitem(recording.PLANS, 'quick', recording.Plan(1.0, 3000, 1))
         assert main(['--quick', '--output', str(folder)]) == 0
@@ -51,10 +51,6 @@ def test_every_part_leaves_its_figures(figures: dict[str, Any]) -> None:
     assert figures['another'] == {'kept': True}
     found = figures['loop']
     assert set(loop.MEANING) <= set(found)
-    for n_z, one in found['step'].items():
-        assert one['largest_difference_kelvin'] < 1e-9
-        assert found['step_ratio_to_naive'][n_z] == pytest.approx(
-            one['naive_cpu_median_us'] / one['cpu_median_us'])
     plan = found['plan']['pendulum']
     for side in ('do_mpc', 'sqp'):
         assert plan['agreement'][side] < planning.TOLERANCE[side]
@@ -82,11 +78,7 @@ def test_every_solver_has_a_time_or_a_reason_and_ours_reaches_the_targets(
                 assert ratio == pytest.approx(seconds / times['ours'])
 
 
-def test_laws_and_plans_that_differ_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    same = step.NaiveLaw.step
-    monkeypatch.setattr(step.NaiveLaw, 'step', lambda self, *given: same(self, *given) + 2e-6)
-    with pytest.raises(ValueError, match='differ'):
-        step.compare(3, 5)
+def test_plans_that_differ_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     rates = EQUATIONS['pendulum']
     monkeypatch.setitem(EQUATIONS, 'pendulum', lambda x, u: rates(x, 0.8 * u))
     with pytest.raises(ValueError, match='pendulum'):

@@ -13,9 +13,7 @@ from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, St
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
 from koopman_ros.reasons import Code
 from koopman_ros.units import NANOSECONDS as SECOND
-from studies.paper.optimal_control import exact_two_state_model
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
-from support.random_lifts import change_of_variable
 
 NOW = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 280.0, 304.0, 0.8
@@ -69,21 +67,6 @@ def test_a_start_elsewhere_holds_what_it_finds():
     _, command, report = controller().step(State(), np.array([SETPOINT]), NOW)
     np.testing.assert_array_equal(report.target.setpoint, [SETPOINT])
     np.testing.assert_allclose(command, [COOLANT], rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize('first', [math.nan, LARGEST, -LARGEST, 1e300, 0.0])
-def test_scaling_beyond_what_numbers_hold(first):
-    model = exact_two_state_model()
-    fine = replace(model, states=replace(model.states, scale=np.array([1e-3, 0.1])))
-    bounds = InputLimits(np.array([-2.0]), np.array([1.0]), np.array([np.inf]))
-    for second in (math.inf, LARGEST, -LARGEST, -1e300, -0.0):
-        for loop, measurement in (
-                (plain(fine, bounds), [first, second]),
-                (plain(change_of_variable(1e-3), bounds), [first]),
-                (plain(change_of_variable(1e3), bounds), [second])):
-            state = loop.step(State(), np.zeros(len(measurement)), NOW)[0]
-            command = loop.step(state, np.array(measurement), NOW + SECOND)[1]
-            assert -2.0 <= command[0] <= 1.0, second
 
 
 def test_what_a_step_returns_and_takes_cannot_be_changed_afterwards():
@@ -469,25 +452,6 @@ def test_the_ramp_starts_from_the_first_measurement_and_with_time(before):
 
 
 # What is given as lists, and what has another size.
-
-def test_lists_do_as_arrays_do():
-    model = shipped('reactor_nz4')
-    lists = Controller(model, Tuning.for_model(
-        model, state_weight=[1.0], input_weight=[1.0], limits=InputLimits(
-            [LOWER], [UPPER], [RATE])))
-    arrays = controller()
-    assert lists.tuning.state_weight.dtype == np.float64
-    np.testing.assert_array_equal(lists.initialise(State(), [290.0]).command, [290.0])
-    one, other = (loop.step(State(), value, NOW)[0] for loop, value in (
-        (lists, [START]), (arrays, np.array([START]))))
-    assert content(one) == content(other)
-    one, other = (loop.request_setpoint(state, value)[0] for loop, state, value in (
-        (lists, one, [SETPOINT]), (arrays, other, np.array([SETPOINT]))))
-    assert content(lists.step(one, [START], NOW + SECOND, [290.0])) == content(
-        arrays.step(other, np.array([START]), NOW + SECOND, np.array([290.0])))
-    manual = lists.set_mode(one, Mode.MANUAL)
-    np.testing.assert_array_equal(lists.request_manual_input(manual, [290])[0].manual_input, 290.0)
-
 
 @pytest.mark.parametrize(('act', 'message'), [
     (lambda loop, state: loop.step(state, [START, 1.0], NOW + SECOND),

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import (
-    Controller,
     exchange,
     InputLimits,
     Mode,
@@ -53,14 +52,6 @@ def test_limits(previous, wanted, seconds, rate, u, at_range, at_rate):
                     seconds)
     assert (limited.u[0], limited.at_range, limited.at_rate) == (
         pytest.approx(u, rel=1e-15), at_range, at_rate)
-
-
-def test_each_input_has_its_own_limits():
-    both = InputLimits(np.array([0.0, -5.0]), np.array([1.0, 5.0]), np.array([9.0, 0.5]))
-    limited = limit(both, np.array([3.0, 3.0]), np.array([0.5, 0.0]), 1.0)
-    np.testing.assert_array_equal(limited.u, [1.0, 0.5])
-    assert limited.at_range
-    assert limited.at_rate
 
 
 def step(size: float) -> BumplessTransfer:
@@ -209,15 +200,6 @@ def test_a_coolant_that_is_no_number_is_not_taken_over():
     np.testing.assert_array_equal(state.command, [305.15])
     # later it is no news
     assert loop.initialise(state, np.array([290.0])) is state
-
-
-def test_a_controller_succeeds_itself_without_a_trace():
-    loop = loop_at(START)
-    before, state, x = loop.loop.controller, loop.loop.state, np.array([loop.kelvin])
-    again = Controller(before.model, before.tuning)
-    later = state.time_ns + 10 ** 9
-    np.testing.assert_array_equal(again.step(again.hand_over(before, state), x, later)[1],
-                                  before.step(state, x, later)[1])
 
 
 def test_who_wants_no_transfer_is_answered_by_the_law_from_the_first_measurement_on():

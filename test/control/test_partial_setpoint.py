@@ -109,26 +109,6 @@ def test_one_of_two_levels_is_held_under_a_disturbance(w):
         target.forcing + target.drift, np.zeros(2), rtol=0, atol=1e-9)
 
 
-def test_the_report_says_where_the_law_goes():
-    controller = loop(SERIES, 'h2', setpoint_ramp=np.array([0.05]))
-    state, _, report = stepped(controller, State(), [1.0, 1.0], 0)
-    np.testing.assert_array_equal(report.target.setpoint, [1.0])
-    np.testing.assert_allclose(report.target.state, [1.0, 1.0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(report.target.input, [3.0], rtol=0, atol=1e-12)
-    state, refused = asked(controller, 1.2, state)
-    assert refused is None
-    state, _, report = stepped(controller, state, [1.0, 1.0], 2)
-    # on its ramp
-    np.testing.assert_allclose(report.target.setpoint, [1.1], rtol=1e-12)
-    np.testing.assert_allclose(report.target.state, [1.05, 1.1], rtol=0, atol=1e-3)
-    np.testing.assert_array_equal(state.target, [*report.target.state, *report.target.input])
-    # of every state, the target is the set-point
-    whole = loop(BOTH)
-    report = stepped(whole, State(), [1.1, 1.3], 0)[2]
-    np.testing.assert_array_equal(report.target.state, [1.1, 1.3])
-    np.testing.assert_allclose(report.target.input, [3.1, 3.2], rtol=1e-12)
-
-
 def test_inputs_to_spare_go_least_far_from_the_nominal_point():
     # h1 = 1 + a, q1 = 3 + a, q2 = 3 + r - a; in scaled deviations a / 0.5, a / 2 and (r - a) / 2:
     # the sum of squares is least where 4 a + 0.25 a = 0.25 (r - a)
@@ -480,7 +460,7 @@ changes = st.lists(st.tuples(
              min_size=3, max_size=3)), min_size=1, max_size=25)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.sampled_from([
     loop(SERIES, 'h2', lower=2.0, upper=4.0), loop(BOTH, 'h2', lower=2.0, upper=4.0),
     loop(THREE, 'h2', 'h3', setpoint_ramp=np.array([0.1, np.inf])), loop(SERIES, 'h1'),

@@ -104,7 +104,7 @@ RUNS = {name: (Run(name), limited(name, 10.0))
 
 
 @pytest.mark.parametrize('name', RUNS)
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(slow=st.booleans(), sequence=sequences)
 @np.errstate(all='ignore')
 def test_commands_keep_their_limits_and_follow_from_the_records(name, slow, sequence):

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from koopman_ros.learning import fit, Growth, NoUsefulLift, train
-from koopman_ros.learning.levenberg_marquardt import MinimumStatus
-from koopman_ros.learning.validation import ROUNDING
+from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
+from koopman_ros.learning.lift.metrics import ROUNDING
 from koopman_ros.plant_data import split_by_episode
 from support import small_plants
 from support.small_plants import BENT, bent_samples, bits, SMALL, UNFORCED, unforced_samples
@@ -109,11 +109,6 @@ def test_a_held_out_episode_at_rest():
     x[at_rest.episode == split_by_episode(at_rest, 0)[1].episode[0]] = 3.3
     with pytest.raises(ValueError, match='30 samples do not tell 2 coordinates apart'):
         train(BENT, replace(at_rest, x=x), SMALL)
-
-
-def test_there_must_be_a_start():
-    with pytest.raises(ValueError, match='starts must be at least 1, got 0'):
-        train(BENT, bent_samples(), SMALL, starts=0)
 
 
 def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.learning import Growth, train
-from koopman_ros.learning.residuals import deviations
+from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.lifting import (
     Box,
     Coordinates,

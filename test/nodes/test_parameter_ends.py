@@ -44,7 +44,7 @@ EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperatu
 PAIRS = (('validity_margin', 'linear_margin'),
          ('experiment_shortest_hold', 'experiment_longest_hold'),
          *((f'{name}min', f'{name}max') for name in (
-             'coolant_temperature.', 'temperature.', 'temperature.sensor_',
+             'coolant_temperature.', 'mpc.temperature.', 'temperature.sensor_',
              'coolant_temperature.experiment_', 'temperature.experiment_',
              'temperature.setpoint_')))
 

@@ -197,7 +197,7 @@ def test_measurements_come_at_their_times(ros: Harness, tmp_path: Path) -> None:
     ros.wait_until(lambda: len(arrived) == 9)
     assert ros.wait_for_end(process) == 0
     # the first one may come late on a busy machine, but none before its time
-    assert arrived[-1] - arrived[0] > 0.75 * 8.0 / 4.0
+    assert arrived[-1] - arrived[0] > 0.5 * 8.0 / 4.0
 
 
 def test_clock_shows_the_stamp_of_each_measurement(ros: Harness, tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_lift_that_is_refused_has_an_exit_code_of_its_own(
     """The words of a training that ends so; one that does runs beside the loop below."""
     end = {'summary': {'accepted': False, 'model_class': 'linear', 'model_file': '',
                        'reasons': ['it is too flat']}}
-    monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
+    monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
         sys.executable, '-c', f'print({json.dumps(end)!r})'))
     assert run_here(trainer, task='train', bags='[run]') == 2
     line = complaint(capfd)
@@ -73,7 +73,7 @@ def test_class_is_passed_on_and_each_that_was_learned_is_shown(
         'free lift': {'chosen': False, 'refusal': 'it has lost a state', 'seconds': 2.0}}
     end = {'accepted': False, 'model_class': 'linear', 'model_file': '',
            'units': {'temperature': 'K'}, 'classes': learned}
-    monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
+    monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
         sys.executable, '-c', 'import json; task = json.loads(input()); print(json.dumps('
         f'{{"summary": {{**json.loads({json.dumps(end)!r}), "reasons": [task["model_class"]]}}}}))'
     ))

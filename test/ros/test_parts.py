@@ -88,7 +88,7 @@ def made(part: str, node: Part, folder: Path) -> Callable[[], object]:
 def test_what_a_part_has_created_goes_with_it(
         shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
     # a training that loads no library, and ends when it is asked to
-    monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
+    monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
         'sh', '-c', 'cat > /dev/null'))
     node = Part('part', context=shared_ros.node.context)
     # which outlive the parts that report

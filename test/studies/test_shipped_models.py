@@ -34,7 +34,6 @@ from studies.paper.reactor import SETPOINT, SYSTEM, training_samples
 from studies.shipped_models import (
     library_system,
     LIFTS,
-    main,
     SADDLE,
     SEED,
     train_lift,
@@ -72,25 +71,6 @@ def roll_out_error(model, episodes):
     squares = [np.square(roll_out(model, episode.x[0], episode.u, SAMPLE_PERIOD)
                          - episode.x) for episode in episodes]
     return float(np.sqrt(np.mean(squares)))
-
-
-@pytest.mark.parametrize('n_z', [3, 4])
-def test_what_the_files_say(n_z):
-    model = shipped(f'nz{n_z}')
-    assert (model.n_x, model.n_u, model.n_z) == (1, 1, n_z)
-    assert model.identity
-    assert model.is_hurwitz
-    assert model.provenance.plant == SYSTEM.name
-    assert model.provenance.metrics.keys() == {'rw', 'rx', 'cond', 'rollout_rmse'}
-    assert len(model.provenance.data_digest) == 64
-    assert (model.states.names, model.states.units) == (SYSTEM.state_names, SYSTEM.state_units)
-    assert (model.inputs.names, model.inputs.units) == (SYSTEM.input_names, SYSTEM.input_units)
-    assert model.time_unit == SYSTEM.time_unit
-    np.testing.assert_array_equal(model.lift(np.zeros(1)), np.zeros(n_z))
-    np.testing.assert_allclose(model.states.center, SYSTEM.nominal_state, rtol=1e-12)
-    np.testing.assert_allclose(model.inputs.center, SYSTEM.nominal_input, rtol=1e-12)
-    np.testing.assert_allclose(
-        model.B * model.states.scale / model.inputs.scale, SYSTEM.B, rtol=1e-12)
 
 
 @pytest.mark.parametrize('name', ['nz3', 'nz4', 'linear'])
@@ -285,9 +265,3 @@ def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone(monkeypatch)
     # with the reactor's own equations and both states known it is 3.85 K
     assert largest < 4.2
     assert left < 0.05
-
-
-def test_models_that_there_are_not_are_refused(capsys):
-    with pytest.raises(SystemExit):
-        main(['teapot'])
-    assert 'no lift of teapot: choose of reactor, two_state' in capsys.readouterr().err

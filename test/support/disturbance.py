@@ -35,6 +35,6 @@ def disturb_training() -> None:
     """Disturb what `train` hands to its starts; figures and digests are of the data as given."""
     if not SIZE:
         return
-    from koopman_ros.learning import scaling
+    from koopman_ros.learning.lift import scaling
     original = scaling.ScaledSamples
     scaling.ScaledSamples = lambda *arrays: disturbed_data(original(*arrays))

@@ -9,7 +9,13 @@ import math
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from koopman_ros.identification import DriftModel, Method, METHODS, weak_forms
+from koopman_ros.learning.identification import (
+    DriftModel,
+    IdentificationMethod,
+    TotalVariation,
+    WeakForm,
+    WeakFormParameters,
+)
 from koopman_ros.lifting import Box, Coordinates
 from koopman_ros.plant_data import Episode, Plant
 from support.disturbance import disturbed
@@ -26,9 +32,10 @@ def box(state_lower, state_upper, input_lower, input_upper) -> Box:
                                               ('u', input_lower, input_upper))), 's')
 
 
-def methods(*windows: int) -> dict[str, Method]:
+def methods(*windows: int) -> dict[str, IdentificationMethod]:
     """Return few methods to choose from: the weak form with some windows, total variation."""
-    return {**weak_forms(*windows), 'total variation': METHODS['total variation']}
+    return {'weak_form': WeakForm(WeakFormParameters(windows)),
+            'total_variation': TotalVariation()}
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
-from koopman_ros.identification import Drift
+from koopman_ros.learning import TrainingTask
+from koopman_ros.learning.identification import Drift
+from koopman_ros.learning.record import Source
 from koopman_ros.plants.library.reactor import OneStateReactor
-from koopman_ros.retraining import Task
-from koopman_ros.retraining.record import Source
 from koopman_ros.solvers import runge_kutta_step
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_MINUTE
 from koopman_ros.wire import Place
@@ -66,11 +66,11 @@ def bags_of(count: int, folder: Path) -> list[Path]:
                   1.0 + run * (SAMPLES + 3600.0)) for run in range(count)]
 
 
-def task(bags: Sequence[Path], output: Path) -> Task:
+def task(bags: Sequence[Path], output: Path) -> TrainingTask:
     """Return the task of a first lift from some bags."""
     state, coolant = (Place(f'/{name}', TYPE, FIELD, 'K')
                       for name in ('temperature', 'coolant_temperature'))
-    return Task(tuple(map(str, bags)), str(output), '',
+    return TrainingTask(tuple(map(str, bags)), str(output), '',
                 (RecordedState('temperature', 'K', state),),
                 (RecordedInput('coolant_temperature', 'K', coolant),), plant='reactor at 1 Hz')
 

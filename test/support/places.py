@@ -7,7 +7,7 @@ import contextlib
 import logging
 import warnings
 
-from koopman_ros.jobs.backends import backend_of
+from koopman_ros.execution import backend_of
 
 KINDS = ('', 'process', 'joblib:2', 'dask')
 

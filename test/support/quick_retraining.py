@@ -9,19 +9,20 @@ from functools import partial
 
 import pytest
 
-from koopman_ros.retraining import compare_classes, decide
-from koopman_ros.retraining import task as task_module
-from koopman_ros.retraining.report import _sections
+from koopman_ros.learning import compare_classes, decide
+from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning.report import _sections
 from support.known_plants import methods
 
 
 @contextlib.contextmanager
-def quick_retraining(loops: int) -> Iterator[None]:
+def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
+                     windows: tuple[int, ...] = (20,)) -> Iterator[None]:
     """Estimate by a few methods alone, and try laws in so many loops."""
     original = task_module.identify
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task_module, 'identify',
-                      partial(original, degrees=(1, 3), methods=methods(20)))
+        patch.setattr(task_module, 'identify', lambda *given, **others: original(
+            *given, **{**others, 'degrees': degrees, 'methods': methods(*windows)}))
         patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(task_module, 'decide', partial(decide, loops=loops))
         yield

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from koopman_ros.learning import Growth, read_samples, Shard, write_samples
+from koopman_ros.learning import Growth
 from koopman_ros.plant_data import Plant, Samples
 from koopman_ros.plants import two_state_example
 
@@ -51,14 +51,3 @@ def bits(model):
     arrays = (model.A, model.B, network.W, network.b, network.V, model.states.scale,
               np.zeros(0) if model.readout is None else model.readout)
     return b''.join(array.tobytes() for array in arrays)
-
-
-def shards_of(samples, folder):
-    """Write samples to files, unequal shares of them, and return how to read these."""
-    share = np.arange(len(samples)) / len(samples)
-    found = []
-    for number, (begin, end) in enumerate(((0.0, 0.2), (0.2, 0.5), (0.5, 1.0))):
-        path = folder / f'{number}.npz'
-        write_samples(path, samples.where((share >= begin) & (share < end)))
-        found.append(Shard(f'shard {number}', read_samples, (path,)))
-    return found

@@ -1,0 +1,18 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Execution of long work: serial, in processes or on a Dask cluster; without ROS and torch."""
+
+from koopman_ros.execution.backends import (
+    Backend,
+    backend_of,
+    scheduler_refusal,
+    SchedulerLost,
+    Serial,
+    Tell,
+    Watch,
+    WorkerLost,
+)
+
+__all__ = ['Backend', 'SchedulerLost', 'Serial', 'Tell', 'Watch', 'WorkerLost', 'backend_of',
+           'scheduler_refusal']

@@ -1,0 +1,333 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Backends by the executors of joblib (loky) and of Dask, both of `concurrent.futures`."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+import contextlib
+from functools import lru_cache, partial
+import logging
+import os
+from pathlib import Path
+import pickle
+import queue
+import signal
+import tempfile
+import time
+from typing import Any, Protocol
+import uuid
+
+import cloudpickle
+from joblib.externals.loky import ProcessPoolExecutor
+
+from koopman_ros.execution.backends import (
+    Backend,
+    Found,
+    Item,
+    never,
+    SchedulerLost,
+    Task,
+    Watch,
+    WorkerLost,
+)
+from koopman_ros.startup import ONE_THREAD
+
+PERIOD = 0.1  # s between two calls of a watch, and between two messages of a task
+_PATIENCE = 5.0  # s from the request to end until a task is abandoned
+_ATTEMPTS = 3  # times that a task is begun whose worker dies
+_CONNECT = 10.0  # s for the first answer of a scheduler
+_JOIN = 30.0  # s for its first worker
+_STOP = 'stop'
+
+
+class _Channel(Protocol):
+    """Messages between a task and the process that waits for it; sent to the workers."""
+
+    def begin(self, number: int) -> bool:
+        """Note that a task begins; return whether it should end."""
+
+    def tell(self, number: int, value: Any) -> bool:
+        """Send the progress of a task; return whether it should end."""
+
+
+class _Pool(Backend):
+    """Tasks on workers, whose executor and messages the subclasses provide."""
+
+    def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
+            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
+        """Run tasks, see :meth:`Backend.run`."""
+        names, ready, following = list(items), dict[int, Any](), 0
+        with contextlib.closing(self._completed(
+                cloudpickle.dumps((function, shared)), items, watch)) as completed:
+            for number, found in completed:
+                if isinstance(found, Exception):
+                    found.add_note(f'in {names[number]}')
+                    if not apart:
+                        raise found
+                ready[number] = found
+                while following in ready:
+                    yield names[following], ready.pop(following)
+                    following += 1
+        # after a request to end there are gaps
+        for number in sorted(ready):
+            yield names[number], ready[number]
+
+    def _completed(self, call: bytes, items: Mapping[str, Any], watch: Watch
+                   ) -> Generator[tuple[int, Any]]:
+        """Yield number and result, or exception, of the tasks as they end."""
+        names, values = list(items), list(map(cloudpickle.dumps, items.values()))
+        open_, losses, abandoned = set(range(len(names))), Counter[int](), float('inf')
+        with self._messages(call) as (channel, source, news, stop):
+            futures: dict[Future[Any], int] = {}
+            try:
+                while open_ and abandoned == float('inf'):
+                    # tasks whose worker died before run alone, and last
+                    batch = {n for n in open_ if not losses[n]} or {min(open_)}
+                    futures = {self._submit(_call, channel, source, n, values[n]): n
+                               for n in sorted(batch)}
+                    lost, begun = set[int](), set[int]()
+                    while futures:
+                        for future in wait(futures, PERIOD, FIRST_COMPLETED).done:
+                            number = futures.pop(future)
+                            found = self._outcome(future, names[number])
+                            if isinstance(found, BrokenProcessPool):
+                                lost.add(number)
+                            elif not isinstance(found, _NotBegun):
+                                open_.discard(number)
+                                yield number, found
+                        told = news()
+                        begun |= {number for number, _ in told}
+                        asked = [watch(names[n], value) for n, value in told if value is not None]
+                        if any([*asked, watch('', None)]) and abandoned == float('inf'):
+                            stop()
+                            abandoned = time.monotonic() + _PATIENCE
+                        if time.monotonic() > abandoned:
+                            return
+                    if lost:
+                        self._restart()
+                    for number in lost & begun if lost & begun else lost:
+                        losses[number] += 1
+                        if losses[number] == _ATTEMPTS:
+                            open_.discard(number)
+                            yield number, _worker_lost(names[number])
+            finally:
+                stop()
+                if futures:
+                    self._abandon(futures)
+
+    @abstractmethod
+    def _messages(self, call: bytes) -> contextlib.AbstractContextManager[tuple[
+            _Channel, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]]:
+        """Return channel, source of the call for workers, and functions: news, and stop."""
+
+    @abstractmethod
+    def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Send a task to a worker."""
+
+    def _outcome(self, future: Future[Any], _: str) -> Any:
+        """Return the result or the exception of a task."""
+        return future.exception() or future.result()
+
+    def _restart(self) -> None:
+        """Replace workers that died."""
+
+    def _abandon(self, futures: Mapping[Future[Any], int]) -> None:
+        """Leave tasks that do not end."""
+
+
+class Processes(_Pool):
+    """
+    Processes of joblib's loky, of one thread each, started for the first tasks.
+
+    :param count: of processes; 0 for one on each core.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count or len(os.sched_getaffinity(0))
+        self._executor: ProcessPoolExecutor | None = None
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._executor is not None:
+            self._executor.shutdown(kill_workers=True)
+            self._executor = None
+
+    def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        if self._executor is None:
+            # the process that waits answers an interrupt of the terminal
+            self._executor = ProcessPoolExecutor(
+                self._count, timeout=None, env={**ONE_THREAD, **os.environ},
+                initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN))
+        future: Future[Any] = self._executor.submit(function, *arguments)
+        return future
+
+    def _restart(self) -> None:
+        self.close()
+
+    def _abandon(self, _: object) -> None:
+        self.close()
+
+    @contextlib.contextmanager
+    def _messages(self, call: bytes) -> Generator[tuple[
+            _Channel, Path, Callable[[], list[tuple[int, Any]]], Callable[[], None]]]:
+        with tempfile.TemporaryDirectory(prefix='koopman_ros_') as name:
+            folder, seen = Path(name), dict[str, bytes]()
+            source = folder / 'call'
+            source.write_bytes(call)
+
+            def news() -> list[tuple[int, Any]]:
+                told = {path.name: path.read_bytes() for path in folder.iterdir()
+                        if path.name.isdigit()}
+                new = [(int(key), pickle.loads(data)) for key, data in told.items()
+                       if seen.get(key) != data]
+                seen.update(told)
+                return new
+
+            yield _Folder(folder), source, news, (folder / _STOP).touch
+
+
+class _Folder:
+    """Messages by files of a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._last = folder, -PERIOD
+
+    def begin(self, number: int) -> bool:
+        return self._write(number, None)
+
+    def tell(self, number: int, value: Any) -> bool:
+        if time.monotonic() - self._last >= PERIOD:
+            self._last = time.monotonic()
+            return self._write(number, value)
+        return (self._folder / _STOP).exists()
+
+    def _write(self, number: int, value: Any) -> bool:
+        # a rename, so that no half is read
+        draft = self._folder / f'{number}.draft'
+        draft.write_bytes(pickle.dumps(value))
+        draft.replace(self._folder / str(number))
+        return (self._folder / _STOP).exists()
+
+
+class Cluster(_Pool):
+    """
+    Workers of a Dask scheduler, which repeats the tasks of workers that died.
+
+    :param address: of the scheduler, like ``'tcp://127.0.0.1:8786'``.
+    :raises SchedulerLost: when nothing answers there.
+    :raises WorkerLost: when no worker has joined.
+    """
+
+    def __init__(self, address: str) -> None:
+        import distributed
+        self._address = address
+        # a lost scheduler is raised here
+        logging.getLogger('distributed.client').setLevel(logging.CRITICAL)
+        try:
+            self._client = distributed.Client(address, timeout=_CONNECT, set_as_default=False)
+        except (OSError, TimeoutError) as error:
+            raise SchedulerLost(
+                f'no scheduler answers at {address} within {_CONNECT:g} s: start `dask scheduler` '
+                'there, and `dask worker` with its address') from error
+        try:
+            self._client.wait_for_workers(1, timeout=_JOIN)
+        except TimeoutError:
+            self.close()
+            raise WorkerLost(f'the scheduler at {address} has no worker: start one, `dask worker '
+                             f'{address}`') from None
+        self._executor = self._client.get_executor(pure=False)
+
+    def close(self) -> None:
+        """Leave the cluster."""
+        self._client.close(timeout=_PATIENCE)
+
+    def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        future: Future[Any] = self._executor.submit(function, *arguments)
+        return future
+
+    def _outcome(self, future: Future[Any], name: str) -> Any:
+        from distributed.scheduler import KilledWorker
+        if future.cancelled():
+            raise self._lost()
+        error = future.exception()
+        return _worker_lost(name) if isinstance(error, KilledWorker) else error or future.result()
+
+    def _abandon(self, futures: Mapping[Future[Any], int]) -> None:
+        for future in futures:
+            future.cancel()
+
+    def _lost(self) -> SchedulerLost:
+        return SchedulerLost(f'the scheduler at {self._address} is lost: start it and its workers '
+                             'again, and repeat the work')
+
+    @contextlib.contextmanager
+    def _messages(self, call: bytes) -> Generator[tuple[
+            _Channel, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]]:
+        import distributed
+        token, told = uuid.uuid4().hex, queue.SimpleQueue[tuple[int, Any]]()
+        event = distributed.Event(token, client=self._client)
+
+        def news() -> list[tuple[int, Any]]:
+            if self._client.status != 'running':
+                raise self._lost()
+            return [told.get() for _ in range(told.qsize())]
+
+        def stop() -> None:
+            with contextlib.suppress(OSError, RuntimeError):
+                event.set()
+
+        self._client.subscribe_topic(token, lambda message: told.put(message[1]))
+        try:
+            # not scattered: that would be lost with the worker that has it
+            yield _Topic(token), self._client.submit(bytes, call, pure=False), news, stop
+        finally:
+            with contextlib.suppress(OSError, ValueError, RuntimeError):
+                self._client.unsubscribe_topic(token)
+
+
+class _Topic:
+    """Messages by a topic and an event of the Dask scheduler."""
+
+    def __init__(self, token: str) -> None:
+        self._token, self._last = token, -PERIOD
+
+    def begin(self, number: int) -> bool:
+        return self.tell(number, None)
+
+    def tell(self, number: int, value: Any) -> bool:
+        import distributed
+        if time.monotonic() - self._last < PERIOD:
+            return False
+        self._last = time.monotonic()
+        worker = distributed.get_worker()
+        worker.log_event(self._token, (number, value))
+        stopped: bool = distributed.Event(self._token).is_set()
+        return stopped
+
+
+class _NotBegun:
+    """Result of a task that should end before it began."""
+
+
+@lru_cache(maxsize=1)
+def _unpacked(source: Path | bytes) -> Any:
+    return pickle.loads(source.read_bytes() if isinstance(source, Path) else source)
+
+
+def _call(channel: _Channel, source: Path | bytes, number: int, item: bytes) -> Any:
+    """Run a task on a worker."""
+    if channel.begin(number):
+        return _NotBegun()
+    function, shared = _unpacked(source)
+    return function(shared, pickle.loads(item), partial(channel.tell, number))
+
+
+def _worker_lost(name: str) -> WorkerLost:
+    return WorkerLost(f'{name}: {_ATTEMPTS} workers that ran it died, one after the other: check '
+                      'whether the memory suffices for it, and run it again')

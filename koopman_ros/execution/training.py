@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A training in a child process: start, progress, outcome, cancel; without ROS and torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+import json
+import queue
+import signal
+from typing import Any
+
+from koopman_ros.execution.job import Job
+
+_CANCELLED = 'cancelled, nothing was written'
+
+
+@dataclass(frozen=True)
+class JobState:
+    """Where a retraining stands, with the figures of a lift that was judged."""
+
+    share: float = 0.0  #: done, in [0, 1]
+    text: str = 'starting'  #: what is done now, or how it ended
+    ended: bool = False  #: whether it has ended
+    summary: Mapping[str, Any] | None = None
+    #: those of a fleet that have ended, by name
+    plants: Mapping[str, JobState] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether there is a new lift that may be used, or one of each plant."""
+        if self.plants:
+            return all(one.accepted for one in self.plants.values())
+        return bool(self.summary and self.summary['accepted'])
+
+    @property
+    def refused(self) -> bool:
+        """Whether a lift was learned or tried and does not suffice, of a fleet the worst one."""
+        if self.plants:
+            return not self.accepted and all(
+                one.accepted or one.refused for one in self.plants.values())
+        return bool(self.summary and not self.summary['accepted'])
+
+
+class TrainingJob(Job):
+    """
+    A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`.
+
+    Of a fleet with ``plants``, such fields by name, and ``scheduler``.
+    """
+
+    def __init__(self, task: Mapping[str, object]) -> None:
+        self.state = JobState()
+        self._cancelled = False
+        super().__init__('koopman_ros.learning.__main__', task=json.dumps(dict(task)))
+
+    def poll(self) -> JobState:
+        """Read the output of the process since the last call, and return its state."""
+        try:
+            while not self.state.ended:
+                line = self.line()
+                self.state = self._ended() if line is None else self._told(line)
+        except queue.Empty:
+            pass
+        return self.state
+
+    def cancel(self) -> None:
+        """Request the end of the process; nothing is written then."""
+        self._cancelled = True
+        super().cancel()
+
+    def _told(self, line: str) -> JobState:
+        try:
+            said = json.loads(line)
+        except ValueError:
+            # cut off when the process was killed, or printed by a library
+            return self.state
+        if 'plant' in said:
+            plants = {**self.state.plants, said['plant']: self._conclusion(said)}
+            return replace(self.state, plants=plants)
+        if 'progress' in said:
+            return replace(self.state, share=said['progress'],
+                           text=said['text'] or self.state.text)
+        if 'ended' in said:
+            accepted = sum(one.accepted for one in self.state.plants.values())
+            return replace(self.state, share=1.0, ended=True, text=(
+                f'{accepted} of {len(self.state.plants)} new models are accepted'))
+        return self._conclusion(said)
+
+    def _conclusion(self, said: Mapping[str, Any]) -> JobState:
+        """Return the state by the last line of a training."""
+        if 'summary' in said:
+            return JobState(1.0, _in_words(said['summary']), True, said['summary'])
+        if 'stopped' in said:
+            return JobState(self.state.share, _CANCELLED, True)
+        return JobState(self.state.share, f'training failed: {said["error"]}', True)
+
+    def _ended(self) -> JobState:
+        """Return the state of a process that ended without a last line."""
+        code = self.process.wait()
+        if self._cancelled:
+            text = _CANCELLED
+        elif code < 0:
+            name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
+            text = (f'the training process was killed by {name}: see whether the memory '
+                    'suffices, and train again')
+        else:
+            last = self.errors[-1] if self.errors else 'it said nothing'
+            text = f'the training process ended with code {code}: {last}'
+            if last.startswith(('ModuleNotFoundError', 'ImportError')):
+                text = (f'training needs a package that is not installed ({last}): '
+                        'pip install torch cloudpickle joblib tqdm')
+        return replace(self.state, text=text, ended=True)
+
+
+def _in_words(summary: Mapping[str, Any]) -> str:
+    if not summary['accepted']:
+        reasons = '; '.join(summary['reasons'])
+        kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
+        return f'the new model ({summary["model_class"]}) is refused: {reasons}{kept}'
+    present = summary['heldout_error_of_present_lift']
+    other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
+        'heldout_error_of_present_lift', 'present one'))
+    units = summary['units']
+    return (f'the new model ({summary["model_class"]}) is accepted: error on held-out records '
+            f'{_errors(summary["heldout_error"], units)}, that of the {name} '
+            + ('infinite, as it diverges' if None in summary[other].values()
+               else _errors(summary[other], units))
+            + f'; written to {summary["model_file"]}')
+
+
+def _errors(errors: Mapping[str, float | None], units: Mapping[str, str]) -> str:
+    return ', '.join(('infinite' if value is None else f'{value:.4g} {units[name]}')
+                     + (f' in {name}' if len(errors) > 1 else '')
+                     for name, value in errors.items())
+
+
+def class_lines(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return a line for each of several classes that were learned, by name; else nothing."""
+    classes = summary.get('classes', {})
+    return {} if len(classes) < 2 else {
+        name: _class_line(one, summary['units']) for name, one in classes.items()}
+
+
+def constant_lines(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return a line for each constant that was estimated, by name."""
+    return {name: one['text'] for name, one in summary.get('constants', {}).items()}
+
+
+def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    parts = []
+    if 'heldout_error' in one:
+        rx, failed, loops = (one[key] for key in (
+            'heldout_rx', 'closed_loops_failed', 'closed_loops'))
+        parts = [f'drift rx {"infinite" if rx is None else f"{rx:.1e}"}',
+                 f'roll-out {_errors(one["heldout_error"], units)}',
+                 f'law fails in {failed} of {loops} closed loops']
+    line = 'chosen: ' * one['chosen'] + ', '.join([*parts, f'{one["seconds"]:.1f} s'])
+    return line + (f'; refused: {one["refusal"]}' if one['refusal'] else '')
+
+
+def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:
+    """Return the figures of a summary one by one, those of a signal under its name."""
+    found: dict[str, bool | float | str] = {
+        **{f'class {name}': line for name, line in class_lines(summary).items()},
+        **{f'constant {name}': line for name, line in constant_lines(summary).items()}}
+    for key, value in summary.items():
+        if key in ('classes', 'constants'):
+            continue
+        if isinstance(value, Mapping):
+            found |= {f'{key}: {name}': one for name, one in scalars(value).items()}
+        elif isinstance(value, (bool, int, float, str)):
+            found[key] = value
+    return found

@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The gate: acceptance of a model by the part of the record that it was not learned from."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from koopman_ros.arrays import Array, brief
+from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
+from koopman_ros.control.usable import unusable
+from koopman_ros.execution import Backend
+from koopman_ros.learning.identification import (
+    Drift,
+    fitted_starts,
+    Identified,
+    longest_step,
+    Stopped,
+)
+from koopman_ros.learning.identification.drift import prediction_error, Segments
+from koopman_ros.learning.lift.metrics import Figures, lifted_rate
+from koopman_ros.learning.lift.training import Trained
+from koopman_ros.learning.model_selection import Comparison
+from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.model_classes import LINEAR
+from koopman_ros.units import Display, display_unit, SECONDS_PER_TIME_UNIT
+
+# An error is more than noise when it is this unlikely, and this large beside the range.
+_SIGMAS = 5.0
+_NOTICEABLE = 1e-3
+# White errors have none; those of a fitted start stay far below.
+_LEAST_AUTOCORRELATION = 0.3
+# A share of the set-points' range that may be missing: noise moves the ends of a record.
+_MISSING = 0.05
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Thresholds that a lift has to reach."""
+
+    #: by this share its held-out error must be smaller than those of the present lift, where
+    #: there is one, and of the best linear model
+    margin: float = 0.1
+    condition: float = 1e4  #: largest condition number of E[z z']
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.margin < 1.0:
+            raise ValueError(f'margin = {self.margin} must be in [0, 1)')
+        if not self.condition > 1.0:
+            raise ValueError(f'condition = {self.condition} must be above 1')
+
+
+class HeldOut:
+    """The held-out part of a record, and the requirements on a model there."""
+
+    def __init__(self, found: Identified, thresholds: Thresholds) -> None:
+        self._found, self._thresholds = found, thresholds
+        self.segments = Segments.of(found.held_out, longest_step(found.held_out))
+        self.scale = found.drift.box.states.scale
+        self.count = sum(len(episode) for episode in found.held_out)
+        self.linear_rmse = self.rmse(found.linear.rate)
+        self._seconds = SECONDS_PER_TIME_UNIT[found.drift.box.time_unit]
+
+    def rmse(self, rate: Rate) -> Array:
+        """Return the error (n_x,) of a drift's predictions of the measurements."""
+        return prediction_error(rate, self.segments, self.scale)
+
+    def rmse_of(self, model: LiftedModel) -> Array:
+        """Return that of a model's drift."""
+        return self.rmse(lifted_rate(model, self._seconds))
+
+    def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
+                  backend: Backend | None = None) -> LawCheck:
+        """Close a model's loop on the estimated drift; Stopped where `watch` ended it."""
+        # as it was measured, as far as that matters
+        period = float(np.median(np.concatenate(
+            [np.diff(part.time) for part in self._found.held_out])))
+        found = check_law(model, self._found.drift.rate, loops=loops, watch=watch,
+                          interval=period * self._seconds, backend=backend)
+        if found is None:
+            raise Stopped
+        return found
+
+    def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array) -> str:
+        """Say that an error is not clearly below another one, or nothing."""
+        own, margin = _size(rmse, self.scale), self._thresholds.margin
+        if np.isfinite(own) and own <= (1.0 - margin) * _size(other, self.scale):
+            return ''
+        return (f'its error on held-out records, {_text(rmse, model)}, is not '
+                f'{100.0 * margin:.0f} % below that of {name}, {_text(other, model)}')
+
+    def reasons(self, model: LiftedModel, rmse: Array, figures: Figures, law_check: LawCheck,
+                linear: bool) -> tuple[str, ...]:
+        """
+        Say why a model must not be used whatever the present one is.
+
+        :param rmse: (n_x,) error of its predictions, in state units.
+        :param linear: whether it is a linear one itself, which need not be better than that.
+        """
+        reasons = [unusable(model)] + ([] if linear else [self.exceeded(
+            model, 'the best linear model', rmse, self.linear_rmse)])
+        cond, most = figures.fit.cond, self._thresholds.condition
+        if not cond <= most:
+            reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
+                           f'{most:.3g}: use fewer coordinates')
+        if not law_check.accepted:
+            reasons.append(f'it is no controller of the estimated drift: {law_check}')
+        return tuple(filter(None, reasons))
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Acceptance or refusal of a lift, with its figures on held-out segments."""
+
+    reasons: tuple[str, ...]  #: why it is refused; empty when it is accepted
+    warnings: tuple[str, ...]  #: for the user, in either case
+    rmse: Array  #: (n_x,) error of its predictions of the measurements, in state units
+    drift_rmse: Array  #: (n_x,) the same of the drift that it was learned from
+    current_rmse: Array | None  #: (n_x,) the same of the present lift, None without one
+    linear_rmse: Array  #: (n_x,) the same of the best linear model
+    noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
+    law_check: LawCheck  #: closed loops on the estimated drift
+
+    __repr__ = brief
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the lift may be used."""
+        return not self.reasons
+
+
+def decide(found: Identified, learned: Trained | Comparison, current: LiftedModel | None,
+           thresholds: Thresholds, *, loops: int = LOOPS,
+           watch: Callable[[float], bool] = lambda _: False) -> Decision:
+    """
+    Compare a new lift with the present and a linear one, held out, and close its loop.
+
+    :param learned: what was trained, or compared by :func:`compare_classes`, of which the chosen
+        model is judged, and whose closed loops are not run again.
+    :param loops: see :func:`~koopman_ros.control.law_check.check_law`, as for `watch`.
+    :raises Stopped: when `watch` ended it.
+    """
+    model, held_out = learned.model, HeldOut(found, thresholds)
+    rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
+    current_rmse = None if current is None else held_out.rmse_of(current)
+    chosen = learned.chosen if isinstance(learned, Comparison) else None
+    law_check = chosen.law_check if chosen and chosen.excess is not None else None
+    if law_check is None:
+        law_check = held_out.law_check(model, loops, watch)
+    reasons = held_out.reasons(model, rmse, learned.figures, law_check,
+                               chosen is not None and chosen.name == LINEAR)
+    if current_rmse is not None:
+        beside = held_out.exceeded(model, 'the present model', rmse, current_rmse)
+        reasons = (*filter(None, [beside]), *reasons)
+    warnings = _warnings(found, model, drift_rmse,
+                         _autocorrelation(found.drift, held_out.segments))
+    return Decision(reasons, warnings, rmse, drift_rmse, current_rmse, held_out.linear_rmse,
+                    found.noise, law_check)
+
+
+def _autocorrelation(drift: Drift, segments: Segments) -> Array:
+    """Return the autocorrelation (n_x,) of a drift's errors from one measurement to the next."""
+    starts = fitted_starts(drift.rate, segments, drift.box.states.scale)[0]
+    errors = segments.errors(drift.rate, starts)
+    products, squares = np.zeros((2, errors.shape[2]))
+    for j in range(errors.shape[1]):
+        own = errors[segments.measured[:, j], j]
+        products += np.sum(own[1:] * own[:-1], axis=0)
+        squares += 0.5 * np.sum(own[1:] ** 2 + own[:-1] ** 2, axis=0)
+    return products / np.where(squares > 0.0, squares, 1.0)
+
+
+def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
+              ) -> tuple[str, ...]:
+    """Say where the best drift errs by more than white noise explains."""
+    warnings = list(found.warnings)
+    count = sum(len(episode) for episode in found.held_out)
+    measured = len(model.states) - found.hidden
+    for i, (name, unit) in enumerate(zip(model.states.names[:measured], model.states.units,
+                                         strict=False)):
+        noticeable, r = _NOTICEABLE * found.drift.box.states.scale[i], autocorrelation[i]
+        if error[i] > noticeable and r > max(_LEAST_AUTOCORRELATION, _SIGMAS / np.sqrt(count)):
+            warnings.append(
+                f'the noise of {name} is coloured (autocorrelation {r:.2f} from sample to sample '
+                'of what the best drift leaves): a filter before the record does that, or what '
+                f'is not measured; it tells as much as {100.0 * (1.0 - r) / (1.0 + r):.0f} % of '
+                'the samples would with white noise, so record longer, or without the filter')
+        noise = found.noise[i]
+        excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
+        # the mean square of `count` white errors strays by this share
+        chance = noise * (_SIGMAS * np.sqrt(2.0 / count)) ** 0.5
+        if excess > max(chance, noticeable):
+            warnings.append(
+                f'the best drift errs by {error[i]:.3g} {unit} in {name}, of which {excess:.3g} '
+                f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): something that '
+                'is not measured acts too, such as another state or a disturbance, and no lift '
+                'of what is measured can know it')
+    return tuple(warnings)
+
+
+def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float]]
+                        ) -> tuple[str, ...]:
+    """
+    Say which set-points that are wanted a trained range leaves out.
+
+    :param wanted: lowest and highest set-point of some of the states by name, in their units.
+    """
+    found = []
+    for name, (low, high) in wanted.items():
+        i = states.names.index(name)
+        lower, upper = states.lower[i], states.upper[i]
+        if max(lower - low, high - upper) > _MISSING * (high - low):
+            unit = Display(states.units[i], display_unit(states.units[i]), '.4g')
+            found.append(
+                f'{name} was trained from {unit.text(lower)} to {unit.text(upper)}, set-points '
+                f'are wanted from {unit.text(low)} to {unit.text(high)}: those outside will be '
+                'refused, record what is missing or narrow setpoint_min and setpoint_max')
+    return tuple(found)
+
+
+def _size(rmse: Array, scale: Array) -> float:
+    return float(np.sqrt(np.mean((rmse / scale) ** 2)))
+
+
+def _text(rmse: Array, model: LiftedModel) -> str:
+    names, units = model.states.names, model.states.units
+    return ', '.join(f'{value:.4g} {unit}' + (f' in {name}' if len(names) > 1 else '')
+                     for value, unit, name in zip(rmse, units, names, strict=True))

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Training of models on an estimated drift."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.law_check import LOOPS
+from koopman_ros.execution import Backend
+from koopman_ros.learning.acceptance import HeldOut, Thresholds
+from koopman_ros.learning.identification import Drift, fitted_starts, Identified, longest_step
+from koopman_ros.learning.identification.drift import Segments, steady_point
+from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.metrics import ROUNDING
+from koopman_ros.learning.lift.multistart import Watch
+from koopman_ros.learning.lift.training import train, Trained
+from koopman_ros.learning.model_selection import (
+    compare,
+    Comparison,
+    Contender,
+    Judge,
+    usual_recipes,
+)
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
+from koopman_ros.plant_data import Episode, Plant, Samples
+
+# More samples of a smooth drift tell nothing new.
+_MAX_SAMPLES = 2000
+# Cells a state by which samples are spread over the range; fewer where there were too many.
+_CELLS = 20
+# Parts among which the samples are dealt out.
+_SHARES = 10
+
+
+def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> Samples:
+    """
+    Sample a drift along the paths that it predicts for some episodes, free of their noise.
+
+    They are values of one smooth function, free of noise, so that training, choice and figures
+    may share the range among them; the plant's own held-out segments judge the lift. Episodes
+    that the drift does not follow are left out; ValueError when it follows none.
+    """
+    segments = Segments.of(episodes, longest_step(episodes))
+    x0, squares = fitted_starts(drift.rate, segments, drift.box.states.scale)
+    followed = np.all(squares < drift.box.states.scale ** 2, axis=1)
+    if not np.any(followed):
+        raise ValueError('the estimated drift follows none of the episodes: record longer, with '
+                         'steps of the input')
+    path = segments.path(drift.rate, x0)[:-1]
+    inside = (segments.steps > 0.0) & followed
+    # segment by segment, each in the order of its times
+    x, u = (np.swapaxes(a, 0, 1)[inside.T] for a in (path, segments.u))
+    kept = _spread(drift.box.states.to_deviation(x))
+    x, u = x[kept], u[kept]
+    return Samples(x, drift.rate(x, u), u, np.arange(len(x)) % _SHARES)
+
+
+def _spread(xi: Array) -> NDArray[np.int64]:
+    """
+    Choose samples (N, n_x) that fill the range as evenly as they can; return rising numbers.
+
+    A plant dwells around some states; a lift learned from all samples would know those best and
+    tell its coordinates apart by the few others.
+    """
+    low, high = xi.min(axis=0), xi.max(axis=0)
+    share = (xi - low) / (high - low)
+    for count in range(_CELLS, 0, -1):
+        cells = np.minimum((count * share).astype(int), count - 1)
+        visited, cell = np.unique(cells, axis=0, return_inverse=True)
+        if len(visited) <= _MAX_SAMPLES:
+            break
+    cell = cell.ravel()
+    # the rank of each sample within its cell, taken evenly along the episode
+    order = np.argsort(cell, kind='stable')
+    sizes = np.bincount(cell)
+    quota = _quota(sizes, _MAX_SAMPLES)
+    chosen = []
+    for rows in np.split(order, np.cumsum(sizes)[:-1]):
+        take = min(len(rows), quota)
+        chosen.append(rows[np.linspace(0, len(rows) - 1, take).round().astype(int)])
+    return np.sort(np.concatenate(chosen))
+
+
+def _quota(sizes: NDArray[np.int64], total: int) -> int:
+    """Return the largest number a cell may give so that all together give at most `total`."""
+    low, high = 1, int(np.max(sizes))
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if np.sum(np.minimum(sizes, middle)) <= total else (
+            low, middle - 1)
+    return low
+
+
+def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: int,
+               watch: Watch | None = None) -> Trained:
+    """
+    Learn a lift of an estimated drift; the arguments are those of :func:`learning.train`.
+
+    :param plant: names, units and the nominal point. Where it is not known, or the episodes do not
+        surround it, a steady state in the middle of their range is taken.
+    :raises NoUsefulLift: when no lift is better than a linear model.
+    :raises ValueError: when the episodes hold no steady state.
+    """
+    known, samples = _estimated(found, plant)
+    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch,
+                 loops=0)
+
+
+def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
+    """Return the plant with its estimated nominal point and B, and samples of the drift."""
+    samples = drift_samples(found.drift, found.fitted)
+    lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
+    within = (plant.nominal_state > lower) & (plant.nominal_state < upper)
+    x, u = steady_point(found.drift,
+                        np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
+                        np.where(np.isfinite(plant.nominal_input), plant.nominal_input,
+                                 found.drift.box.inputs.center))
+    drift = found.drift
+    return replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
+                   B=drift.input_matrix_at if drift.varying_input_matrix else (
+                       drift.input_matrix)), samples
+
+
+def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
+                    model_class: str = BEST, n_z: int, seed: int, starts: int, loops: int = LOOPS,
+                    watch: Watch | None = None,
+                    judging: Callable[[str, float], bool] = lambda *_: False,
+                    device: str = 'cpu', backend: Backend | None = None,
+                    begin: LiftedModel | None = None) -> Comparison:
+    """
+    Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
+
+    The rule is the same, its error another: the mean square by which predictions of the
+    measurements that were held out err beyond their noise. What chance makes of the noise is the
+    same for all and counts as equal. Refused are classes that the gate would refuse for their law,
+    their coordinates or for a linear model that is as good.
+
+    :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
+        them and the rule.
+    :param n_z: coordinates of the identity lift; other arguments as for :func:`learn_lift`.
+    :param judging: called with the class whose law is being tried and the share that is done.
+    :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
+        run, too.
+    :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
+    :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
+    :raises Stopped: when `judging` ended it.
+    """
+    held_out = HeldOut(found, thresholds)
+    noise = np.minimum(found.noise, held_out.rmse(found.drift.rate)) / held_out.scale
+
+    def judged(one: Contender) -> Contender:
+        assert one.model is not None
+        assert one.figures is not None
+        rmse = held_out.rmse_of(one.model)
+        law_check = held_out.law_check(one.model, loops, lambda share: judging(one.name, share),
+                                       backend)
+        reasons = held_out.reasons(one.model, rmse, one.figures, law_check,
+                                   one.name == LINEAR)
+        return replace(one, figures=replace(one.figures, rollout_rmse=rmse), law_check=law_check,
+                       excess=float(np.mean(np.maximum(
+                           (rmse / held_out.scale) ** 2 - noise ** 2, 0.0))),
+                       refusal='; '.join(reasons))
+
+    known, samples = _estimated(found, plant)
+    # the mean square of so many white errors strays by this share
+    chance = float(np.mean(noise ** 2)) * np.sqrt(2.0 / held_out.count)
+    alone = model_class != BEST
+    return compare(known, samples, {**usual_recipes(len(noise)), IDENTITY_LIFT: Growth(n_z)},
+                   choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
+                   watch=watch, judge=Judge(judged, max(chance, ROUNDING)), device=device,
+                   backend=backend, begin=begin)

@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The contract of an identification method: a plug-in that estimates a polynomial drift."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from koopman_ros.arrays import Array, brief
+from koopman_ros.declaration import NoParameters
+from koopman_ros.learning.identification.drift import DriftModel
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Episode
+
+
+@dataclass(frozen=True)
+class DriftProblem:
+    """Segments of a record, and the polynomial dx/dt = f(x) + B(x) u that is to be estimated."""
+
+    episodes: Sequence[Episode]  #: segments
+    box: Box  #: in whose deviations the polynomial is written
+    degree: int  #: of f
+    B: Array | None = None  #: weights of the inputs as :class:`DriftModel` has them, where known
+    #: likewise, an estimate of an earlier method of the list; None for the first method
+    rough: Array | None = None
+    input_degree: int = 0  #: of the B(x) that is to be estimated
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True)
+class DriftEstimate:
+    """A drift, and the variant of the method that it is from."""
+
+    model: DriftModel
+    variant: str = ''  #: e.g. ``'40 samples'``
+
+
+class IdentificationMethod(ABC):
+    """
+    An estimate of a drift from noisy samples.
+
+    A class of one's own is named as ``module:Class`` in the parameter `identification_methods`;
+    its own parameters are then ``Class.<parameter>``::
+
+        class Finest(IdentificationMethod):
+            Parameters = FinestParameters
+
+            def estimate(self, problem):
+                ...
+                return [DriftEstimate(model)]
+
+    :param parameters: of the class `Parameters`, by default its defaults.
+    """
+
+    #: a frozen dataclass of the method's own parameters, see :mod:`koopman_ros.declaration`
+    Parameters: ClassVar[type[Any]] = NoParameters
+
+    def __init__(self, parameters: Any = None) -> None:
+        self.parameters = self.Parameters() if parameters is None else parameters
+
+    @abstractmethod
+    def estimate(self, problem: DriftProblem) -> Sequence[DriftEstimate]:
+        """
+        Return one estimate, or several variants of which held-out segments choose.
+
+        :raises ValueError: for a problem that the method does not suit, such as short segments.
+        """

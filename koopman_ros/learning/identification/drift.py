@@ -1,0 +1,344 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Models of a drift, and segments of episodes on which they are rolled out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import brief
+from koopman_ros.lifting import Box, InputTerms, PolynomialObservables
+from koopman_ros.lifting.observables import Monomials
+from koopman_ros.plant_data import Array, Episode, Plant
+from koopman_ros.solvers import runge_kutta_step
+
+# dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
+Rate = Callable[[Array, Array], Array]
+
+# A state; features that depend on it, their derivatives, and factors.
+_Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+
+# Of the search of a steady state: the range is that of noisy measurements, and a search that is so
+# far outside does not come back.
+_SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
+# Difference of two starts that tells the slope, in units of the states' scale.
+_STEP = 1e-4
+
+
+def box_of(plant: Plant, episodes: Sequence[Episode]) -> Box:
+    """Return the episodes' range, its middle the origin; ValueError when a signal never moves."""
+    return Box.of(plant, np.concatenate([episode.x for episode in episodes]),
+                  np.concatenate([episode.u for episode in episodes]), nominal=False)
+
+
+@dataclass(frozen=True)
+class Drift(ABC):
+    """A model of dx/dt = f(x) + B(x) u, in deviations within a box and in units."""
+
+    box: Box  #: the deviations' origin and scale
+
+    @property
+    @abstractmethod
+    def form(self) -> str:
+        """The kind of model, in words."""
+
+    @property
+    @abstractmethod
+    def varying_input_matrix(self) -> bool:
+        """Whether B depends on the state."""
+
+    @abstractmethod
+    def scaled_rate(self, xi: Array, v: Array) -> Array:
+        """Evaluate the rate in deviations: (..., n_x) and (..., n_u) -> (..., n_x)."""
+
+    @abstractmethod
+    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
+        """
+        Evaluate the Jacobian of the scaled rate: (..., n_x) -> (..., n_x, n_x).
+
+        :param v: (..., n_u) inputs in deviations; those of the box's middle by default.
+        """
+
+    @abstractmethod
+    def scaled_input_matrix(self, xi: Array) -> Array:
+        """Evaluate B(x) in deviations: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+
+    def rate(self, x: Array, u: Array) -> Array:
+        """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
+        return self.box.states.scale * self.scaled_rate(
+            self.box.states.to_deviation(x), self.box.inputs.to_deviation(u))
+
+    def slope(self, x: Array) -> Array:
+        """Evaluate df/dx (n_x, n_x) at a state (n_x,), in 1/time unit for equal units."""
+        scale = self.box.states.scale
+        return scale[:, None] * self.scaled_slope(self.box.states.to_deviation(x)) / scale
+
+    @property
+    def input_matrix(self) -> Array:
+        """B (n_x, n_u) in state units per input and time unit, in the middle of the box."""
+        return self.input_matrix_at(self.box.states.center)
+
+    def input_matrix_at(self, x: Array) -> Array:
+        """Evaluate B(x) in units: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+        B = self.scaled_input_matrix(self.box.states.to_deviation(x))
+        return self.box.states.scale[:, None] * B / self.box.inputs.scale
+
+
+@dataclass(frozen=True)
+class DriftModel(Drift):
+    """dx/dt = f(x) + B(x) u with f and B polynomials, in deviations within a box."""
+
+    degree: int  #: highest total degree of the monomials
+    coefficients: Array  #: (1 + m, n_x) of 1 and of the m monomials, in scale units a time unit
+    #: (n_x, n_u (1 + n_phi)) likewise, of the inputs and, where B depends on the state, of their
+    #: products with monomials, see :meth:`InputTerms.regressors`
+    B: Array
+
+    __repr__ = brief
+
+    @property
+    def monomials(self) -> PolynomialObservables:
+        """The monomials from degree 1 on."""
+        return PolynomialObservables.total_degree(len(self.box.states), self.degree)
+
+    def features(self, xi: Array) -> Array:
+        """Evaluate 1 and the monomials: (..., n_x) -> (..., 1 + m)."""
+        return _features(len(self.box.states), self.degree).at(xi)
+
+    @cached_property
+    def _slope_coefficients(self) -> Array:
+        """(1 + m, n_x n_x) of the features, for the slope."""
+        n_x = len(self.box.states)
+        found = np.zeros((len(self.coefficients), n_x, n_x))
+        for by, rows, lowered, factors in _derivatives(n_x, self.degree):
+            found[lowered, :, by] = factors[:, None] * self.coefficients[rows]
+        return found.reshape(len(found), -1)
+
+    @cached_property
+    def _split(self) -> tuple[Array, InputTerms | None]:
+        return InputTerms.split(self.B, len(self.box.inputs))
+
+    @property
+    def form(self) -> str:
+        """Its degree, and that of B(x)."""
+        return f'drift of degree {self.degree}' + (
+            f', B of degree {self.input_degree}' if self.input_degree else '')
+
+    @property
+    def varying_input_matrix(self) -> bool:
+        """Whether B depends on the state."""
+        return self.input_degree > 0
+
+    @property
+    def input_degree(self) -> int:
+        """Degree of the polynomial B(x)."""
+        terms = self._split[1]
+        return 0 if terms is None else terms.degree
+
+    def scaled_input_matrix(self, xi: Array) -> Array:
+        """Evaluate B(x) in deviations: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+        B, terms = self._split
+        return B if terms is None else B + terms.matrix(xi)
+
+    def scaled_rate(self, xi: Array, v: Array) -> Array:
+        """Evaluate the rate in deviations: (..., n_x) and (..., n_u) -> (..., n_x)."""
+        return self.rate_of(self.features(xi), self.regressors(xi, v))
+
+    def rate_of(self, features: Array, regressors: Array) -> Array:
+        """Return the scaled rate (..., n_x) where its features and regressors are these."""
+        return features @ self.coefficients + regressors @ self.B.T
+
+    def regressors(self, xi: Array, v: Array) -> Array:
+        """Return the regressors of `B`: (..., n_x), (..., n_u) -> (..., columns of B)."""
+        return InputTerms.regressors(xi, v, self.input_degree)
+
+    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
+        """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
+        return self.slope_of(self.features(xi), xi, v)
+
+    def slope_of(self, features: Array, xi: Array, v: Array | None) -> Array:
+        """Return the scaled slope (..., n_x, n_x) where the features are these."""
+        # derivatives of monomials are monomials: the same features with other coefficients
+        slope = (features @ self._slope_coefficients).reshape(*xi.shape, xi.shape[-1])
+        terms = self._split[1]
+        return slope if terms is None or v is None else slope + terms.jacobian(xi, v)
+
+
+@lru_cache(maxsize=64)
+def _features(n_x: int, degree: int) -> Monomials:
+    """Return 1 and the monomials up to a degree."""
+    E = PolynomialObservables.total_degree(n_x, degree).exponents
+    E = np.vstack([np.zeros((1, n_x), dtype=np.int64), E])
+    return Monomials(np.ones(len(E)), E)
+
+
+@lru_cache(maxsize=64)
+def _derivatives(n_x: int, degree: int) -> tuple[_Derivative, ...]:
+    """Return for each state: features that depend on it, their derivatives, factors."""
+    E = _features(n_x, degree).exponents
+    place = {tuple(row): k for k, row in enumerate(E.tolist())}
+    found = []
+    for by in range(n_x):
+        rows = np.flatnonzero(E[:, by])
+        lowered = E[rows] - np.eye(n_x, dtype=np.int64)[by]
+        found.append((by, rows, np.array([place[tuple(row)] for row in lowered.tolist()]),
+                      E[rows, by]))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """M segments on grids of K steps, each with one input; short ones are padded."""
+
+    steps: Array  #: (K, M) lengths of the steps, 0 in the padding, in time units
+    u: Array  #: (K, M, n_u) inputs held over them, or their means where they were linear
+    x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
+    measured: np.ndarray  #: (K + 1, M) whether one was
+
+    __repr__ = brief
+
+    @classmethod
+    def of(cls, episodes: Sequence[Episode], longest_step: float) -> Segments:
+        """Put episodes on grids of their own: samples, input changes and steps between."""
+        grids = [_grid(episode, longest_step) for episode in episodes]
+        K, M = max(len(grid) for grid in grids) - 1, len(episodes)
+        n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
+        steps, u = np.zeros((K, M)), np.zeros((K, M, n_u))
+        x, measured = np.zeros((K + 1, M, n_x)), np.zeros((K + 1, M), dtype=bool)
+        for j, (episode, grid) in enumerate(zip(episodes, grids, strict=True)):
+            k = len(grid) - 1
+            steps[:k, j] = np.diff(grid)
+            u[:k, j] = 0.5 * np.add(*episode.inputs_between(grid))
+            u[k:, j] = episode.u[-1]
+            rows = np.searchsorted(grid, episode.time)
+            x[rows, j], measured[rows, j] = episode.x, True
+        return cls(steps, u, x, measured)
+
+    def repeated(self, count: int) -> Segments:
+        """Return all of them so many times, one round of them after the other."""
+        return Segments(*(np.tile(one, (1, count, *[1] * (one.ndim - 2)))
+                          for one in (self.steps, self.u, self.x, self.measured)))
+
+    def path(self, rate: Rate, x0: Array) -> Array:
+        """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
+        path = np.empty(self.x.shape)
+        path[0] = x = x0
+        with np.errstate(all='ignore'):
+            for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
+                path[k + 1] = x = runge_kutta_step(partial(_held, rate, u), x, h)
+        return path
+
+    def errors(self, rate: Rate, x0: Array) -> Array:
+        """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""
+        return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
+
+
+def _held(rate: Rate, u: Array, x: Array) -> Array:
+    return rate(x, u)
+
+
+def longest_step(episodes: Sequence[Episode]) -> float:
+    """Return a step over which a Runge-Kutta method follows motion that the episodes resolve."""
+    # a motion is resolved where it takes several samples
+    return 2.0 * float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
+
+
+def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, Array]:
+    """
+    Predict every segment by a model, from the start that suits it best, and compare.
+
+    The start is fitted, for a measurement of it would bring its noise into the prediction.
+
+    :param scale: (n_x,) size of the states, in which their errors are weighed.
+    :return: the starts (M, n_x), and the mean squared errors from there (M, n_x), in state units
+        squared, infinite on divergence.
+    """
+    x0 = first_measured(segments)
+    n_x = x0.shape[1]
+    count = np.sum(segments.measured, axis=0)[:, None]
+    best, least = x0, np.full_like(x0, np.inf)
+    # beside each segment the same from starts that differ in one state
+    beside = segments.repeated(1 + n_x)
+    shifts = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
+    for last in (False, False, True):
+        tried = x0 + scale * (shifts[:1] if last else shifts)[:, None]
+        # errors in units of the scale: states of different units weigh alike
+        found = (segments if last else beside).errors(rate, tried.reshape(-1, n_x)) / scale
+        found = found.reshape(len(found), *tried.shape)
+        errors = found[:, 0]
+        # a model may diverge from any of the starts
+        with np.errstate(all='ignore'):
+            squares = np.sum(errors ** 2, axis=0) / count
+            better = np.sum(squares, axis=1) < np.sum(least, axis=1)
+            best, least = (np.where(better[:, None], x0, best),
+                           np.where(better[:, None], squares, least))
+            if last or not np.all(np.isfinite(errors)):
+                break
+            # (K + 1, M, n_x, n_x): change of every state with each start
+            slopes = np.moveaxis(found[:, 1:] - found[:, :1], 1, -1) / _STEP
+            normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
+            right = np.einsum('kmij,kmi->mj', slopes, errors)
+            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+                break
+            inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+            x0 = x0 - scale * (inverse @ right[..., None])[..., 0]
+    return best, least * scale ** 2
+
+
+def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
+    """
+    Find a state and an input near given ones under which the drift stands still.
+
+    With as many inputs as states the state stays what it is; otherwise both move as little as
+    they can, in units of their range. ValueError when there is none nearby.
+
+    :param x: (n_x,) in state units.
+    :param u: (n_u,) in input units.
+    """
+    box = drift.box
+    xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
+    n_x = len(xi)
+    held = np.linalg.matrix_rank(drift.scaled_input_matrix(xi)) == n_x
+    for _ in range(50):
+        rate = drift.scaled_rate(xi, v)
+        slope, B = drift.scaled_slope(xi, v), drift.scaled_input_matrix(xi)
+        change = -np.linalg.pinv(np.hstack([0.0 * slope if held else slope, B])) @ rate
+        xi, v = xi + change[:n_x], v + change[n_x:]
+        # far outside, the polynomial means nothing and overflows at last
+        if np.max(np.abs(change)) < 1e-13 or np.max(np.abs(xi)) > _LOST:
+            break
+    near = np.all(np.abs(xi) <= _SLIGHTLY_OUTSIDE)
+    if not (near and np.all(np.abs(drift.scaled_rate(xi, v)) < 1e-9)):
+        raise ValueError('no steady state was found within the range of the episodes: record '
+                         'around a state that the plant can hold')
+    return box.states.to_physical(xi), box.inputs.to_physical(v)
+
+
+def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:
+    """Return the root mean square error (n_x,) of :func:`fitted_starts`, in state units."""
+    squares = fitted_starts(rate, segments, scale)[1]
+    weights = np.sum(segments.measured, axis=0)
+    return np.sqrt(np.average(squares, axis=0, weights=weights))
+
+
+def first_measured(segments: Segments) -> Array:
+    """Return the first measurement of each segment (M, n_x)."""
+    return segments.x[0].copy()
+
+
+def _grid(episode: Episode, longest: float) -> Array:
+    inside = (episode.input_time > episode.time[0]) & (episode.input_time < episode.time[-1])
+    knots = np.union1d(episode.time, episode.input_time[inside])
+    pieces = [np.linspace(a, b, math.ceil((b - a) / longest * (1.0 - 1e-9)) + 1)[:-1]
+              if b - a > longest else np.array([a])
+              for a, b in itertools.pairwise(knots)]
+    return np.concatenate([*pieces, knots[-1:]])

@@ -1,0 +1,363 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Choice of a drift model among all methods and degrees, by held-out segments."""
+
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from dataclasses import dataclass
+from enum import Enum
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+
+from koopman_ros.arrays import brief
+from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.identification_methods import METHODS
+from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
+from koopman_ros.learning.identification.drift import (
+    box_of,
+    Drift,
+    DriftModel,
+    longest_step,
+    prediction_error,
+    Segments,
+)
+from koopman_ros.learning.identification.excitation import check_inputs
+from koopman_ros.learning.identification.output_error import output_error
+from koopman_ros.learning.identification.total_variation import noise_level
+from koopman_ros.learning.lift.input_model import InputModel
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Array, cut, Episode, Plant
+from koopman_ros.plugs import contained, plug_class, short_name
+
+DEGREES = (1, 2, 3, 4, 5, 6)
+# Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
+# minutes for more, and an hour does not determine them.
+_MOST_COEFFICIENTS = 150
+OUTPUT_ERROR = 'output error'
+INNOVATIONS_FORM = 'innovations form'
+
+_SEGMENT_SAMPLES = (20, 240)
+_SEGMENTS = 15
+_FITTED = 0.6  # share of them that are fitted; they hold the extremes of all signals
+# For two states and an input, six of them may hold the extremes.
+_FEWEST = 8
+# Mean squared errors this close count as equal: on a few segments that hold one estimate against
+# another, chance alone makes such a difference.
+_NEARLY = 1.1
+
+# Called with (steps done, steps in all, what is done now); True ends the estimation.
+Watch = Callable[[int, int, str], bool]
+
+
+class Stopped(Exception):  # noqa: N818
+    """The `watch` callback asked to stop."""
+
+
+def stage_by_stage(watch: Watch, total: int, done: int = 0
+                   ) -> Callable[[str], Callable[..., bool]]:
+    """
+    Return a function that begins the next of `total` stages and returns its monitor.
+
+    Of the stages so many are `done` already.
+
+    A stage reports when it begins and whenever its monitor is called, which raises
+    :class:`Stopped` when `watch` asked to stop.
+    """
+    numbers = itertools.count(done)
+
+    def begin(text: str) -> Callable[..., bool]:
+        number = next(numbers)
+
+        def monitor(*_: object) -> bool:
+            if watch(number, total, text):
+                raise Stopped
+            return False
+
+        monitor()
+        return monitor
+
+    return begin
+
+
+@dataclass(frozen=True)
+class Score:
+    """Prediction error of one estimate on the segments held out for the choice."""
+
+    method: str  #: its name, e.g. ``'weak form, 40 samples'``
+    degree: int | None  #: of the drift, None where it is no polynomial
+    rmse: Array  #: (n_x,) root mean square error, in state units; infinite when it diverges
+    cost: float  #: mean squared error in units of the states' scale, by which estimates compare
+
+
+class EstimateStatus(Enum):
+    """Reliability of the estimate of a constant; the value is the sentence for the user."""
+
+    ESTIMATED = ''
+    AT_LOWER_END = ('it ends at the lower end of its range: widen the range, or look for what '
+                    'else is not as the equations say')
+    AT_UPPER_END = ('it ends at the upper end of its range: widen the range, or look for what '
+                    'else is not as the equations say')
+    NOT_IDENTIFIABLE = ('the record tells no more of it than its range does: give its value in '
+                        'place of a range, or that of another constant that acts as it does, or '
+                        'record more')
+
+
+@dataclass(frozen=True)
+class EstimatedConstant:
+    """A constant of a plant's equations, as a record tells it."""
+
+    name: str  #: of the field of the plant's class
+    unit: str  #: of SI, as the plant node has it
+    value: float  #: the estimate, in `unit`
+    #: standard deviation of the estimate, in `unit` (K for a temperature); NaN at an end of the
+    #: range, infinite where the record tells nothing of it
+    standard_error: float
+    lower: float  #: lowest value that was looked at
+    upper: float  #: highest likewise
+    standing: EstimateStatus
+
+    def __str__(self) -> str:
+        error = '' if self.standing is not EstimateStatus.ESTIMATED else (
+            f' +- {self.standard_error:.2g}')
+        said = f' ({self.standing.value})' if self.standing.value else ''
+        return f'{self.value:.6g}{error} {self.unit}{said}'
+
+
+@dataclass(frozen=True)
+class Identified:
+    """An estimated drift with the scores of all candidates."""
+
+    drift: Drift  #: the estimate
+    method: str  #: how it was found
+    linear: DriftModel  #: the best linear model of the same episodes, by output error
+    scores: tuple[Score, ...]  #: of all estimates, in the order of their making
+    noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
+    fitted: tuple[Episode, ...]  #: the segments that it was fitted to
+    held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
+    #: unmeasured states, the last ones: the segments hold a filter's estimates of them
+    hidden: int = 0
+    #: those that were estimated, where it is the equations of a plant's class
+    constants: tuple[EstimatedConstant, ...] = ()
+    warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
+
+    __repr__ = brief
+
+
+def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
+             methods: Mapping[str, IdentificationMethod] | None = None, seed: int = 0,
+             watch: Watch = lambda *_: False, backend: Backend | None = None) -> Identified:
+    """
+    Estimate dx/dt = f(x) + B(x) u from sampled, noisy measurements.
+
+    For each degree of f every method gives an estimate; the best on segments held out for the
+    choice is refined by output error, where that pays. Of the degrees that predict about as well
+    as the best, the one with the least Bayesian information criterion (Schwarz 1978) over the
+    fitted segments is taken, which reach further than the others, and refitted to all but those
+    held out for good.
+
+    :param plant: names, units, and B where it is known, or the degree of the B(x) to learn.
+    :param degrees: of f that are tried, rising, the first one 1; by default those whose drift has
+        few enough coefficients for so many states.
+    :param methods: by name, in the order in which they pass a rough B on; all of ``METHODS`` by
+        default.
+    :param seed: of the split.
+    :param backend: where the degrees are estimated, each by itself; this process by default.
+    :raises ValueError: when the episodes are too short, their inputs do not determine B, or
+        nothing fits.
+    :raises Stopped: when `watch` asked for it.
+    """
+    n_x, n_u = len(plant.state_names), len(plant.input_names)
+    degrees = degrees or tuple(degree for degree in DEGREES if degree == 1
+                               or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
+    parts = segments_of(episodes, n_x + n_u)
+    box = box_of(plant, parts)
+    warnings = check_inputs(plant, episodes)
+    fit, choose, held_out = ([parts[i] for i in share] for share in split(parts, seed))
+    step = longest_step(parts)
+    chooser, fitter = Segments.of(choose, step), Segments.of(fit, step)
+    inputs = InputModel.of(plant, box, np.concatenate([part.x for part in parts]))
+    known = inputs.weights
+    if methods is None:
+        methods = methods_of(tuple(METHODS), {})
+    scores: list[Score] = []
+    failures: dict[str, None] = {}
+    best: dict[int, tuple[DriftModel, Score]] = {}
+    done, words = 0, {f'drift of degree {degree}': degree for degree in degrees}
+
+    def progress(name: str, _: object) -> bool:
+        if watch(done, len(degrees) + 1, name or [*words, ''][done]):
+            raise Stopped
+        return False
+
+    with contextlib.closing((backend or Serial()).run(
+            _candidate, words, watch=progress, shared=_Given(
+                fit, fitter, chooser, box, known, inputs.degree, methods))) as candidates:
+        for name, candidate in candidates:
+            done += 1
+            failures |= dict.fromkeys(candidate.failures)
+            scores += candidate.scores
+            if candidate.best is not None:
+                best[words[name]] = candidate.best
+    least = min((score.cost for _, score in best.values()), default=math.inf)
+    if not math.isfinite(least):
+        raise ValueError('; '.join(['no drift fits the episodes: record longer, with steps of the '
+                                    'input', *failures]))
+    good = [d for d, (_, score) in best.items() if score.cost <= _NEARLY * least]
+    degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
+
+    def monitor(*_: object) -> bool:
+        return progress(f'drift of degree {degree} on all episodes', None)
+
+    monitor()
+    everything = Segments.of([*fit, *choose], step)
+    finished = {}
+    for d in {degree, degrees[0]} & set(best):
+        model, score = best[d]
+        finished[d] = output_error(model, everything, learn_input_matrix=known is None,
+                                   monitor=monitor) if OUTPUT_ERROR in score.method else model
+    return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
+                      tuple(scores), noise_level(parts, finished[degree]),
+                      (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures))
+
+
+@dataclass(frozen=True)
+class _Given:
+    """The data of the estimates of all degrees."""
+
+    fit: Sequence[Episode]
+    fitter: Segments  # the same
+    chooser: Segments
+    box: Box
+    known: Array | None  # B as DriftModel has it
+    input_degree: int  # of the B(x) to estimate
+    methods: Mapping[str, IdentificationMethod]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """The best estimate of a degree, with the scores of all of them that were refined."""
+
+    best: tuple[DriftModel, Score] | None
+    scores: tuple[Score, ...]
+    failures: tuple[str, ...]  # reasons of methods that raised unexpectedly
+
+
+def _candidate(given: _Given, degree: int, tell: Tell) -> _Candidate:
+    """Estimate a drift of a degree by every method, and refine the best."""
+    def monitor(*_: object) -> bool:
+        return tell(None)
+
+    monitor()
+    estimates, failures = _estimates(given, degree)
+    rated = [(model, _score(model, given.chooser, method)) for method, model in estimates]
+    model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
+    if model is None or score is None:
+        return _Candidate(None, (), failures)
+    if not math.isfinite(score.cost):
+        return _Candidate((model, score), (), failures)
+    refined = output_error(model, given.fitter, learn_input_matrix=given.known is None,
+                           monitor=monitor)
+    polished = _score(refined, given.chooser, f'{OUTPUT_ERROR} from {score.method}')
+    # the better estimate in theory needs no proof, only that it does no harm
+    best = (refined, polished) if polished.cost <= _NEARLY * score.cost else (model, score)
+    return _Candidate(best, (*(score for _, score in rated), polished), failures)
+
+
+def segments_of(episodes: Sequence[Episode], signals: int) -> list[Episode]:
+    """Cut into segments, of which three fifths may hold the extremes of so many signals."""
+    low, high = _SEGMENT_SAMPLES
+    count = max(_SEGMENTS, math.ceil(2 * signals / _FITTED))
+    total = sum(len(episode) for episode in episodes)
+    if total < _FEWEST * low:
+        raise ValueError(f'{total} samples are too few to learn from and to judge by: record at '
+                         f'least {_FEWEST * low}, better some thousand')
+    parts = cut(episodes, min(high, max(low, total // count)))
+    kept = [part for part in parts if len(part) >= low // 2]
+    if len(kept) < _FEWEST:
+        raise ValueError(f'the episodes have {len(kept)} uninterrupted segments of {low // 2} '
+                         f'samples, at least {_FEWEST} are needed: record longer without gaps')
+    return kept
+
+
+def split(parts: Sequence[Episode], seed: int) -> tuple[list[int], list[int], list[int]]:
+    """
+    Return which segments to fit to, to choose by and to hold out: three, one and one fifth.
+
+    Those that reach furthest are fitted to: the range should be known, not extrapolated to.
+    """
+    lows = np.array([np.concatenate((part.x.min(axis=0), part.u.min(axis=0))) for part in parts])
+    highs = np.array([np.concatenate((part.x.max(axis=0), part.u.max(axis=0))) for part in parts])
+    furthest = {*lows.argmin(axis=0).tolist(), *highs.argmax(axis=0).tolist()}
+    free = [i for i in np.random.default_rng(seed).permutation(len(parts)).tolist()
+            if i not in furthest]
+    if len(free) < 2:
+        raise ValueError(f'all but {len(free)} of {len(parts)} segments hold the lowest or the '
+                         'highest of a state or an input, none is left to judge by: record longer')
+    fifth = min(max(1, len(parts) // 5), len(free) // 2)
+    choose, held_out = free[:fifth], free[fifth:2 * fifth]
+    fit = furthest.union(free[2 * fifth:])
+    return sorted(fit), sorted(choose), sorted(held_out)
+
+
+def _estimates(given: _Given, degree: int
+               ) -> tuple[list[tuple[str, DriftModel]], tuple[str, ...]]:
+    """Return the estimates of all methods by name, and why methods failed unexpectedly."""
+    found: list[tuple[str, DriftModel]] = []
+    failures = []
+    for name, method in given.methods.items():
+        rough = found[-1][1].B if found else given.known
+        try:
+            for estimate in method.estimate(DriftProblem(
+                    given.fit, given.box, degree, given.known, rough, given.input_degree)):
+                words = [name.replace('_', ' '), estimate.variant]
+                if not np.all(np.isfinite(estimate.model.coefficients)):
+                    raise ValueError('its coefficients are not finite')
+                found.append((', '.join(filter(None, words)), estimate.model))
+        except (ValueError, np.linalg.LinAlgError):
+            # as on short segments
+            continue
+        except Exception as error:
+            failures.append(f'the method {name} failed: {contained(error)}')
+    return found, tuple(failures)
+
+
+def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
+               ) -> dict[str, IdentificationMethod]:
+    """
+    Return methods of identification by name.
+
+    :param names: of ``METHODS``, or ``module:Class`` for one of your own.
+    :param parameters: fields of its `Parameters` by the name of the method.
+    :raises ValueError: for a name without a method, a class that does not fulfil the contract, or
+        parameters that it does not have.
+    """
+    found: dict[str, IdentificationMethod] = {}
+    for name in names:
+        kind = plug_class(name, 'identification method', METHODS, IdentificationMethod)
+        short = short_name(name)
+        try:
+            found[short] = kind(kind.Parameters(**parameters.get(short, {})))
+        except Exception as error:
+            raise ValueError(f'the identification method {name!r} cannot be configured: '
+                             f'{contained(error)}') from error
+    return found
+
+
+def _information(model: DriftModel, segments: Segments, learned_B: bool) -> float:
+    """Return the Bayesian information criterion, but for a constant."""
+    scale = model.box.states.scale
+    # an error below rounding tells nothing
+    rmse = np.maximum(prediction_error(model.rate, segments, scale) / scale, 1e-12)
+    count = int(np.sum(segments.measured))
+    size = model.coefficients.size + learned_B * model.B.size
+    return 2.0 * count * float(np.sum(np.log(rmse))) + size * math.log(count)
+
+
+def _score(model: DriftModel, segments: Segments, method: str) -> Score:
+    scale = model.box.states.scale
+    rmse = prediction_error(model.rate, segments, scale)
+    return Score(method, model.degree, rmse, float(np.mean((rmse / scale) ** 2)))

@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A drift with the gain of its filter, which foresees the next measurement: innovations form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
+from koopman_ros.learning.identification.weak_form import regress
+from koopman_ros.plant_data import Episode
+from koopman_ros.solvers import runge_kutta_step
+
+SETTLING = 40  # samples after which a filter has found the state
+# Of the search for the start of an episode: how far hidden states are tried, steps, differences.
+_APART, _SEARCHES, _STEP = 0.5, 3, 1e-4
+
+
+_Drift = TypeVar('_Drift', bound=Drift, covariant=True)
+
+
+@dataclass(frozen=True)
+class Predictor(Generic[_Drift]):
+    """A drift whose first states are measured, with the gain of its filter."""
+
+    drift: _Drift
+    gain: Array  #: (n_x, n_y) in deviations
+
+    def run(self, episodes: Sequence[Episode], step: float) -> Run:
+        """Filter episodes of measurements (N, n_y), from the starts that suit the first ones."""
+        data = Segments.of(episodes, step)
+        run = self._filter(data, self._starts(data))
+        if not np.all(np.isfinite(run[1])):
+            raise ValueError('the estimate of the unmeasured states diverges')
+        return _run(data, run)
+
+    def along(self, segments: Segments, starts: Array) -> Run:
+        """Filter segments from starts (M, n_x), in deviations."""
+        return _run(segments, self._filter(segments, starts))
+
+    def _filter(self, data: Segments, x: Array) -> tuple[Array, Array, Array]:
+        """Return the arrays of a run from starts (M, n_x), on the grid (K + 1, M, ...)."""
+        drift, n_y = self.drift, self.gain.shape[1]
+        v, target = drift.box.inputs.to_deviation(data.u), self._target(data)
+        foreseen = np.empty((*target.shape[:2], len(self.gain)))
+        estimates, errors = np.empty(foreseen.shape), np.empty(target.shape)
+        with np.errstate(all='ignore'):
+            for k in range(len(target)):
+                foreseen[k] = x
+                errors[k] = np.where(data.measured[k][:, None], target[k] - x[:, :n_y], 0.0)
+                estimates[k] = x = x + errors[k] @ self.gain.T
+                if k < len(v):
+                    x = runge_kutta_step(_held(drift, v[k]), x, data.steps[k][:, None])
+        return foreseen, estimates, errors
+
+    def _target(self, data: Segments) -> Array:
+        states = self.drift.box.states
+        return states.only(states.names[:self.gain.shape[1]]).to_deviation(data.x)
+
+    def _starts(self, data: Segments) -> Array:
+        """Return starts (M, n_x) from which the first measurements are foreseen, in deviations."""
+        taken = np.cumsum(data.measured, axis=0).max(axis=1)
+        rows = min(int(np.sum(taken <= SETTLING)), len(data.steps))
+        first = Segments(data.steps[:rows], data.u[:rows], data.x[:rows + 1],
+                         data.measured[:rows + 1])
+        n_x, n_y = self.gain.shape
+        home = np.zeros((first.x.shape[1], n_x))
+        home[:, :n_y] = self._target(first)[0]
+        hidden = _APART * np.eye(n_x)[n_y:]
+
+        def errors(starts: Array) -> Array:
+            """Evaluate the errors, (S, k, M, n_y), from starts (S, M, n_x), side by side."""
+            found = self._filter(first.repeated(len(starts)), starts.reshape(-1, n_x))[2]
+            return np.moveaxis(found.reshape(len(found), *starts.shape[:2], n_y), 1, 0)
+
+        def best_of(starts: Array) -> tuple[Array, Array]:
+            """Return the best of starts (S, M, n_x) for each segment, and its size."""
+            with np.errstate(over='ignore'):
+                squares = np.sum(errors(starts) ** 2, axis=(1, 3))
+            squares = np.where(np.isfinite(squares), squares, np.inf)
+            chosen = np.argmin(squares, axis=0)[None]
+            return (np.take_along_axis(starts, chosen[..., None], axis=0)[0],
+                    np.take_along_axis(squares, chosen, axis=0)[0])
+
+        shifts = np.concatenate((np.zeros((1, n_x)), hidden, -hidden))
+        best, least = best_of(home + shifts[:, None])
+        steps = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
+        for _ in range(_SEARCHES):
+            here, *beside = errors(best + steps[:, None])
+            slopes = np.stack([other - here for other in beside], axis=-1) / _STEP
+            normal = np.einsum('kmyi,kmyj->mij', slopes, slopes)
+            right = np.einsum('kmyi,kmy->mi', slopes, here)
+            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+                break
+            offered = best - (np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+                              @ right[..., None])[..., 0]
+            offer, own = best_of(offered[None])
+            best, least = (np.where((own < least)[:, None], offer, best), np.minimum(own, least))
+        return best
+
+
+@dataclass(frozen=True)
+class Run:
+    """The result of a filter on all samples, in deviations."""
+
+    foreseen: Array  #: (N, n_x) states before the samples
+    estimates: Array  #: (N, n_x) states after them
+    innovations: Array  #: (N, n_y)
+
+
+def _run(data: Segments, values: Sequence[Array]) -> Run:
+    # episode by episode, each in the order of its times
+    return Run(*(np.swapaxes(one, 0, 1)[data.measured.T] for one in values))
+
+
+def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:
+    """Return the same with monomials of the next degree, which have no weight yet."""
+    drift = predictor.drift
+    higher = DriftModel(drift.box, drift.degree + 1, np.empty(0), drift.B)
+    n_x = len(drift.B)
+    coefficients = np.zeros((1 + higher.monomials.n_z, n_x))
+    # those of a degree come before those of the next
+    coefficients[:len(drift.coefficients)] = drift.coefficients
+    return replace(predictor, drift=replace(higher, coefficients=coefficients))
+
+
+def standardised(predictor: Predictor[DriftModel], xi: Array) -> Predictor[DriftModel]:
+    """
+    Replace hidden states by their part that measurements do not explain, from -1 to 1.
+
+    :param xi: (N, n_x) states as they were estimated, in deviations.
+    """
+    drift, n_y = predictor.drift, predictor.gain.shape[1]
+    left = np.column_stack([np.ones(len(xi)), xi[:, :n_y]])
+    weights = np.linalg.lstsq(left, xi[:, n_y:], rcond=None)[0]
+    rest = xi[:, n_y:] - left @ weights
+    if rest.shape[1] > 1:
+        # uncorrelated among each other, too
+        rest_axes = np.linalg.svd(rest, full_matrices=False)[2]
+    else:
+        rest_axes = np.eye(rest.shape[1])
+    turned = rest @ rest_axes.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    if not np.all(high > low):
+        raise ValueError('a state that is not measured never moves')
+    S = np.eye(len(xi.T))
+    S[n_y:, n_y:] = 2.0 * rest_axes / (high - low)[:, None]
+    S[n_y:, :n_y] = -S[n_y:, n_y:] @ weights[1:].T
+    shift = -S[n_y:, n_y:] @ weights[0] - (high + low) / (high - low)
+    offset = np.concatenate((np.zeros(n_y), shift))
+    # polynomials of a degree remain such: as many points as determine them, and some more
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1.0, 1.0, (4 * len(drift.coefficients), len(S)))
+    before = np.linalg.solve(S, (points - offset).T).T
+    none = np.zeros((len(points), len(drift.box.inputs)))
+    rates = drift.features(before) @ drift.coefficients @ S.T
+    B = S @ drift.B
+    return Predictor(regress(drift.box, drift.degree, drift.features(points), none, rates, B),
+                     S @ predictor.gain)
+
+
+def _held(drift: Drift, v: Array) -> Callable[[Array], Array]:
+    return lambda x: drift.scaled_rate(x, v)

@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Held-out figures of a lifted model, invariant under linear maps of its coordinates."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import DOP853
+
+from koopman_ros.arrays import brief
+from koopman_ros.control.law_check import Rate
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Array, Samples
+
+# Beyond it S is singular to working precision, and rw is noise.
+_MAX_COND = 1e13
+# Of relative mean-square errors below it, which is smaller says nothing.
+ROUNDING = 1e-20
+# Of the drift in a roll-out, for each sample; a model a thousand times faster needs a fifth.
+_MAX_DRIFTS = 10_000
+# A prediction this far from the nominal point, in units of the scale, has diverged.
+_DIVERGED = 1e6
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Residuals of a lift in dz/dt = A z + J_N(x) B(x) u on samples."""
+
+    #: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant under linear
+    #: maps of z, so that it cannot be lowered by shrinking z; f is the drift under the model's
+    #: pre-feedback, where it has one
+    rw: float
+    rx: float  #: relative mean-square error of the drift of x that the lift implies
+    cond: float  #: condition number of S; large when coordinates have collapsed onto each other
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of a model on held-out samples."""
+
+    fit: Fit  #: its residuals
+    eigenvalues: NDArray[np.complex128] = field(compare=False)  #: (n_z,) of A, in 1/time unit
+    #: (n_x,) root mean square error of the prediction over the held-out episodes, in state units;
+    #: infinite when it diverges, None when the samples have no times
+    rollout_rmse: Array | None = field(compare=False)
+
+    __repr__ = brief
+
+    def metrics(self, names: tuple[str, ...]) -> dict[str, float]:
+        """Return the finite figures by name, as they are stored with the model."""
+        figures = {'rw': self.fit.rw, 'rx': self.fit.rx, 'cond': self.fit.cond}
+        if self.rollout_rmse is not None:
+            labels = ['rollout_rmse'] if len(names) == 1 else [
+                f'rollout_rmse_{name}' for name in names]
+            figures |= dict(zip(labels, map(float, self.rollout_rmse), strict=True))
+        return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def evaluate(model: LiftedModel, samples: Samples) -> Figures:
+    """Evaluate all open-loop figures on held-out episodes; raises as :func:`fit`."""
+    return Figures(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
+                  rollout_rmse(model, samples))
+
+
+def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
+    """
+    Evaluate the residuals of a lift on samples of a plant.
+
+    :param x: (N, n_x) states, in state units.
+    :param dxdt: (N, n_x) their derivatives, in state units per time unit.
+    :param u: (N, n_u) inputs, in input units.
+    :raises ValueError: when the samples do not distinguish the coordinates, or do not fit the
+        model.
+    """
+    xi, f = _drifts(model, x, dxdt, u)
+    z, J = model.lift_and_jacobian(xi)
+    # of the plant under the pre-feedback of A
+    dz = (J @ (f + model.pre_feedback_rate(xi))[..., None])[..., 0]
+    S = z.T @ z / len(z)
+    cond = float(np.linalg.cond(S))
+    if not cond < _MAX_COND:
+        raise ValueError(f'{len(z)} samples do not tell {model.n_z} coordinates apart: judge by '
+                         'samples that move more, or use a smaller n_z')
+    factor = np.linalg.cholesky(S)
+    residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
+    reference = np.linalg.solve(factor, dz.T)
+    return Fit(rw=float(np.sum(residual ** 2) / np.sum(reference ** 2)),
+               rx=_relative_error(model, xi, f),
+               cond=cond)
+
+
+def drift_error(model: LiftedModel, samples: Samples) -> float:
+    """Return `rx` of samples that need not tell the coordinates apart."""
+    return _relative_error(model, *_drifts(model, samples.x, samples.dxdt, samples.u))
+
+
+def _drifts(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> tuple[Array, Array]:
+    """Return scaled states (N, n_x), and their rates (N, n_x) less the effect of inputs."""
+    x, dxdt = (model.states.array(name, a) for name, a in (('x', x), ('dxdt', dxdt)))
+    xi = model.states.to_deviation(x)
+    return xi, dxdt / model.states.scale - model.forcing(
+        xi, model.inputs.to_deviation(model.inputs.array('u', u)))
+
+
+def _relative_error(model: LiftedModel, xi: Array, f: Array) -> float:
+    error = model.drift(xi) - f
+    return float(np.sum(error ** 2) / np.sum(f ** 2))
+
+
+def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
+    """
+    Predict the states under inputs that are held, from the model's drift: dx/dt = f(x) + B(x) u.
+
+    :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
+    :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
+    :param sample_period: in the model's time unit, or (K,) periods.
+    :return: (..., K + 1, n_x) states at the samples, in state units.
+    :raises RuntimeError: when the prediction diverges.
+    :raises ValueError: for arrays that do not fit the model, or periods that are not above 0.
+    """
+    inputs = model.inputs.array('inputs', inputs)
+    xi = model.states.to_deviation(model.states.array('x0', x0))
+    shape = xi.shape
+    if inputs.ndim != xi.ndim + 1:
+        raise ValueError(f'incompatible inputs: expected ({", ".join(map(str, shape[:-1]))}'
+                         f'{", " if shape[:-1] else ""}K, {model.n_u}), got {inputs.shape}')
+    holds = inputs.shape[-2]
+    periods = np.asarray(sample_period, dtype=np.float64)
+    if periods.shape not in ((), (holds,)) or not np.all(periods > 0.0):
+        raise ValueError(f'sample_period must be above 0 {model.time_unit}, one number or one for '
+                         f'each of {holds} inputs, got {sample_period}')
+    v = model.inputs.to_deviation(inputs)
+    path = [xi]
+    for k, period in enumerate(np.broadcast_to(periods, (holds,))):
+        # a prediction that overflows is reported below
+        with np.errstate(all='ignore'):
+            rate = model.rate_under(v[..., k, :])
+            solver = DOP853(
+                lambda _, y, rate=rate: rate(y.reshape(shape)).ravel(), 0.0, xi.ravel(), period,
+                rtol=1e-9, atol=1e-12)
+            # near a state where J_N is singular the steps may become ever shorter
+            while solver.status == 'running' and solver.nfev < _MAX_DRIFTS:
+                solver.step()
+        xi = solver.y.reshape(shape)
+        if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
+            raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
+                               'inputs within the training box')
+        path.append(xi)
+    return model.states.to_physical(np.stack(path, axis=-2))
+
+
+def rollout_rmse(model: LiftedModel, samples: Samples) -> Array | None:
+    """
+    Predict every episode from its first state; return the root mean square error (n_x,), in units.
+
+    It is infinite when a prediction diverges, None when the samples have no times.
+    """
+    if samples.time is None:
+        return None
+    # episodes with the same times are predicted side by side
+    alike: dict[bytes, list[np.ndarray]] = {}
+    for number in np.unique(samples.episode):
+        rows = np.flatnonzero(samples.episode == number)
+        if len(rows) > 1:
+            alike.setdefault(np.diff(samples.time[rows]).tobytes(), []).append(rows)
+    squares, count = np.zeros(model.n_x), 0
+    for group in alike.values():
+        rows = np.stack(group)
+        periods = np.diff(samples.time[rows[0]])
+        try:
+            predicted = roll_out(model, samples.x[rows[:, 0]], samples.u[rows[:, :-1]], periods)
+        except (RuntimeError, np.linalg.LinAlgError):
+            return np.full(model.n_x, np.inf)
+        squares += np.sum((predicted - samples.x[rows]) ** 2, axis=(0, 1))
+        count += rows[:, 1:].size
+    return np.sqrt(squares / count) if count else None
+
+
+def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
+    """
+    Return dx/dt of a model's drift, in units and per a time unit of so many seconds.
+
+    It is NaN for states that have diverged: their pseudo-inverse does not exist.
+    """
+    factor = time_unit_seconds / model.seconds_per_time_unit
+
+    def rate(x: Array, u: Array) -> Array:
+        xi = model.states.to_deviation(x)
+        followed = np.all(np.abs(xi) < _DIVERGED, axis=-1, keepdims=True)
+        xi = np.where(followed, xi, 0.0)
+        found = model.drift(xi) + model.forcing(xi, model.inputs.to_deviation(u))
+        scaled: Array = factor * model.states.scale * np.where(followed, found, np.nan)
+        return scaled
+
+    return rate

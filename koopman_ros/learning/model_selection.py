@@ -1,0 +1,318 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The classes of models side by side on the same samples, and which of them to take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from dataclasses import dataclass, replace
+import math
+import time
+
+import numpy as np
+
+from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
+from koopman_ros.execution import Backend
+from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
+from koopman_ros.learning.lift.edmd import Edmd
+from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.metrics import evaluate, Figures, fit, ROUNDING
+from koopman_ros.learning.lift.multistart import Progress, Recipe, Watch
+from koopman_ros.learning.lift.neural_drift import NeuralDrift, with_readout, with_units_of
+from koopman_ros.learning.lift.training import (
+    NoUsefulLift,
+    reference_drift,
+    train,
+    training_states,
+)
+from koopman_ros.lifting import Box, LiftedModel, model_file
+from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
+from koopman_ros.plant_data import Plant, Samples, split_by_episode
+from koopman_ros.reports import table
+
+DEGREES = (2, 3, 4, 5)
+# A plainer model may err by this much more, in the mean square.
+_FACTOR = 2.0
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A model of one class with its figures, or the reason why there is none."""
+
+    name: str  #: of the class
+    model: LiftedModel | None  #: the best of the class, None when training refused all
+    rx: float  #: relative mean-square error of its drift on the validation episodes; else infinite
+    figures: Figures | None  #: its figures on the test episodes, which chose nothing
+    law_check: LawCheck | None  #: its law in closed loops, where there are any
+    seconds: float  #: that it took to learn
+    refusal: str = ''  #: why it should not be used; empty when it may be
+    #: mean-square error of its predictions of a record beyond the noise, relative to the states'
+    #: scale; None where no record judges
+    excess: float | None = None
+    steps: int = 0  #: of minimisations, where it is a network
+
+    @property
+    def error(self) -> float:
+        """The error that the rule compares: on a record where there is one, else `rx`."""
+        return self.rx if self.excess is None else self.excess
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Judgement of models in place of that by validation episodes and their polynomials."""
+
+    #: completes a contender that has no law check, no `excess` and no refusal yet
+    judged: Callable[[Contender], Contender]
+    resolution: float  #: errors below it count as equal
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of :func:`compare`; as text a table in Markdown."""
+
+    contenders: tuple[Contender, ...]  #: the plainest first
+    chosen: Contender  #: by the rule, or as it was asked for
+    state_names: tuple[str, ...]  #: of the states, with their units
+    state_units: tuple[str, ...]
+
+    @property
+    def model(self) -> LiftedModel:
+        """The model of the chosen class."""
+        assert self.chosen.model is not None
+        return self.chosen.model
+
+    @property
+    def figures(self) -> Figures:
+        """The figures of that model."""
+        assert self.chosen.figures is not None
+        return self.chosen.figures
+
+    def with_model(self, model: LiftedModel) -> Comparison:
+        """Return the same with another model of the chosen class."""
+        chosen = replace(self.chosen, model=model)
+        return replace(self, chosen=chosen, contenders=tuple(
+            chosen if one is self.chosen else one for one in self.contenders))
+
+    def __str__(self) -> str:
+        """Return a row for each class; roll-outs are of the test episodes, or of the record."""
+        recorded = any(one.excess is not None for one in self.contenders)
+        head = ['model', 'n_z', 'rx, validation', 'rx, test', *['beyond noise'] * recorded,
+                *(f'roll-out of {name}, {unit}' for name, unit in zip(
+                    self.state_names, self.state_units, strict=True)),
+                'loops failed', 'cost beside linear', 's', 'remark']
+        rows = []
+        for one in self.contenders:
+            found = one.figures
+            errors = [''] * len(self.state_names) if found is None or (
+                found.rollout_rmse is None) else [f'{error:.2g}' for error in found.rollout_rmse]
+            law = one.law_check
+            rows.append([
+                one.name, '' if one.model is None else one.model.n_z,
+                '' if one.model is None else f'{one.rx:.1e}',
+                '' if found is None else f'{found.fit.rx:.1e}',
+                *['' if one.excess is None else f'{one.excess:.1e}'] * recorded, *errors,
+                *(('', '') if law is None else (f'{law.failed.sum()} of {law.loops}',
+                                                f'{law.median_ratio:.3f}')), f'{one.seconds:.1f}',
+                '; '.join(filter(None, ['chosen' * (one is self.chosen), one.refusal]))])
+        return table(head, rows, range(1, len(head) - 1))
+
+
+def usual_recipes(n_x: int) -> dict[str, Recipe]:
+    """Return the networks that are tried for a plant of `n_x` states, plainest first."""
+    units = 8 if n_x == 1 else 16
+    return {
+        NEURAL_DRIFT: NeuralDrift(units),
+        IDENTITY_LIFT: Growth(n_x + 3, hidden_first=units, max_iterations=300),
+        FREE_LIFT: Growth(n_x, identity=False, hidden_first=units, max_iterations=300)}
+
+
+def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None = None, *,
+            degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
+            seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
+            loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
+            backend: Backend | None = None, begin: LiftedModel | None = None) -> Comparison:
+    """
+    Learn a model of each class from the same episodes and choose one by a stated rule.
+
+    In order of plainness: linear, polynomial, and the recipes, by default a neural drift, a lift
+    with identity coordinates and a free one. Refused are networks whose `rx` on validation
+    episodes is not below the linear one's, models whose law fails in closed loops, and classes of
+    which no model can be learned. Of the others the plainest is taken whose `rx` there is at most
+    twice the smallest; below 1e-20 it is rounding and counts as equal. Where every law fails, it
+    is the one that does in the smallest share of the loops. The degree of the polynomial is chosen
+    by the same rule from `rx`. The read-out of a lift after a neural drift may use the units of
+    that, too.
+
+    :param recipes: those of the networks by name, in the order of the choice; the usual ones by
+        default. Other arguments as in :func:`train`.
+    :param choose: the name of the class to take whatever the rule says.
+    :param alone: whether it is the only one to be learned.
+    :param judge: of the models, in place of validation episodes and `loops`.
+    :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
+    :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
+    :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
+        was asked for or all samples are to blame.
+    """
+    n_x = samples.x.shape[1]
+    recipes = usual_recipes(n_x) if recipes is None else recipes
+    names: tuple[str, ...] = (LINEAR, POLYNOMIAL, *recipes)
+    if choose not in (*names, *[None] * (not alone)):
+        raise ValueError(f'choose must be one of {", ".join(names)}, got {choose!r}')
+    if alone:
+        names = tuple(name for name in names if name == choose)
+    if starts < 1:
+        raise ValueError(f'starts must be at least 1, got {starts}')
+    continuing = [name for name in names if begin is not None and _of_kind(recipes, name, begin)]
+    if begin is not None and not continuing:
+        raise ValueError(f'no class of {", ".join(names)} begins from a lift '
+                         f'{"with" if begin.identity else "without"} identity coordinates: learn '
+                         'a lift of its kind, or begin from nothing')
+    learner = _Learner(plant, samples, split_seed)
+    judge = judge or learner.judge(loops, backend)
+    counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
+    found: list[Contender] = []
+    drift: LiftedModel | None = None
+    for name in names:
+        since, steps = time.perf_counter(), 0
+        try:
+            if name in recipes:
+                trained = train(
+                    plant, samples, recipes[name], seed=seed, starts=starts,
+                    split_seed=split_seed, loops=0, watch=_among(watch, name, counts),
+                    device=device, backend=backend,
+                    begin=begin if name in continuing else None)
+                steps = trained.steps
+                model = trained.model if drift is None else learner.with_units_of(
+                    drift, trained.model)
+                if isinstance(recipes[name], NeuralDrift):
+                    drift = model
+            else:
+                model = learner.linear() if name == LINEAR else learner.polynomial(degrees)
+            found.append(replace(learner.contender(
+                name, model, time.perf_counter() - since, judge), steps=steps))
+        except (ValueError, np.linalg.LinAlgError) as refusal:
+            if name == choose:
+                raise
+            found.append(Contender(name, None, math.inf, None, None,
+                                   time.perf_counter() - since, str(refusal)))
+    chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
+    return Comparison(tuple(found), chosen, plant.state_names, plant.state_units)
+
+
+def plainest(contenders: Sequence[Contender], resolution: float = ROUNDING) -> Contender:
+    """
+    Return of those that pass the first whose error is at most twice the smallest.
+
+    Where none passes, the one whose law fails in the smallest share of its closed loops.
+
+    :param resolution: errors below it count as equal.
+    :raises NoUsefulLift: when there is no model of any class.
+    """
+    able = [one for one in contenders if not one.refusal]
+    if not able:
+        tried = [one for one in contenders if one.model is not None]
+        if not tried:
+            raise NoUsefulLift('no class has a model: ' + '; '.join(
+                f'{one.name}: {one.refusal}' for one in contenders))
+        return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
+    limit = _FACTOR * max(min(one.error for one in able), resolution)
+    return next(one for one in able if one.error <= limit)
+
+
+def _of_kind(recipes: Mapping[str, Recipe], name: str, lift: LiftedModel) -> bool:
+    """Return whether a class is that of a lift, as far as its coordinates tell."""
+    recipe = recipes.get(name)
+    return isinstance(recipe, Growth) and recipe.identity == lift.identity
+
+
+def _rounds(recipe: Recipe, n_x: int) -> int:
+    """Return the number of rounds of a recipe; 0 where it does not fit, as training will say."""
+    with contextlib.suppress(ValueError):
+        return len(recipe.rounds(n_x))
+    return 0
+
+
+def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch | None:
+    """Return a watch that counts the starts of one class among those of all."""
+    if watch is None:
+        return None
+    before = sum(counts[other] for other in list(counts)[:list(counts).index(name)])
+
+    def told(now: Progress) -> bool:
+        return watch(replace(now, name=name, finished=before + now.finished,
+                             total=sum(counts.values())))
+
+    return told
+
+
+class _Learner:
+    """The samples that all contenders are learned from, and judged by without a record."""
+
+    def __init__(self, plant: Plant, samples: Samples, split_seed: int) -> None:
+        self._plant = plant
+        self._parts = split_by_episode(samples, split_seed)
+        self._training, self._validation, self._test = self._parts
+        self._box = Box.of(plant, samples.x, samples.u)
+        # errors of the samples concern all classes
+        check_rates(plant, samples)
+        check_nominal_point(plant, samples, self._box)
+        self._known = training_states(self._box, samples)
+
+    def rx(self, model: LiftedModel) -> float:
+        """Return the error on the validation episodes."""
+        return fit(model, self._validation.x, self._validation.dxdt, self._validation.u).rx
+
+    def linear(self) -> LiftedModel:
+        """Return the linear model."""
+        return Edmd(degree=1).learn(self._plant, self._training, self._box)
+
+    def polynomial(self, degrees: Sequence[int]) -> LiftedModel:
+        """Choose the degree; those with too many monomials to tell apart or to save fall out."""
+        tried, refusal = [], 'no degree was to be tried'
+        for degree in degrees:
+            try:
+                model = Edmd(degree).learn(self._plant, self._training, self._box)
+                model_file.check(model)
+                tried.append(Contender(POLYNOMIAL, model, self.rx(model), None, None, 0.0))
+            except (ValueError, np.linalg.LinAlgError) as error:
+                refusal = str(error)
+        best = plainest(tried).model if tried else None
+        if best is None:
+            raise NoUsefulLift(refusal)
+        return best
+
+    def with_units_of(self, drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
+        """Let a lift's read-out use a drift's units as well, where that is closer."""
+        try:
+            joined = with_readout(with_units_of(drift, lift), self._training)
+        except ValueError:
+            # of another kind
+            return lift
+        return min((lift, joined), key=self.rx)
+
+    def contender(self, name: str, model: LiftedModel, seconds: float, judge: Judge) -> Contender:
+        """Judge a model, and note its figures in it."""
+        model = replace(model, training_states=self._known)
+        one = judge.judged(Contender(name, model, self.rx(model), evaluate(model, self._test),
+                                     None, seconds))
+        assert one.figures is not None
+        return replace(one, model=replace(
+            model, tried_loops=None if one.law_check is None else one.law_check.tried,
+            provenance=replace(
+                model.provenance, metrics=one.figures.metrics(model.states.names))))
+
+    def judge(self, loops: int, backend: Backend | None) -> Judge:
+        """Return the judge by closed loops on the drift that predicts validation episodes best."""
+        def judged(one: Contender) -> Contender:
+            model = one.model
+            if not loops or model is None or not model.n_u:
+                return one
+            law_check = check_law(model, reference_drift(
+                self._plant, self._box, self._parts, model), loops=loops, backend=backend)
+            refused = law_check is not None and not law_check.accepted
+            return replace(one, law_check=law_check,
+                           refusal=f'no controller: {law_check}' if refused else '')
+
+        return Judge(judged, ROUNDING)

@@ -1,0 +1,383 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Retraining from bags to the model file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+import hashlib
+import os
+from pathlib import Path
+import shutil
+
+import numpy as np
+
+from koopman_ros.arrays import Array, brief
+from koopman_ros.bags import Account
+from koopman_ros.bags.limits import bounded_reading
+from koopman_ros.execution import Backend, backend_of
+from koopman_ros.learning.acceptance import decide, Decision, Thresholds, uncovered_setpoints
+from koopman_ros.learning.downsampling import coverage
+from koopman_ros.learning.drift_sampling import compare_classes
+from koopman_ros.learning.identification import (
+    DriftModel,
+    estimate_parameters,
+    IdentificationMethod,
+    Identified,
+    identify,
+    identify_unmeasured,
+    methods_of,
+    Stopped,
+)
+from koopman_ros.learning.lift.multistart import Progress
+from koopman_ros.learning.lift.scaling import checked_device
+from koopman_ros.learning.lift.training import NoUsefulLift
+from koopman_ros.learning.model_selection import Comparison, Contender
+from koopman_ros.learning.record import read_record, Reduction, Source
+from koopman_ros.learning.task import FIRST, known, TrainingTask
+from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.model_classes import BEST, CLASSES
+from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.plants import plant_class
+from koopman_ros.resources import predecessor
+from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
+
+# A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
+_LEAST_JUMP = 0.1
+
+# Shares of the whole at which reading, estimating, learning and judging begin and end.
+_STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
+           'decide': (0.9, 1.0)}
+_JUDGED = 0.8  # share of deciding in which the closed loops are run
+
+# Called with the share done in [0, 1] and what is done now; True asks to stop.
+OnProgress = Callable[[float, str], bool]
+
+
+@dataclass(frozen=True)
+class Retrained:
+    """Result of a retraining."""
+
+    task: TrainingTask  #: the task
+    account: Account  #: counts of used and dropped measurements
+    found: Identified  #: the estimated drift
+    #: the classes that were learned, None when there is no model worth judging
+    learned: Comparison | None
+    decision: Decision | None  #: its figures, None without a lift
+    reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
+    #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
+    coverage: Mapping[tuple[str, str], float]
+    plant: Plant  #: names, units and nominal point; its time unit is that of the drift
+    present: LiftedModel | None  #: the lift that was in use, where there was one
+    model_file: str = ''  #: where the lift was written, or an empty string
+    reduction: Reduction | None = None  #: the part of a long record that is used
+
+    __repr__ = brief
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the lift may be used."""
+        return not self.reasons
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name, for a JSON file; None is an error that is infinite."""
+        box = self.found.drift.box
+        states, inputs = box.states, box.inputs
+        gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
+
+        def by_state(values: Array) -> dict[str, float | None]:
+            return {name: _finite(value) for name, value in zip(states.names, values, strict=True)}
+
+        def of_class(one: Contender) -> dict[str, object]:
+            said: dict[str, object] = {
+                'chosen': self.learned is not None and one is self.learned.chosen,
+                'refusal': one.refusal, 'seconds': one.seconds, 'steps': one.steps}
+            if one.figures and one.law_check:
+                assert one.figures.rollout_rmse is not None
+                assert one.excess is not None
+                said |= {
+                    'heldout_rx': _finite(one.figures.fit.rx),
+                    'heldout_error': by_state(one.figures.rollout_rmse),
+                    'beyond_noise': _finite(one.excess),
+                    'closed_loops': one.law_check.loops,
+                    'closed_loops_failed': int(np.sum(one.law_check.failed)),
+                    'closed_loop_cost_beside_linear': _finite(one.law_check.median_ratio)}
+            return said
+
+        figures: dict[str, object] = {
+            'accepted': self.accepted,
+            'model_class': 'none learned' if self.learned is None else self.learned.chosen.name,
+            'reasons': list(self.reasons),
+            'warnings': list(self.decision.warnings) if self.decision else [],
+            'model_file': self.model_file,
+            'units': dict(zip((*states.names, *inputs.names), (*states.units, *inputs.units),
+                              strict=True)),
+            'measurements_read': self.account.measurements,
+            'measurements_used': self.account.used,
+            'reduction': None if self.reduction is None else asdict(self.reduction),
+            'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
+            'derivative_method': self.found.method,
+            'drift': self.found.drift.form,
+            'drift_degree': (
+                self.found.drift.degree if isinstance(self.found.drift, DriftModel) else None),
+            'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
+                           for name, row in zip(states.names, gains, strict=True)},
+            'noise': by_state(self.found.noise),
+            'constants': {one.name: {
+                'value': one.value, 'standard_error': _finite(one.standard_error),
+                'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
+                'standing': one.standing.name.lower(), 'text': str(one)}
+                for one in self.found.constants},
+        }
+        if self.decision and self.learned:
+            trained, fit = self.learned.model.states, self.learned.figures.fit
+            check = self.decision.law_check
+            figures |= {
+                'model_class': self.learned.chosen.name,
+                'classes': {one.name: of_class(one) for one in self.learned.contenders},
+                'trained_from': by_state(trained.lower),
+                'trained_to': by_state(trained.upper),
+                'heldout_error': by_state(self.decision.rmse),
+                'heldout_error_of_present_lift': None if self.decision.current_rmse is None else (
+                    by_state(self.decision.current_rmse)),
+                'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
+                'heldout_rw': fit.rw,
+                'heldout_rx': fit.rx,
+                'condition': fit.cond,
+                'closed_loops': check.loops,
+                'closed_loops_arrived': check.arrived,
+                'closed_loops_failed': int(np.sum(check.failed)),
+                'closed_loop_cost_beside_linear': check.median_ratio,
+                'worst_closed_loop_cost_beside_linear': check.worst_ratio,
+            }
+        return {name: _finite(value) if isinstance(value, float) else value
+                for name, value in figures.items()}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
+    """
+    Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
+
+    It is worked where the task says, and gives the same lift wherever that is; arguments, what it
+    writes and raises as for :func:`retrain_by`.
+
+    :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
+    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
+    """
+    checked_device(task.device)
+    with backend_of(task.scheduler) as backend:
+        return retrain_by(backend, task, on_progress)
+
+
+def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = lambda *_: False
+               ) -> Retrained:
+    """
+    Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
+
+    An accepted lift goes to the output file, and what was there before is kept beside it as
+    ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``. Where what a
+    sibling's lift has become would be refused, the lift is learned from nothing after all.
+
+    :raises BagReadError: for bags that cannot be used.
+    :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
+    :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
+    :raises Stopped: when `on_progress` asked for it; nothing is written then.
+    """
+    thresholds = _checked(task)
+    current, sibling = (load(path) if path else None for path in (task.model, task.sibling))
+    plant, states, inputs = known(task, current)
+    methods = methods_of(task.methods, task.method_parameters)
+    # a folder that cannot be written should fail now, not after the training
+    Path(task.output).parent.mkdir(parents=True, exist_ok=True)
+    source = Source(
+        task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
+        least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
+    _stop_if(on_progress(0.0, 'reading bags'))
+    with bounded_reading(task.bags):
+        record = read_record(source, task.most_samples, task.seed,
+                             hidden=bool(task.hidden_states or task.equations),
+                             tick=_reading(on_progress, source), backend=backend)
+    if not record.episodes:
+        raise ValueError('the bags hold no usable segment of measurements: '
+                         + '; '.join(record.account.lines()))
+    seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
+    episodes = [replace(episode, time=episode.time / seconds,
+                        input_time=episode.input_time / seconds)
+                for episode in record.episodes]
+    found = _estimate(task, plant, episodes, methods, on_progress, backend)
+    if found.hidden:
+        episodes = [*found.fitted, *found.held_out]
+    box = found.drift.box
+    if current is not None and (box.states.names, box.states.units) != (
+            current.states.names, current.states.units):
+        # of other states
+        current = None
+    if current is None:
+        # an input that keeps the plant somewhere in the middle is not far
+        plant = replace(plant, state_names=box.states.names, state_units=box.states.units, B=None,
+                        nominal_state=box.states.center, nominal_input=box.inputs.center)
+    elif found.hidden:
+        plant = replace(current.plant, B=None)
+    bare = Retrained(task, record.account, found, None, None, (), coverage(episodes, box),
+                     plant, current, reduction=record.reduction)
+    learned, decision, reasons = _learn(bare, sibling, thresholds, on_progress, backend)
+    if learned is None or decision is None:
+        return replace(bare, reasons=reasons)
+    decision = replace(decision, warnings=(
+        *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
+        *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
+        *[f'it is not compared with the present model {task.model}, which has other states'
+          ] * bool(task.model and current is None)))
+    _stop_if(on_progress(_at('decide', 0.9), 'writing'))
+    model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
+                             episodes, learned.chosen.name)
+    path = _place(Path(task.output), decision.accepted)
+    save(model, path)
+    return replace(bare, learned=learned.with_model(model), decision=decision,
+                   reasons=decision.reasons, model_file=str(path))
+
+
+def _checked(task: TrainingTask) -> Thresholds:
+    """Return the thresholds of a task; ValueError for fields that do not fit."""
+    if task.model_class not in (*CLASSES, BEST):
+        raise ValueError(f'model_class = {task.model_class!r} must be one of '
+                         f'{", ".join((*CLASSES, BEST))}')
+    if Path(task.output).suffix != '.safetensors':
+        raise ValueError(f'output = {task.output!r} must end in .safetensors')
+    if task.sibling == FIRST:
+        raise ValueError(f'sibling = {FIRST!r} is the first of a fleet: retrain several plants in '
+                         'one call, or name a model file')
+    return Thresholds(task.margin, task.condition)
+
+
+def _estimate(task: TrainingTask, plant: Plant, episodes: list[Episode],
+              methods: Mapping[str, IdentificationMethod], on_progress: OnProgress,
+              backend: Backend) -> Identified:
+    """Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations."""
+    def watch(done: int, total: int, text: str) -> bool:
+        return on_progress(_at('estimate', done / total), f'estimating: {text}')
+
+    if task.equations:
+        return estimate_parameters(plant, episodes, plant_class(task.equations), task.constants,
+                                   seed=task.seed, watch=watch)
+    if task.hidden_states:
+        return identify_unmeasured(plant, episodes, task.hidden_states, seed=task.seed,
+                                   watch=watch, backend=backend)
+    return identify(plant, episodes, methods=methods, seed=task.seed, watch=watch,
+                    backend=backend)
+
+
+def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
+           on_progress: OnProgress, backend: Backend
+           ) -> tuple[Comparison | None, Decision | None, tuple[str, ...]]:
+    """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
+    task, found = bare.task, bare.found
+    learned = decision = None
+    reasons: tuple[str, ...] = ('',)
+    warnings: list[str] = []
+    for begin in (None,) if sibling is None else (sibling, None):
+        course = _Course(on_progress)
+        learned = decision = None
+        try:
+            learned = compare_classes(
+                found, bare.plant, thresholds, model_class=task.model_class,
+                n_z=task.coordinates, seed=task.seed, starts=task.starts, watch=course.learning,
+                judging=course.judging, device=task.device, backend=backend, begin=begin)
+        except NoUsefulLift as error:
+            reasons = (str(error),)
+        _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
+        if learned is not None:
+            decision = decide(found, learned, bare.present, thresholds)
+            decision = replace(decision, warnings=(*decision.warnings, *warnings))
+            reasons = decision.reasons
+        if not reasons:
+            break
+        warnings.append(f'it was learned from nothing, as what training made of {task.sibling} '
+                        f'would be refused: {"; ".join(reasons)}')
+    return learned, decision, reasons
+
+
+def _at(stage: str, share: float) -> float:
+    begin, end = _STAGES[stage]
+    return begin + share * (end - begin)
+
+
+def _stop_if(stop: bool) -> None:
+    if stop:
+        raise Stopped
+
+
+def _reading(on_progress: OnProgress, source: Source) -> Callable[[int], None]:
+    """Return a tick that reports the share read of a record, twice; it may raise Stopped."""
+    total, read = 2 * source.size(), 0
+
+    def tick(samples: int) -> None:
+        nonlocal read
+        read += samples
+        _stop_if(on_progress(_at('read', min(1.0, read / total)), 'reading bags'))
+
+    return tick
+
+
+class _Course:
+    """Reports how far learning and judging the classes have come; ends them by Stopped."""
+
+    def __init__(self, on_progress: OnProgress) -> None:
+        self._on_progress, self._share = on_progress, 0.0
+
+    def learning(self, now: Progress) -> bool:
+        """Report the starts, as :func:`learning.compare` tells of them."""
+        self._share = now.finished / now.total
+        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
+        _stop_if(self._on_progress(
+            _at('learn', self._share), f'learning: {now.name}, n_z {now.n_z}, start '
+            f'{min(now.finished + 1, now.total)} of {now.total}{rw}'))
+        return False
+
+    def judging(self, name: str, share: float) -> bool:
+        """Report the share of a class's closed loops; the last ones come after all starts."""
+        at = _at('decide', _JUDGED * share) if self._share == 1.0 else _at('learn', self._share)
+        _stop_if(self._on_progress(at, f'judging: {name}'))
+        return False
+
+
+def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, covered: float,
+                     episodes: list[Episode], model_class: str) -> LiftedModel:
+    sha = hashlib.sha256()
+    for episode in episodes:
+        for array in (episode.time, episode.x, episode.input_time, episode.u):
+            sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
+        sha.update(bytes(episode.linear))
+    metrics = {**model.provenance.metrics, 'coverage': covered}
+    for label, values in (('rollout_rmse', decision.rmse), ('noise', decision.noise)):
+        labels = [label] if len(values) == 1 else [
+            f'{label}_{name}' for name in model.states.names]
+        metrics |= dict(zip(labels, map(float, values), strict=True))
+    # a refused lift may diverge
+    metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
+    return replace(model, tried_loops=decision.law_check.tried, provenance=replace(
+        model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
+        method=f'{found.method}, {found.drift.form}', model_class=model_class,
+        accepted=decision.accepted, reasons=decision.reasons))
+
+
+def _place(output: Path, accepted: bool) -> Path:
+    """Return where a lift is written; an accepted one moves its predecessor aside."""
+    if not accepted:
+        return output.with_suffix('.refused.safetensors')
+    if output.exists():
+        previous = predecessor(output)
+        previous.unlink(missing_ok=True)
+        # a second name, so that there is a model under the first one at every moment
+        try:
+            os.link(output, previous)
+        except OSError:
+            # not every file system has them
+            shutil.copy2(output, previous)
+    return output

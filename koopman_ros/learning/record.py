@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Reading of bags for a retraining, of a long record in memory that does not grow with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+import contextlib
+from dataclasses import dataclass
+from functools import partial, reduce
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from koopman_ros.bags import (
+    Account,
+    loop_episodes,
+    RecordedInput,
+    RecordedState,
+    stream_episodes,
+    summary,
+)
+from koopman_ros.bags.episodes import distinct
+from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
+from koopman_ros.plant_data import Episode
+
+# Segments of a record with states that are not measured are longer by this: a filter has to find
+# these first.
+_LONGER = 4
+
+_Numbered: TypeAlias = tuple[int, str]  # a bag, with its number in the record
+# Called with the samples that were read; it may raise to end the reading.
+Tick = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Bags, and the signals to read from them."""
+
+    bags: tuple[str, ...]
+    states: Sequence[RecordedState]
+    inputs: Sequence[RecordedInput]
+    tolerance_ns: int
+    least_jumps: Sequence[float] | None
+
+    def size(self) -> int:
+        """Return about how many samples there are, as the bags count their messages."""
+        contents = [summary(bag).counts for bag in distinct(self.bags, Account())]
+        return min(sum(counts.get(state.place.topic, 0) for counts in contents)
+                   for state in self.states)
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """The part of a long record that is used."""
+
+    samples: int  #: in the record
+    group: int  #: samples that were averaged, 1 for none
+    segments: int  #: of the record
+    chosen: int  #: segments that were learned from, or judged by
+    used: int  #: samples in these
+
+    def text(self) -> str:
+        """Say it in words."""
+        means = (f'means of {self.group} samples each, over which the motion is straight but for '
+                 'the noise, ' if self.group > 1 else '')
+        return (f'a long record: {means}{self.chosen} of {self.segments} segments are learned '
+                f'from and judged by ({self.used} of {self.samples} samples), drawn so that they '
+                'visit the cells of the range evenly')
+
+
+@dataclass(frozen=True)
+class Record:
+    """Episodes to learn from and to judge by."""
+
+    episodes: list[Episode]
+    account: Account
+    reduction: Reduction | None = None  #: None where they are all that there are
+
+
+def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
+                tick: Tick = lambda _: None, backend: Backend | None = None) -> Record:
+    """
+    Read the episodes of some bags: all of them, or a selection where they are many.
+
+    A record of more than `most` samples is read twice. The first reading tells its range, and
+    over how many samples the motion is a straight line but for the noise: so many are averaged,
+    which loses nothing. The second one chooses segments, see :class:`Selection`.
+
+    :param hidden: whether states are to be found that are not measured.
+    :param tick: told of the samples of a long record as they are read.
+    :param backend: where long records are read, a bag a task; this process by default.
+    :raises BagReadError: for bags that cannot be used.
+    """
+    if source.size() <= most:
+        return Record(*loop_episodes(source.bags, source.states, source.inputs,
+                                     tolerance_ns=source.tolerance_ns,
+                                     least_jumps=source.least_jumps))
+    account = Account()
+    bags = {str(bag): (number, str(bag))
+            for number, bag in enumerate(distinct(source.bags, account))}
+    n_x, n_u = len(source.states), len(source.inputs)
+
+    def each(function: Callable[[_Numbered, Tick], Any]) -> Iterator[Any]:
+        done, under_way = 0, dict.fromkeys(bags, 0)
+
+        def watch(name: str, read: int | None) -> bool:
+            nonlocal done
+            if read is not None:
+                under_way[name] = read
+            # a bag that is read again counts from where it was
+            now = max(done, sum(under_way.values()))
+            tick(now - done)
+            done = now
+            return False
+
+        with contextlib.closing((backend or Serial()).run(
+                _told, bags, shared=function, watch=watch)) as results:
+            for _, result in results:
+                yield result
+
+    survey = RecordStatistics.empty(n_x, n_u)
+    for part, own in each(partial(_surveyed, source)):
+        survey = survey.merged(part)
+        account.add(own)
+    if not survey.count:
+        return Record([], account)
+    start = Selection(survey.lower, survey.upper, survey.group(most), most,
+                      SEGMENT * (_LONGER if hidden else 1))
+    found = reduce(Selection.merged, each(partial(_selected, source, start, seed)))
+    episodes = found.episodes()
+    return Record(episodes, account, Reduction(
+        survey.count, start.group, found.offered, len(episodes),
+        start.group * sum(map(len, episodes))))
+
+
+def _told(function: Callable[[_Numbered, Tick], Any], bag: _Numbered, tell: Tell) -> Any:
+    """Read a bag on a worker, and report the samples so far."""
+    read = 0
+
+    def tick(samples: int) -> None:
+        nonlocal read
+        read += samples
+        tell(read)
+
+    return function(bag, tick)
+
+
+def _streamed(source: Source, bag: str, account: Account, tick: Tick) -> Iterable[Episode]:
+    for episode in stream_episodes([bag], source.states, source.inputs, account,
+                                   tolerance_ns=source.tolerance_ns,
+                                   least_jumps=source.least_jumps):
+        tick(len(episode))
+        yield episode
+
+
+def _surveyed(source: Source, numbered: _Numbered, tick: Tick) -> tuple[RecordStatistics, Account]:
+    """Look through one bag."""
+    account, survey = Account(), RecordStatistics.empty(len(source.states), len(source.inputs))
+    for episode in _streamed(source, numbered[1], account, tick):
+        survey.add(episode)
+    return survey, account
+
+
+def _selected(source: Source, start: Selection, seed: int, numbered: _Numbered,
+              tick: Tick) -> Selection:
+    """Choose segments of one bag."""
+    number, bag = numbered
+    rng = np.random.default_rng([seed, number])
+    selection = start.empty()
+    for episode in _streamed(source, bag, Account(), tick):
+        selection.offer(number, episode, rng)
+    return selection

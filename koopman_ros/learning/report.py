@@ -1,0 +1,216 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Report of a retraining beside the model: figures as JSON, a page, a picture."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from koopman_ros.control.law_map import draw_loops
+from koopman_ros.learning.downsampling import CELLS, visited_cells
+from koopman_ros.learning.identification import fitted_starts, Identified, longest_step, Segments
+from koopman_ros.learning.identification.drift import Rate
+from koopman_ros.learning.lift.metrics import lifted_rate
+from koopman_ros.learning.pipeline import Retrained
+from koopman_ros.lifting import Coordinates
+from koopman_ros.model_classes import BEST
+from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
+from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
+
+
+def write_report(retrained: Retrained) -> list[Path]:
+    """Write ``<output>.json``, ``.md`` and, with matplotlib, ``.png``; return the files."""
+    base = Path(retrained.task.output)
+    picture = base.with_suffix('.png')
+    drawn = _draw(picture, retrained)
+    written = [write_figures(base.with_suffix('.json'), retrained.summary()),
+               write_page(base.with_suffix('.md'), 'Retraining',
+                          [*_sections(retrained),
+                           f'![Data, drift and prediction]({picture.name})' if drawn else ''],
+                          ('numpy', 'scipy', 'torch'))]
+    return [*written, *([picture] if drawn else [])]
+
+
+def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Write the report; return the summary, with a warning where that failed, and the files."""
+    warnings = list(retrained.decision.warnings) if retrained.decision else []
+    files: tuple[str, ...] = ()
+    try:
+        files = tuple(map(str, write_report(retrained)))
+    except OSError as error:
+        # the lift is written already
+        warnings.append(f'the report could not be written: {error}')
+    return {**retrained.summary(), 'warnings': warnings}, files
+
+
+def _sections(retrained: Retrained) -> Iterator[str]:
+    found, decision, learned = retrained.found, retrained.decision, retrained.learned
+    states, inputs = found.drift.box.states, found.drift.box.inputs
+    errors = tuple(f'error of {name} [{unit}]'
+                   for name, unit in zip(states.names, states.units, strict=True))
+    kind = '' if learned is None else f' ({learned.model.kind})'
+    yield f'**The new model{kind} is {"accepted" if retrained.accepted else "refused"}.**'
+    warnings = () if decision is None else decision.warnings
+    yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
+    if retrained.model_file:
+        yield f'Model file: `{retrained.model_file}`'
+    yield '## Data'
+    yield bullets(map(str, retrained.task.bags))
+    yield bullets([
+        *retrained.account.lines(),
+        *([] if retrained.reduction is None else [retrained.reduction.text()]),
+        *(f'{100.0 * share:.0f} % of the cells of {first} and {second} visited ({CELLS} along '
+          'each)' for (first, second), share in retrained.coverage.items()),
+        *(f'noise of {name} from sample to sample: {noise:.3g} {unit}' for name, noise, unit in
+          zip(states.names, found.noise, states.units, strict=True)),
+        f'{len(found.fitted)} segments to estimate and learn from, '
+        f'{len(found.held_out)} held out to judge by'])
+    yield '## Estimates of the drift'
+    yield (f'Taken: {found.method}, {found.drift.form}, with the input matrix B'
+           + ', which depends on the states, in the middle of the range'
+           * found.drift.varying_input_matrix)
+    yield table(('per second by', *(f'{name} [1/({unit})]' for name, unit in
+                                     zip(inputs.names, inputs.units, strict=True))),
+                ((f'{name} [{unit}]', *(f'{gain:.5g}' for gain in row)) for name, unit, row in zip(
+                    states.names, states.units,
+                    found.drift.input_matrix / SECONDS_PER_TIME_UNIT[retrained.plant.time_unit],
+                    strict=True)), range(1, 1 + len(inputs)))
+    if found.constants:
+        yield 'Constants, with the standard errors of their estimates:'
+        yield table(('constant', 'unit', 'estimate', 'standard error', 'looked for in', ''),
+                    ((one.name, one.unit, f'{one.value:.6g}', f'{one.standard_error:.2g}',
+                      f'{one.lower:.6g} to {one.upper:.6g}', one.standing.value)
+                     for one in found.constants), (2, 3))
+    yield 'Errors on the segments to choose by' + (
+        ', of the next measurement foreseen:' if found.hidden or found.constants else ':')
+    yield table(('degree', 'method', *errors),
+                (('' if score.degree is None else score.degree, score.method,
+                  *(f'{error:.5g}' for error in score.rmse),
+                  *[''] * (len(states) - len(score.rmse)))
+                 for score in found.scores), range(2, 2 + len(states)))
+    if decision is None or learned is None:
+        return
+    yield '## Classes of models'
+    by_rule = retrained.task.model_class == BEST
+    yield ('Taken by the rule: the plainest of those not refused whose error beyond the noise is '
+           'at most twice the smallest, where what chance explains counts as equal.' if by_rule
+           else 'The one that was asked for.')
+    yield str(learned)
+    yield ('rx is the relative mean-square error of the drift beside the estimated one; roll-outs '
+           'are predictions of the held-out measurements, with their noise; the errors beyond the '
+           'noise are mean squares relative to the range.')
+    yield '## On held-out segments'
+    yield 'Root mean square errors of predictions of the measurements:'
+    yield table(('prediction by', *errors),
+                ((name, *(f'{error:.5g}' for error in rmse)) for name, rmse in (
+                    ('the new model', decision.rmse),
+                    ('the drift that it was learned from', decision.drift_rmse),
+                    ('the present model', decision.current_rmse),
+                    ('the best linear model', decision.linear_rmse)) if rmse is not None),
+                range(1, 1 + len(states)))
+    yield 'The noise of the measurements is part of each.'
+    eigenvalues = ', '.join(f'{value:.3g}' for value in learned.model.eigenvalues)
+    own = learned.model.states
+    yield 'Set-points can be given within ' + ', '.join(
+        f'{low:.5g} to {high:.5g} {unit} of {name}'
+        for name, unit, low, high in zip(own.names, own.units, own.lower, own.upper, strict=True))
+    yield (f'Lift: n_z = {learned.model.n_z}, rw = {learned.figures.fit.rw:.2g}, condition number '
+           f'{learned.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
+           f'1/{learned.model.time_unit}. On the estimated drift {decision.law_check}.')
+
+
+def _label(signals: Coordinates, k: int) -> str:
+    return f'{signals.names[k].replace("_", " ")} [{unit_label(signals.units[k])}]'
+
+
+def _draw(path: Path, retrained: Retrained) -> bool:
+    """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
+    n_x = len(retrained.found.drift.box.states)
+    try:
+        decision = retrained.decision
+        columns = 3 if decision is None else 4
+        with drawing(path, n_x, columns, size=(5.0 * columns, 4.6 * n_x)) as (figure, panels):
+            for i in range(n_x):
+                row = panels[columns * i:columns * (i + 1)]
+                _draw_coverage(row[0], retrained.found, i)
+                _draw_drift(row[1], retrained, i)
+                _draw_prediction(row[2], retrained, i)
+                if decision is not None:
+                    draw_loops(row[3], decision.law_check, i)
+                    row[3].set_title('closed loops on the estimated drift')
+                    low, high = row[3].get_ylim()
+                    row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+                    row[3].legend(fontsize=8, loc='upper left')
+            word = 'accepted' if retrained.accepted else 'refused'
+            figure.suptitle(f'Retraining: the new model is {word}')
+    except ImportError:
+        return False
+    return True
+
+
+def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
+    """Draw where a state was, over the input that moves it most."""
+    box = found.drift.box
+    j = int(np.argmax(np.abs(found.drift.input_matrix[i] * box.inputs.scale)))
+    episodes = [*found.fitted, *found.held_out]
+    visited = np.full((CELLS, CELLS), np.nan)
+    cells = visited_cells(episodes, box)
+    visited[cells[:, len(box.states) + j], cells[:, i]] = 1.0
+    edges = [shown(np.linspace(a.lower[k], a.upper[k], CELLS + 1), a.units[k])
+             for a, k in ((box.states, i), (box.inputs, j))]
+    axes.pcolormesh(*edges, visited, cmap='Greens', vmin=0.0, vmax=3.0)
+    for episode in episodes:
+        axes.plot(shown(episode.x[:, i], box.states.units[i]),
+                  shown(episode.inputs_at(episode.time)[:, j], box.inputs.units[j]), '.',
+                  markersize=1.0, color='tab:blue')
+    axes.grid(False)  # the cells are one
+    axes.set(xlabel=_label(box.states, i), ylabel=_label(box.inputs, j),
+             title='where the measurements lie (visited cells in green)')
+
+
+def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
+    """Return label, rate and colour of the present lift and of the new one, where they are."""
+    new = None if retrained.learned is None else retrained.learned.model
+    return [(name, lifted_rate(model, SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]), color)
+            for name, model, color in (('present model', retrained.present, 'tab:red'),
+                                       ('new model', new, 'tab:green')) if model is not None]
+
+
+def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
+    """Draw a state's rate over the state, the others and the inputs in the middle."""
+    found = retrained.found
+    box = found.drift.box
+    x = np.tile(box.states.center, (200, 1))
+    x[:, i] = np.linspace(box.states.lower[i], box.states.upper[i], 200)
+    u = np.broadcast_to(box.inputs.center, (len(x), len(box.inputs)))
+    estimated = found.drift.rate(x, u)[:, i]
+    for name, rate, color in [*_lifts(retrained), ('best linear model', found.linear.rate, '0.5')]:
+        axes.plot(shown(x[:, i], box.states.units[i]), rate(x, u)[:, i] - estimated,
+                  color=color, label=name)
+    axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
+                 label='estimated from the data')
+    axes.set(xlabel=_label(box.states, i),
+             ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
+             title='rate in the middle of the range, less the estimate')
+    axes.legend()
+
+
+def _draw_prediction(axes: Any, retrained: Retrained, i: int) -> None:
+    found = retrained.found
+    states = found.drift.box.states
+    episode = found.held_out[0]
+    segments = Segments.of([episode], longest_step([episode]))
+    times = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
+    measured = segments.measured[:, 0]
+    axes.plot(times[measured], shown(segments.x[measured, 0, i], states.units[i]),
+              '.', color='0.6', markersize=3.0, label='measured')
+    for name, rate, color in _lifts(retrained):
+        x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
+        path = segments.path(rate, x0)[:, 0, i]
+        axes.plot(times, shown(path, states.units[i]), color=color, label=name)
+    axes.set(xlabel=f'time [{retrained.plant.time_unit}]', ylabel=_label(states, i),
+             title='prediction of a held-out segment')
+    axes.legend()

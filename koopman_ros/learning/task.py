@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The task of a training, and the plant and signals that it describes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+import json
+import math
+from typing import Any, TypeVar
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.bags import RecordedInput, RecordedState
+from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.model_classes import IDENTITY_LIFT
+from koopman_ros.plant_data import Plant
+from koopman_ros.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.wire import Place
+
+#: As a task's sibling, in a fleet: the first plant of its kind whose lift is accepted.
+FIRST = 'first'
+MOST_SAMPLES = 20_000  # more cost more time, and tell less and less
+
+
+@dataclass(frozen=True)
+class TrainingTask:
+    """Input files, output file and settings of a retraining."""
+
+    bags: tuple[str, ...]  #: files or folders
+    output: str  #: model file to write, ending in ``.safetensors``
+    model: str  #: file of the present lift, empty to learn the first one
+    states: tuple[RecordedState, ...]  #: those of the present lift, in any order
+    inputs: tuple[RecordedInput, ...]  #: likewise
+    plant: str = ''  #: name of the plant in a first lift
+    tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
+    #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
+    model_class: str = IDENTITY_LIFT
+    coordinates: int = 3  #: n_z of the identity lift
+    seed: int = 0  #: of the split and of the training, and of the reduction of a long record
+    #: samples that are learned from and judged by; a longer record is reduced to them, see
+    #: :func:`read_record`
+    most_samples: int = MOST_SAMPLES
+    starts: int = 3  #: of each round of the training
+    #: B where it is known, in state unit per input unit and second, by state and input; what is
+    #: not named is 0; empty to learn B
+    input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
+    input_matrix_degree: int = 0
+    #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
+    #: not compared with the present one, which has other states
+    hidden_states: int = 0
+    #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
+    #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.
+    equations: str = ''
+    #: constants of it that are looked for, see :func:`koopman_ros.plants.sought_of`
+    constants: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
+    #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
+    #: units
+    setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: methods of identification, see :func:`methods_of`; where all states are measured
+    methods: tuple[str, ...] = ('weak_form', 'total_variation')
+    #: their parameters, by the name of the method
+    method_parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    margin: float = 0.1  #: see :class:`Thresholds`
+    condition: float = 1e4  #: likewise
+    #: where it is worked, see :func:`~koopman_ros.execution.backend_of`
+    scheduler: str = ''
+    #: file of a lift of a plant of the same kind, which training begins from; empty for nothing.
+    #: In a fleet also ``'first'``, see :func:`~koopman_ros.learning.fleet.retrain_fleet`.
+    sibling: str = ''
+    device: str = 'cpu'  #: where residuals are evaluated, as torch names it
+
+    @classmethod
+    def from_json(cls, text: str) -> TrainingTask:
+        """Read a task; unknown or missing fields are a TypeError."""
+        return cls.of(json.loads(text))
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> TrainingTask:
+        """Return the task of its fields as JSON has them; as :meth:`from_json`."""
+        states = tuple(RecordedState(**{**signal, 'place': Place(**signal['place'])})
+                       for signal in values['states'])
+        inputs = tuple(RecordedInput(**{
+            **signal, 'command': Place(**signal['command']),
+            'measured': Place(**signal['measured']) if signal.get('measured') else None})
+            for signal in values['inputs'])
+        return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
+                      'inputs': inputs, 'methods': tuple(values.get('methods', cls.methods))})
+
+
+def known(task: TrainingTask, current: LiftedModel | None
+          ) -> tuple[Plant, Sequence[RecordedState], Sequence[RecordedInput]]:
+    """
+    Return the plant as far as the task describes it, and its signals in order.
+
+    :param current: the present lift, where there is one.
+    :raises ValueError: for a task whose parts do not fit each other or the present lift.
+    """
+    if task.equations and (task.hidden_states or task.input_gain):
+        raise ValueError(f'equations = {task.equations!r} say which states there are and what '
+                         'inputs do: set hidden_states to 0 and give no input_gain')
+    if task.constants and not task.equations:
+        raise ValueError(f'constants name {", ".join(task.constants)}, but there are no equations '
+                         'that have them: give the plant in equations')
+    states: Sequence[RecordedState] = task.states
+    inputs: Sequence[RecordedInput] = task.inputs
+    if current is None:
+        plant = _unknown(task)
+    else:
+        some = [name for name in current.states.names
+                if name in {state.name for state in states}]
+        # the others are estimated
+        partly = bool(task.equations) and 0 < len(some) < len(current.states)
+        states = _in_order(states, current.states.only(some) if partly else current.states,
+                           'state', task.model)
+        inputs = _in_order(inputs, current.inputs, 'input', task.model)
+        plant = current.plant if not partly else replace(
+            _unknown(replace(task, states=tuple(states), inputs=tuple(inputs))),
+            name=current.plant.name, time_unit=current.plant.time_unit)
+    return replace(plant, B=_known_gain(task, plant),
+                   input_matrix_degree=task.input_matrix_degree), states, inputs
+
+
+_Signal = TypeVar('_Signal', RecordedState, RecordedInput)
+
+
+def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: str
+              ) -> list[_Signal]:
+    """Return signals in the order of a lift; ValueError where they are not the same."""
+    by_name = {signal.name: signal for signal in given}
+    found = {(signal.name, signal.unit) for signal in given}
+    if len(by_name) != len(given) or found != set(zip(wanted.names, wanted.units, strict=True)):
+        said, needed = (
+            ', '.join(f'{name} [{unit}]' for name, unit in pairs) or 'none'
+            for pairs in (((s.name, s.unit) for s in given),
+                          zip(wanted.names, wanted.units, strict=True)))
+        raise ValueError(f'the present model {path} has the {kind}s {needed}, the task has '
+                         f'{said}: give the same names and units, each once')
+    return [by_name[name] for name in wanted.names]
+
+
+def _unknown(task: TrainingTask) -> Plant:
+    """Return the plant of a task without a lift; its nominal point is unknown."""
+    states, inputs = task.states, task.inputs
+    return Plant(task.plant, tuple(signal.name for signal in states),
+                 tuple(signal.unit for signal in states), tuple(signal.name for signal in inputs),
+                 tuple(signal.unit for signal in inputs), 's', np.full(len(states), np.nan),
+                 np.full(len(inputs), np.nan), None)
+
+
+def _known_gain(task: TrainingTask, plant: Plant) -> Array | None:
+    """Return B (n_x, n_u) of a task per time unit of a plant, None to learn it."""
+    if not task.input_gain:
+        return None
+    B = np.zeros((len(plant.state_names), len(plant.input_names)))
+    for state, row in task.input_gain.items():
+        for name, gain in row.items():
+            if state not in plant.state_names or name not in plant.input_names:
+                raise ValueError(
+                    f'input_gain names {name} acting on {state}: the lift has the states '
+                    f'{", ".join(plant.state_names)} and the inputs '
+                    f'{", ".join(plant.input_names)}')
+            if not math.isfinite(gain):
+                raise ValueError(f'input_gain of {name} on {state} is {gain}, must be finite')
+            B[plant.state_names.index(state), plant.input_names.index(name)] = gain
+    return B * SECONDS_PER_TIME_UNIT[plant.time_unit]

@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The process that retrains, as its parent sees it."""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+import itertools
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from koopman_ros.execution import job as job_module
+from koopman_ros.execution import training
+from koopman_ros.execution.training import JobState, TrainingJob
+from koopman_ros.resources import model_path
+from support.nodes import TIMEOUT, wait_until_ended
+from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_bag(tmp_path_factory.mktemp('bag') / 'run.mcap', driven(reactor(0.8), 6.0))
+
+
+@pytest.fixture
+def task(bag: Path, tmp_path: Path) -> dict[str, object]:
+    return {'bags': [str(bag)], 'output': str(tmp_path / 'new.safetensors'),
+            'model': str(model_path('reactor_nz4')), 'coordinates': 2, 'starts': 1,
+            'states': list(map(asdict, STATES)), 'inputs': list(map(asdict, INPUTS))}
+
+
+def follow(job: TrainingJob) -> Iterator[JobState]:
+    """Yield the states of a job to its end."""
+    deadline = time.monotonic() + TIMEOUT
+    while not job.state.ended:
+        assert time.monotonic() < deadline
+        before = job.state
+        if job.poll() != before:
+            yield job.state
+        else:
+            # or the process that is waited for would have one core less
+            time.sleep(0.01)
+
+
+@pytest.mark.parametrize(('step', 'number', 'code', 'words'), [
+    ('starting', signal.SIGKILL, -signal.SIGKILL, 'the training process was killed by SIGKILL: '
+     'see whether the memory suffices, and train again'),
+    ('estimating', signal.SIGTERM, 1, 'cancelled, nothing was written')])
+def test_process_that_gets_a_signal(
+        task: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str,
+        number: int, code: int, words: str) -> None:
+    # its libraries may take their time to end on a busy machine
+    monkeypatch.setattr(job_module, '_PATIENCE', TIMEOUT)
+    job = TrainingJob(task)
+    assert any(state.text.startswith(step) for state in itertools.chain([job.state], follow(job)))
+    os.kill(job.process.pid, number)
+    *_, state = follow(job)
+    assert (state.text, state.ended) == (words, True)
+    assert (state.accepted, state.refused) == (False, False)
+    assert state.share < 1.0
+    job.close()
+    assert job.process.returncode == code
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(('program', 'state'), [
+    # a library that prints, a line that is cut off, and an error that nobody expects
+    ('import sys; sys.stdin.readline(); print("hello"); print(\'{"progress": 0.5, \'); '
+     'print(\'{"progress": 0.25, "text": "learning"}\', flush=True); '
+     'raise RuntimeError("the core melts")',
+     JobState(0.25, 'the training process ended with code 1: RuntimeError: the core melts', True)),
+    ('import no_such_torch',
+     JobState(0.0, 'training needs a package that is not installed (ModuleNotFoundError: No '
+              "module named 'no_such_torch'): pip install torch cloudpickle joblib tqdm", True)),
+])
+def test_process_that_breaks_down(
+        monkeypatch: pytest.MonkeyPatch, program: str, state: JobState) -> None:
+    monkeypatch.setattr(TrainingJob, 'command', lambda *_: (sys.executable, '-c', program))
+    job = TrainingJob({})
+    *_, last = follow(job)
+    assert last == state
+    job.close()
+
+
+def test_process_that_ends_before_it_has_read_its_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        TrainingJob, 'command', lambda *_: (sys.executable, '-c', 'raise SystemExit("no time")'))
+    # more than a pipe holds
+    job = TrainingJob({'output': 'x' * 1_000_000})
+    *_, last = follow(job)
+    assert last == JobState(0.0, 'the training process ended with code 1: no time', True)
+    job.close()
+
+
+@pytest.mark.parametrize('word', ['starting', 'estimating'])
+def test_process_ends_with_its_parent_that_is_killed(
+        task: dict[str, object], tmp_path: Path, word: str) -> None:
+    program = (
+        'import sys, time\n'
+        'from koopman_ros.execution.training import TrainingJob\n'
+        f'job = TrainingJob({task!r})\n'
+        f'while not job.poll().text.startswith({word!r}):\n'
+        '    time.sleep(0.01)\n'
+        'print(job.process.pid, flush=True)\n'
+        'time.sleep(600)\n')
+    with subprocess.Popen(
+            [sys.executable, '-c', program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+    wait_until_ended(child)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TrainingJob, 'command', lambda *_: (
+        'sh', '-c', 'echo \'{"progress": 0.5, "text": "x"}\'; exec sleep 3600'))
+    monkeypatch.setattr(job_module, '_PATIENCE', 0.2)
+    job = TrainingJob({})
+    next(follow(job))
+    job.close()
+    assert job.process.returncode == -signal.SIGKILL
+    assert job.poll().text == 'cancelled, nothing was written'
+
+
+def test_figures_of_signals_are_told_one_by_one() -> None:
+    assert training.scalars({
+        'accepted': True, 'reasons': ['no'], 'noise': {'low': 0.5, 'high': None},
+        'input_gain': {'low': {'pump': 2.0}}}) == {
+            'accepted': True, 'noise: low': 0.5, 'input_gain: low: pump': 2.0}
+    errors = {'low': 0.25, 'high': 3.0}
+    summary = {'accepted': True, 'model_class': 'free lift', 'model_file': 'new',
+               'units': {'low': 'm', 'high': 'Pa'},
+               'heldout_error': errors, 'heldout_error_of_present_lift': {**errors, 'low': 1.0}}
+    words = ('the new model (free lift) is accepted: error on held-out records 0.25 m in low, '
+             '3 Pa in high, that of the present one {}; written to new')
+    assert training._in_words(summary) == words.format('1 m in low, 3 Pa in high')
+    summary['heldout_error_of_present_lift'] = {**errors, 'low': None}
+    assert training._in_words(summary) == words.format('infinite, as it diverges')

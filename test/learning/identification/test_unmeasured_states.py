@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Drifts of plants of which one output is in the record, beside what is known of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+
+from koopman_ros.learning.identification import identify_unmeasured, Stopped
+from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.solvers import runge_kutta_step
+
+PLANT = Plant('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
+              np.zeros(1), None)
+PERIOD, NOISE = 0.2, 0.02
+A = np.array([[-0.5, 1.0], [-0.8, -0.2]])
+B = np.array([0.0, 1.0])
+
+
+def oscillator(x, u):
+    """Damped, moved through what is not measured."""
+    return A @ x + B * u
+
+
+def saddle(x, u):
+    """Unstable in the origin, and moved where it is measured."""
+    y, w = x
+    return np.array([0.6 * y + w + u, -w - 0.5 * y + 0.3 * y ** 2])
+
+
+def record(rate, *, samples=1200, gain=0.0, size=1.0, seed=0):
+    """Return noisy outputs of a plant under steps of random height and length, fed back."""
+    rng = np.random.default_rng(seed)
+    x, wanted, left = np.zeros(2), 0.0, 0
+    measured, inputs = np.empty((samples, 1)), np.empty((samples, 1))
+    for k in range(samples):
+        if not left:
+            wanted, left = rng.uniform(-size, size), int(rng.integers(5, 40))
+        left -= 1
+        measured[k] = x[0] + NOISE * rng.standard_normal()
+        u = inputs[k, 0] = wanted - gain * measured[k, 0]
+        x = runge_kutta_step(lambda x, u=u: rate(x, u), x, PERIOD)
+    time = PERIOD * np.arange(samples)
+    return Episode(time, measured, time, inputs)
+
+
+def test_modes_and_gain_of_a_linear_plant():
+    found = identify_unmeasured(PLANT, [record(oscillator, samples=600)], 2, highest_degree=1)
+    drift = found.drift
+    # as few as suffice
+    assert len({score.method for score in found.scores}) == 2
+    assert found.hidden == 1
+    assert drift.box.states.names == ('level', 'hidden_1')
+    assert drift.box.states.units == ('m', '1')
+    slope = drift.slope(drift.box.states.center)
+    # neither depends on the coordinates
+    assert np.sort_complex(np.linalg.eigvals(slope)) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(A)), rel=0.02)
+    gain = -np.linalg.solve(slope, drift.input_matrix)[0, 0]
+    assert gain == pytest.approx(-np.linalg.solve(A, B)[0], rel=0.01)
+    # nothing disturbs the plant, so that a filter foresees it but for the noise
+    assert found.scores[0].rmse[0] == pytest.approx(NOISE, rel=0.3)  # of some eighty samples
+    assert found.noise[0] == pytest.approx(NOISE, rel=0.15)
+
+
+def test_steady_states_of_an_unstable_plant_from_closed_loop():
+    found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
+                            highest_degree=2)
+    drift = found.drift
+    assert drift.degree >= 2
+    for y in (-0.3, 0.0, 0.3):
+        hidden, u = fsolve(lambda q, y=y: drift.rate(np.array([y, q[0]]), q[1:]), [0.0, 0.0])
+        assert u == pytest.approx(-0.1 * y - 0.3 * y ** 2, abs=5e-3)
+        slope = drift.slope(np.array([y, hidden]))
+        truth = np.array([[0.6, 1.0], [-0.5 + 0.6 * y, -1.0]])
+        assert np.sort(np.linalg.eigvals(slope)) == pytest.approx(
+            np.sort(np.linalg.eigvals(truth)), abs=0.06)
+    # roll-outs of the segments grow by no more than can be judged
+    longest = max(part.time[-1] - part.time[0] for part in found.held_out)
+    assert 0.24 * longest < 3.0
+    # the linear model of the same states is worse
+    x = np.concatenate([part.x for part in found.held_out])
+    u = np.zeros((len(x), 1))
+    assert np.max(np.abs(found.linear.rate(x, u) - drift.rate(x, u))) > 0.05
+
+
+def test_a_known_input_matrix_is_kept():
+    gain = 1.0
+    found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])),
+                            [record(saddle, samples=200, gain=2.0, size=0.1)], 1,
+                            highest_degree=1)
+    assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
+
+
+def test_it_says_what_it_does_and_ends_when_asked():
+    said = []
+
+    def watch(done, total, text):
+        assert 0 <= done < total
+        said.append(text)
+        return len(said) > 3
+
+    with pytest.raises(Stopped):
+        identify_unmeasured(PLANT, [record(oscillator, samples=600)], 1, watch=watch)
+    assert said[0] == 'drift of degree 1 with 1 state not measured'
+
+
+@pytest.mark.parametrize(('plant', 'samples', 'words'), [
+    (PLANT, 100, 'record at least 160'),
+    (replace(PLANT, input_matrix_degree=1), 600, 'set input_matrix_degree to 0')])
+def test_what_cannot_be_learned_from_is_refused(plant, samples, words):
+    with pytest.raises(ValueError, match=words):
+        identify_unmeasured(plant, [record(oscillator, samples=samples)], 1)
+
+
+def test_episodes_in_which_no_filter_finds_the_state_are_refused():
+    whole = record(oscillator, samples=600)
+    parts = [whole.part(k, k + 40) for k in range(0, 600, 40)]
+    with pytest.raises(ValueError, match='too short for a filter'):
+        identify_unmeasured(PLANT, parts, 1)

@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""EDMD and linearisation against exact models; Algorithm 1's start, schedule and two criteria."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+import torch
+
+from koopman_ros.learning import Algorithm1, Edmd, fit, Linearisation
+from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, normal_equations
+from koopman_ros.learning.lift.network import Layout
+from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Plant, Samples
+from support.small_plants import bent_samples, TWO_STATE, two_state_samples
+
+
+@pytest.mark.parametrize('degree', [2, 3])
+@pytest.mark.parametrize('B', [TWO_STATE.B, None], ids=['known B', 'learned B'])
+def test_monomials_hold_the_exact_lift_of_the_two_state_example(degree, B):
+    """The monomials hold (x1, x2, x1^2), which the drift maps into itself."""
+    samples = two_state_samples()
+    model = Edmd(degree).learn(replace(TWO_STATE, B=B), samples)
+    assert model.n_z == {2: 5, 3: 9}[degree]
+    x = model.states.to_deviation(samples.x)
+    f = samples.dxdt / model.states.scale - model.inputs.to_deviation(samples.u) @ model.B.T
+    z, J = model.lift_and_jacobian(x)
+    residual = (J @ f[..., None])[..., 0] - z @ model.A.T
+    # the other monomials are no part of it: their derivatives are not spanned
+    np.testing.assert_allclose(residual[:, :3], 0.0, rtol=0, atol=1e-12)
+    for value in (-0.2, -0.1, 1.0):
+        assert np.min(np.abs(model.eigenvalues - value)) < 1e-9
+    units = model.B * model.states.scale[:, None] / model.inputs.scale
+    np.testing.assert_allclose(units, TWO_STATE.B, rtol=0, atol=1e-12)
+
+
+def van_der_pol(x, u):
+    """Return the rates (..., 2) of dx1/dt = x2, dx2/dt = (1 - x1^2) x2 - x1 + u."""
+    return np.stack([x[..., 1], (1.0 - x[..., 0] ** 2) * x[..., 1] - x[..., 0] + u[..., 0]], -1)
+
+
+VAN_DER_POL = Plant('Van der Pol', ('x1', 'x2'), ('1', '1'), ('u',), ('1',), 's', np.zeros(2),
+                    np.zeros(1), np.array([[0.0], [1.0]]))
+
+
+def van_der_pol_samples(count=400, seed=0):
+    rng = np.random.default_rng(seed)
+    x, u = rng.uniform(-2.0, 2.0, (count, 2)), rng.uniform(-1.0, 1.0, (count, 1))
+    return Samples(x, van_der_pol(x, u), u, np.arange(count) // 40)
+
+
+@pytest.mark.parametrize('degree', [3, 5])
+@pytest.mark.parametrize('B', [VAN_DER_POL.B, None], ids=['known B', 'learned B'])
+def test_a_drift_of_monomials_is_found_exactly(degree, B):
+    """
+    Van der Pol's drift is of degree 3; the rates of its other monomials are of degree 5.
+
+    So no A fits those, and what they lack must not come into the rate of the state.
+    """
+    model = Edmd(degree).learn(replace(VAN_DER_POL, B=B), van_der_pol_samples())
+    fresh = van_der_pol_samples(seed=1)
+    found = fit(model, fresh.x, fresh.dxdt, fresh.u)
+    assert found.rw > 1e-3
+    assert found.rx < 1e-20
+    xi = model.states.to_deviation(fresh.x)
+    f = van_der_pol(fresh.x, np.zeros((400, 1)))
+    np.testing.assert_allclose(model.drift(xi) * model.states.scale, f, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(model.linearised.A * model.states.scale[:, None]
+                               / model.states.scale, [[0.0, 1.0], [-1.0, 1.0]],
+                               rtol=0, atol=1e-10)
+
+
+def test_degree_one_is_linear_regression():
+    samples = two_state_samples()
+    model = Edmd(1).learn(replace(TWO_STATE, B=None), samples)
+    both = np.linalg.lstsq(
+        np.hstack([samples.x, samples.u]), samples.dxdt, rcond=None)[0].T
+    units = np.concatenate([model.states.scale, model.inputs.scale])
+    np.testing.assert_allclose(np.hstack([model.A, model.B]) * model.states.scale[:, None] / units,
+                               both, rtol=0, atol=1e-13)
+
+
+def test_linearisation():
+    samples, jacobian = two_state_samples(), np.array([[-0.1, 0.0], [0.0, 1.0]])
+    model = Linearisation(jacobian).learn(TWO_STATE, samples)
+    scale = model.states.scale
+    np.testing.assert_allclose(model.A * scale[:, None] / scale, jacobian, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(model.B * scale[:, None] / model.inputs.scale, TWO_STATE.B,
+                               rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(scale, Box.of(TWO_STATE, samples.x, samples.u).states.scale)
+    with pytest.raises(ValueError, match='B is not known: give it to the plant'):
+        Linearisation(jacobian).learn(replace(TWO_STATE, B=None), samples)
+
+
+# Algorithm 1.
+
+SMALL = {'n_z': 2, 'hidden': 3, 'decoder': 3, 'max_iterations': 5}
+
+
+@pytest.fixture(scope='module')
+def data():
+    samples = bent_samples(2)
+    x, u = samples.x - 3.0, samples.u - 0.5
+    return ScaledSamples(torch.from_numpy(x), torch.from_numpy(samples.dxdt - 2.0 * u))
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'gamma': 1.0}, 'gamma must be above 1, got 1.0'),
+    ({'lambda_initial': 0.0}, 'lambda_initial must be above 0, got 0.0'),
+    *(({name: 0}, 'sizes and limits must be at least 1')
+      for name in ('n_z', 'decoder', 'max_rounds', 'max_iterations', 'hidden')),
+])
+def test_a_recipe_without_sense(change, message):
+    with pytest.raises(ValueError, match=message):
+        Algorithm1(**{**SMALL, **change})
+
+
+def test_there_is_one_round_of_starts():
+    assert Algorithm1(5).rounds(3) == (5,)
+    assert Algorithm1(3).rounds(3) == (3,)
+    assert Algorithm1(4, identity=True).rounds(3) == (4,)
+    for n_z, identity in ((2, False), (3, True)):
+        with pytest.raises(ValueError, match=f'n_z = {n_z} is too small for 3 states'):
+            Algorithm1(n_z, identity=identity).rounds(3)
+
+
+def unmoved(seed):
+    """Return a start as it was drawn: where the cost is not a number, no step is taken."""
+    nothing = ScaledSamples(*(torch.full((2, 1), torch.nan).double() for _ in range(3)))
+    recipe = Algorithm1(4, identity=True, hidden=60, decoder=30)
+    grown = recipe.start(nothing, 4, None, seed)
+    assert grown.status is MinimumStatus.STALLED
+    return grown
+
+
+def test_all_parameters_start_from_the_standard_normal_distribution():
+    grown = unmoved(4)
+    assert grown.layout == Layout(1, 4, 60, True, n_u=1, decoder=30)
+    parts = grown.layout.split(grown.theta)
+    for part in (grown.theta, parts.W, parts.V, parts.decoder[0]):
+        assert kstest(part.flatten().numpy(), 'norm').pvalue > 0.01
+    assert torch.equal(unmoved(1).theta, unmoved(1).theta)
+    assert not torch.equal(unmoved(1).theta, unmoved(2).theta)
+
+
+@pytest.mark.parametrize(('initial', 'gamma'), [(10.0, 10.0), (3.0, 2.0)])
+def test_lambda_falls_by_gamma_from_one_minimisation_to_the_next(data, initial, gamma):
+    recipe = Algorithm1(**SMALL, lambda_initial=initial, gamma=gamma, tolerance=0.0)
+    for number in range(4):
+        seen = []
+
+        def monitor(iteration, cost, number=number, seen=seen):
+            seen.append((iteration, cost))
+            return [i for i, _ in seen].count(1) == number + 1
+
+        grown = recipe.start(data, 2, None, 0, monitor)
+        assert grown.status is MinimumStatus.INTERRUPTED
+        weights = ResidualWeights(decoder=initial / gamma ** number)
+        there = normal_equations(LiftProblem(grown.layout, data, weights).add_residuals,
+                                 grown.theta, derivatives=False)
+        assert there.cost == pytest.approx(seen[-1][1], rel=1e-13)
+
+
+@pytest.mark.parametrize(('limits', 'status', 'minimisations'), [
+    ({'tolerance': 1e9}, MinimumStatus.CONVERGED, 1),
+    ({'tolerance': 0.0, 'max_rounds': 4}, MinimumStatus.MAX_ITERATIONS, 4)])
+def test_it_ends_when_parameters_hardly_move_or_after_max_rounds(
+        data, limits, status, minimisations):
+    steps = []
+    grown = Algorithm1(**SMALL, **limits).start(
+        data, 2, None, 0, lambda iteration, cost: steps.append(iteration))
+    assert (grown.status, steps.count(1)) == (status, minimisations)
+
+
+def test_it_lowers_the_residual_of_the_dynamics(data):
+    recipe = Algorithm1(2, identity=True, hidden=4, decoder=4, max_iterations=60)
+    grown = recipe.start(data, 2, None, 0)
+    problem = LiftProblem(grown.layout, data, ResidualWeights())
+    found = normal_equations(problem.add_residuals, grown.theta, derivatives=False)
+    assert found.cost < 0.02 * 0.5 * float(np.mean(data.f.numpy() ** 2))

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Samples whose times or nominal point contradict the plant are refused, noisy ones are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from koopman_ros.learning import train
+from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Plant, Samples
+from support.small_plants import BENT, bent_samples, SMALL, TWO_STATE, two_state_samples
+
+# dx/dt = -2 (x - 3) + u - 0.5
+DECAY = Plant('decay', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
+              np.array([0.5]), np.array([[1.0]]))
+
+
+def decaying(noise=0.0, rate_noise=0.0):
+    """Return five episodes of the exact motion under steps, a sample every 0.1 s."""
+    rng = np.random.default_rng(0)
+    x, u = np.empty((5, 60)), 0.5 + np.repeat(rng.uniform(-2.0, 2.0, (5, 6)), 10, axis=1)
+    x[:, 0] = rng.uniform(2.0, 4.0, 5)
+    for k in range(59):
+        rest = 3.0 + 0.5 * (u[:, k] - 0.5)
+        x[:, k + 1] = rest + np.exp(-0.2) * (x[:, k] - rest)
+    rate = -2.0 * (x - 3.0) + u - 0.5
+    x, rate = x + noise * rng.normal(size=x.shape), rate + rate_noise * rng.normal(size=x.shape)
+    return Samples(x.reshape(-1, 1), rate.reshape(-1, 1), u.reshape(-1, 1),
+                   np.repeat(np.arange(5), 60), np.tile(0.1 * np.arange(60), 5))
+
+
+@pytest.mark.parametrize('samples', [
+    decaying(), replace(decaying(), time=None), decaying(noise=0.1), decaying(rate_noise=2.0),
+    # each step as long as the time constant is resolved coarsely, and yet no contradiction
+    Samples(*(a[np.arange(300) % 60 % 5 == 0] for a in (
+        decaying().x, decaying().dxdt, decaying().u, decaying().episode, decaying().time)))],
+    ids=['exact', 'no times', 'noisy states', 'noisy rates', 'coarse'])
+def test_times_that_do_not_contradict_the_rates(samples):
+    check_rates(DECAY, samples)
+
+
+@pytest.mark.parametrize('period', [0.5, 2.0, 2.5, 4.0, 5.0, 8.0])
+@pytest.mark.parametrize('damping', [0.01, 0.5])
+def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period):
+    """The derivatives of dx1/dt = x2, dx2/dt = -x1 - 2 D x2 are exact, however far apart."""
+    plant = replace(TWO_STATE, B=None)
+    A = np.array([[0.0, 1.0], [-1.0, -2.0 * damping]])
+    start = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
+    x = np.stack([start @ expm(A * period * k).T for k in range(6)], axis=1).reshape(-1, 2)
+    samples = Samples(x, x @ A.T, np.zeros((240, 1)), np.repeat(np.arange(40), 6),
+                      np.tile(period * np.arange(6), 40))
+    check_rates(plant, samples)
+    if period == 0.5:
+        with pytest.raises(ValueError, match=r'0\.10\d times as much'):
+            check_rates(plant, replace(samples, time=10.0 * samples.time))
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.005])
+@pytest.mark.parametrize('factor', [10.0, 1.0 / 60.0, -1.0])
+def test_times_or_rates_in_another_unit_are_refused(factor, noise):
+    samples = decaying(noise)
+    # times that are too long, or rates that are too small
+    wrong = replace(samples, time=factor * samples.time) if factor > 1.0 else (
+        replace(samples, dxdt=factor * samples.dxdt))
+    with pytest.raises(ValueError, match=r'level changes .* times as much from sample to sample '
+                                         r'as dxdt and time say, must be 1') as error:
+        train(DECAY, wrong, SMALL, starts=1)
+    assert float(str(error.value).split()[2]) == pytest.approx(1.0 / factor, rel=0.1)
+    assert 'give time in s and dxdt in m per s, another time_unit, or no time' in str(error.value)
+
+
+# -0.2 at -1, 0.3 at -0.8, 0 from -0.4 to 0, -0.7 at 0.3 and -0.4 from 0.4 on, besides 2 u
+KINKED = replace(bent_samples(), dxdt=2.0 * (bent_samples().u - 0.5) + np.interp(
+    bent_samples().x - 3.0,
+    [-1.0, -0.8, -0.4, 0.0, 0.3, 0.4], [-0.2, 0.3, 0.0, 0.0, -0.7, -0.4]))
+
+
+def look(plant, samples):
+    check_nominal_point(plant, samples, Box.of(plant, samples.x, samples.u))
+
+
+@pytest.mark.parametrize(('plant', 'samples'), [
+    (BENT, bent_samples()), (replace(BENT, B=None), bent_samples()),
+    (TWO_STATE, two_state_samples()), (replace(TWO_STATE, B=None), two_state_samples()),
+    (DECAY, decaying(0.1, 0.5)),
+    # kinks, which no polynomial follows
+    (BENT, KINKED),
+    # as near as a nominal point that was measured may be
+    (replace(BENT, nominal_state=[3.01]), bent_samples()),
+    # too few samples to tell
+    (replace(BENT, nominal_state=[3.1]), bent_samples(3, 3))],
+    ids=['known B', 'learned B', 'two states', 'their B learned', 'noisy', 'kinks', 'near', 'few'])
+def test_a_steady_state_is_accepted(plant, samples):
+    look(plant, samples)
+
+
+@pytest.mark.parametrize('known', [True, False], ids=['known B', 'learned B'])
+def test_a_nominal_point_where_the_plant_moves_is_refused(known):
+    plant = replace(BENT, nominal_state=[3.1], B=BENT.B if known else None)
+    # -0.1 - 0.3 * 0.1^2 = -0.103 m/s, which 0.0515 m/s of flow make up for
+    with pytest.raises(ValueError, match=r'moves with -0\.103 m/s of level: by the samples it '
+                                         r'does with nominal_state = \[3\.1\] and nominal_input '
+                                         r'= \[0\.5515\]$'):
+        train(plant, bent_samples(), SMALL, starts=1)
+
+
+def test_the_steady_state_nearby_of_more_states_than_inputs():
+    """dx1/dt = -0.1 x1 stands still at x1 = 0 alone, dx2/dt = x2 - x1^2 + u wherever u = -x2."""
+    plant = replace(TWO_STATE, nominal_state=[0.5, 0.0])
+    with pytest.raises(ValueError, match=r'moves with -0\.05 1/s of x1') as error:
+        look(plant, two_state_samples())
+    assert 'nominal_state = [0.0, ' in str(error.value)
+
+
+def test_where_there_is_no_steady_state_nearby():
+    samples = bent_samples()
+    wrong = replace(samples, dxdt=samples.dxdt + 20.0)
+    with pytest.raises(ValueError, match=r'moves with 20 m/s of level: move the plant around a'):
+        look(BENT, wrong)

@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The same bits whether work runs here, in processes or on Dask: one set of workers for all."""
+
+import contextlib
+from dataclasses import replace
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import koopman_ros
+from koopman_ros.control.law_check import check_law
+from koopman_ros.learning import train
+from koopman_ros.learning.identification import identify, identify_unmeasured
+from koopman_ros.learning.record import read_record
+from koopman_ros.lifting import Coordinates, linearised_model, Provenance
+from support.known_plants import CUBIC, methods, PAIR
+from support.long_records import bags_of, source
+from support.places import places
+from support.small_plants import BENT, bent_samples, bits, SMALL
+
+# a process of its own is one of two
+KINDS = ('', 'joblib:2', 'dask')
+RECIPE = replace(SMALL, n_z=3)
+
+
+def trained(backend, watch=None):
+    return train(BENT, bent_samples(), RECIPE, starts=3, seed=5, loops=16, backend=backend,
+                 watch=watch)
+
+
+@pytest.fixture(scope='module')
+def expected():
+    return bits(trained(None).model)
+
+
+@pytest.fixture(scope='module', name='places')
+def every_place():
+    with places(KINDS) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_bits_do_not_depend_on_where_starts_run(kind, expected, places):
+    threads = torch.get_num_threads()
+    assert bits(trained(places[kind]).model) == expected
+    assert torch.get_num_threads() == threads
+
+
+def test_a_start_that_fails_is_named(places):
+    """Not all of the samples span another coordinate."""
+    class Failing(type(RECIPE)):
+        def start(self, *_):
+            raise ValueError('no new coordinate can be started')
+
+    for backend in places.values():
+        with pytest.raises(ValueError, match='no new coordinate') as caught:
+            train(BENT, bent_samples(), Failing(2), starts=1, backend=backend)
+        assert caught.value.__notes__ == ['in start 1 with n_z = 2']
+
+
+# Estimates, and closed loops.
+
+
+def test_degrees_are_estimated_side_by_side(places):
+    noisy = CUBIC.excited(300, 0.1, noise=0.02)
+    here, there = (identify(CUBIC.plant, [noisy], degrees=(1, 2), methods=methods(10),
+                            backend=places[kind]) for kind in ('', 'joblib:2'))
+    assert there.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
+    assert [(score.method, score.degree, score.cost) for score in there.scores] == [
+        (score.method, score.degree, score.cost) for score in here.scores]
+
+
+def test_hidden_states_are_estimated_elsewhere(places):
+    whole = PAIR.excited(200, 0.1, noise=0.01)
+    plant = replace(PAIR.plant, state_names=('x1',), state_units=('1',),
+                    nominal_state=np.zeros(1))
+    episode = replace(whole, x=whole.x[:, :1])
+    here, there = (identify_unmeasured(plant, [episode], 1, highest_degree=1, backend=places[kind])
+                   for kind in ('', 'joblib:2'))
+    assert there.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
+    assert [score.rmse.tobytes() for score in there.scores] == [
+        score.rmse.tobytes() for score in here.scores]
+
+
+def test_loops_run_side_by_side(places):
+    """In two parts, each of which tells of its share."""
+    A, B = np.array([[0.3, 1.0], [-2.0, -0.5]]), np.array([[0.0, 0.4], [1.5, 0.0]])
+    states, inputs = (Coordinates(names, ('1', '1'), np.zeros(2), np.ones(2), np.full(2, -end),
+                                  np.full(2, end))
+                      for names, end in ((('a', 'b'), 1.0), (('u', 'v'), 9.0)))
+    model = linearised_model(A, B, states, inputs, 's', Provenance('two'))
+
+    def rate(x, u):
+        # by its value, as workers do not know this module
+        return x @ A.T + u @ B.T
+
+    seen = []
+    one = check_law(model, rate, loops=64)
+    other = check_law(model, rate, loops=64, backend=places['joblib:2'], watch=seen.append)
+    assert check_law(model, rate, loops=64, backend=places['joblib:2'],
+                     watch=lambda _: True) is None
+    for name in ('starts', 'setpoints', 'ratios', 'no_gain', 'excess'):
+        assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
+    assert one.loops > 32
+    assert seen == sorted(seen)
+
+
+# Bags.
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    return bags_of(3, tmp_path_factory.mktemp('bags'))
+
+
+def test_the_same_is_read_whoever_reads(bags, places):
+    few, told = source(bags), []
+    one = read_record(few, 3000, 7)
+    other = read_record(few, 3000, 7, tick=told.append, backend=places['joblib:2'])
+    assert min(told) == 0
+    assert one.reduction == other.reduction
+    assert one.account == other.account
+    for a, b in zip(one.episodes, other.episodes, strict=True):
+        np.testing.assert_array_equal(a.x, b.x)
+    another = read_record(few, 3000, 8).episodes
+    assert [part.x[0, 0] for part in another] != [part.x[0, 0] for part in one.episodes]
+
+
+# Ends and interrupts: last, as a process that is ended at work is started anew.
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_watch_follows_and_can_end_starts_anywhere(kind, places):
+    seen = []
+
+    def watch(now):
+        seen.append(now)
+        return now.finished == 4
+
+    kept = trained(places[kind], watch)
+    # whole starts come in their order wherever they run, and steps of them before
+    finished = [(now.n_z, now.finished) for now in seen]
+    assert finished == sorted(finished)
+    assert {(2, 1), (2, 2), (2, 3), (3, 4)} <= set(finished) <= {
+        (2, 0), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4)}
+    # elsewhere a start may end before it tells of a second step
+    assert kind or any(now.iteration and np.isfinite(now.residual) for now in seen)
+    assert kept.status.startswith('interrupted')
+    assert (kept.model.n_z, kept.starts) == (3, 4)
+
+
+PROGRAM = """
+import signal
+from koopman_ros.execution import backend_of
+from koopman_ros.learning import Growth, train
+from support.small_plants import BENT, bent_samples
+
+def watch(now):
+    print(now.n_z, now.finished, flush=True)
+    return False
+
+# started in the background of a shell, it would ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if __name__ == '__main__':
+    with backend_of('joblib:1') as backend:
+        # endless, or it could be over before a busy machine interrupts it
+        recipe = Growth(200, max_iterations=60, tolerance=0.0)
+        found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch,
+                      loops=16, backend=backend)
+    print('model', found.model.n_z, found.status)
+"""
+
+
+def test_an_interrupt_from_the_keyboard():
+    """Interrupt the whole process group, as a terminal does, once the first round is over."""
+    here = Path(__file__).parents[2]
+    path = os.pathsep.join([str(here), str(Path(koopman_ros.__file__).parents[1])])
+    with subprocess.Popen(
+            [sys.executable, '-c', PROGRAM], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, 'PYTHONPATH': path, 'OMP_NUM_THREADS': '1'}) as process:
+        try:
+            for line in process.stdout:
+                if line.startswith('3 '):
+                    break
+            os.killpg(process.pid, signal.SIGINT)
+            output, errors = process.communicate(timeout=240)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    assert errors == ''
+    assert process.returncode == 0
+    last = output.splitlines()[-1]
+    assert last.startswith('model ')
+    assert last.endswith('interrupted: the best parameters so far are kept')

@@ -1,0 +1,391 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""From a drift to a lift: steady point, samples; the gate: what is let through, and why."""
+
+from dataclasses import replace
+import re
+import sys
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from koopman_ros.control.law_check import LawCheck
+from koopman_ros.learning import decide, learn_lift, Thresholds
+from koopman_ros.learning.acceptance import uncovered_setpoints
+from koopman_ros.learning.drift_sampling import _spread, drift_samples
+from koopman_ros.learning.identification import (
+    DriftModel,
+    identify,
+    longest_step,
+    prediction_error,
+    Segments,
+    Stopped,
+)
+from koopman_ros.learning.identification.drift import steady_point
+from koopman_ros.learning.lift.metrics import lifted_rate
+from koopman_ros.lifting import linearised_model, load, ModelFileError, Provenance, save
+from koopman_ros.parameters.model_checks import load_suitable
+from koopman_ros.plant_data import Episode
+from koopman_ros.plants import two_state_reactor
+from koopman_ros.resources import model_path
+from support.known_plants import box, methods
+from support.random_lifts import random_lift
+from support.recorded_runs import driven, NOISE, reactor
+
+
+@pytest.fixture(scope='module')
+def shipped():
+    return load(model_path('reactor_nz4'))
+
+
+@pytest.fixture(scope='module')
+def found(shipped):
+    """Return the estimate of a reactor whose jacket has fouled."""
+    return identify(shipped.plant, [driven(reactor(0.8), 15.0).episode()], degrees=(1, 3),
+                    methods=methods(20))
+
+
+@pytest.fixture(scope='module')
+def trained(found, shipped):
+    plant = replace(shipped.plant, nominal_input=np.array([np.nan]))
+    return learn_lift(found, plant, 2, seed=0, starts=1)
+
+
+@pytest.fixture
+def no_loops(monkeypatch, shipped):
+    """Leave the closed loops out where another figure decides."""
+    passed = LawCheck(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool),
+                      np.ones(9), 0)
+    monkeypatch.setattr(sys.modules[decide.__module__], 'check_law', lambda *_, **__: passed)
+
+
+def linear_lift(model, slope, input_matrix):
+    """Return the lift N(x) = x with the names and boxes of a model."""
+    return linearised_model(np.array([[slope]]), np.array([[input_matrix]]), model.states,
+                            model.inputs, model.time_unit, Provenance(model.provenance.plant))
+
+
+@pytest.mark.parametrize(('unit', 'seconds'), [('s', 1.0), ('min', 60.0)])
+def test_rate_of_a_lift_in_units(unit, seconds):
+    lift = replace(random_lift(n_u=2), time_unit=unit)
+    rng = np.random.default_rng(0)
+    x = lift.states.center + rng.uniform(-0.5, 0.5, (5, 2))
+    u = lift.inputs.center + rng.uniform(-0.5, 0.5, (5, 2))
+    rates = lifted_rate(lift, 60.0)(x, u)
+    for k in range(5):
+        xi, v = lift.states.to_deviation(x[k]), lift.inputs.to_deviation(u[k])
+        z, J = lift.lift_and_jacobian(xi)
+        # the definition, with least squares in place of the pseudo-inverse
+        rate = np.linalg.lstsq(J, lift.A @ z, rcond=None)[0] + lift.B @ v
+        assert rates[k] == pytest.approx(rate * lift.states.scale * 60.0 / seconds, rel=1e-9)
+
+
+def test_rate_of_a_state_that_has_diverged(shipped):
+    x = np.array([[310.0], [np.nan], [np.inf], [1e300], [311.0]])
+    u = np.full((5, 1), 290.0)
+    rates = lifted_rate(shipped, 60.0)(x, u)
+    assert np.isfinite(rates[:, 0]).tolist() == [True, False, False, False, True]
+    np.testing.assert_allclose(
+        rates[[0, 4]], lifted_rate(shipped, 60.0)(x[[0, 4]], u[[0, 4]]), rtol=1e-13)
+
+
+def test_the_shipped_lift_predicts_its_own_plant():
+    shipped = load(model_path('reactor_nz4'))
+    run = driven(reactor(), 8.0, coolant=(281.33, 300.55)).episode()
+    segments = Segments.of([run], longest_step([run]))
+    error = prediction_error(lifted_rate(shipped, 60.0), segments, shipped.states.scale)
+    assert error == pytest.approx([NOISE], rel=0.15)
+
+
+def test_nominal_input_that_is_not_known_is_the_one_that_holds_the_nominal_state(
+        found, trained, shipped):
+    states, inputs = trained.model.states, trained.model.inputs
+    assert states.center == shipped.states.center
+    assert found.drift.rate(states.center, inputs.center) == pytest.approx([0.0], abs=1e-9)
+
+
+def test_a_better_lift_is_accepted(found, trained, shipped):
+    decision = decide(found, trained, shipped, Thresholds())
+    assert decision.accepted
+    assert (decision.reasons, decision.warnings) == ((), ())
+    assert decision.law_check.arrived == decision.law_check.loops == 128
+    assert decision.law_check.worst_ratio < 1.01
+    # nothing but noise is left of its error, and kelvins of the present one's
+    assert decision.rmse == pytest.approx([NOISE], rel=0.15)
+    assert decision.noise == pytest.approx([NOISE], rel=0.15)
+    assert decision.rmse == pytest.approx(decision.drift_rmse, rel=0.05)
+    assert decision.current_rmse > 10.0 * decision.rmse
+    assert decision.linear_rmse > 1.2 * decision.rmse
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_the_present_lift_does_not_beat_itself(found, trained):
+    decision = decide(found, trained, trained.model, Thresholds())
+    own = f'{decision.rmse[0]:.4g} K'
+    assert decision.reasons == (
+        f'its error on held-out records, {own}, is not 10 % below that of the present model, '
+        f'{own}',)
+    assert decide(found, trained, trained.model, Thresholds(margin=0.0)).accepted
+
+
+@pytest.mark.usefixtures('no_loops')
+@pytest.mark.parametrize('share', [-1.5, -1.01, -0.99, 0.0, 0.99, 1.01, 4.0])
+def test_what_is_accepted_can_be_loaded_and_what_cannot_is_refused(
+        found, trained, tmp_path, share):
+    """The nominal input from below all that was recorded to above it, as steady_point gives it."""
+    inputs, path = trained.model.inputs, tmp_path / 'lift.safetensors'
+    center = 0.5 * (inputs.lower + inputs.upper) + share * 0.5 * (inputs.upper - inputs.lower)
+    model = replace(trained.model, inputs=replace(inputs, center=center))
+    decision = decide(found, replace(trained, model=model), None, Thresholds())
+    reasons = [reason for reason in decision.reasons if 'nominal coolant_temperature' in reason]
+    save(model, path)
+    if abs(share) < 1.0:
+        assert not reasons
+        load_suitable(str(path))
+        return
+    assert not decision.accepted
+    assert re.search(f'record coolant_temperature {"up" if share > 0.0 else "down"} to '
+                     rf'{center[0] - 273.15:.4g} degC', reasons[0])
+    with pytest.raises(ModelFileError, match='the nominal coolant_temperature'):
+        load_suitable(str(path))
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_what_the_estimate_warns_of_is_passed_on(found, trained, shipped):
+    warned = replace(found, warnings=('the pumps moved together',))
+    assert decide(warned, trained, shipped, Thresholds()).warnings == warned.warnings
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_margin_is_a_share(found, trained, shipped):
+    decision = decide(found, trained, shipped, Thresholds())
+    ratio = float(decision.rmse[0] / decision.linear_rmse[0])
+    assert decide(found, trained, shipped, Thresholds(margin=1.0 - 1.01 * ratio)).accepted
+    (reason,) = decide(found, trained, shipped, Thresholds(margin=1.0 - 0.99 * ratio)).reasons
+    assert 'the best linear model' in reason
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_coordinates_that_have_collapsed(found, trained, shipped):
+    cond = trained.figures.fit.cond
+    (reason,) = decide(found, trained, shipped, Thresholds(condition=0.99 * cond)).reasons
+    assert reason == (f'the condition number of its coordinates, {cond:.3g}, is above '
+                      f'{0.99 * cond:.3g}: use fewer coordinates')
+
+
+def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
+    wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
+    decision = decide(found, wrong, shipped, Thresholds(), loops=16)
+    assert decision.law_check.share_failed == 1.0
+    (reason,) = (reason for reason in decision.reasons if 'controller' in reason)
+    assert reason.startswith('it is no controller of the estimated drift: the law fails in 16 of '
+                             '16 closed loops over the box (')
+    assert 'not arriving' in reason
+    assert f'{decision.law_check.region}' in reason
+
+
+def test_loops_that_are_ended_leave_no_decision(found, trained, shipped):
+    with pytest.raises(Stopped):
+        decide(found, trained, shipped, Thresholds(), watch=lambda share: share > 0.5)
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, trained):
+    diverging = linear_lift(trained.model, 1e4, 1.0)
+    decision = decide(found, trained, diverging, Thresholds())
+    assert decision.current_rmse == [np.inf]
+    assert decision.accepted
+    decision = decide(found, replace(trained, model=diverging), diverging, Thresholds())
+    assert 'its error on held-out records, inf K, is not 10 % below that of the present model' in (
+        ' '.join(decision.reasons))
+
+
+@pytest.mark.parametrize(('values', 'words'), [
+    ({'margin': 1.0}, r'margin = 1.0 must be in \[0, 1\)'),
+    ({'margin': -0.1}, 'margin = -0.1'),
+    ({'margin': float('nan')}, 'margin = nan'),
+    ({'condition': 1.0}, 'condition = 1.0 must be above 1'),
+    ({'condition': float('nan')}, 'condition = nan'),
+])
+def test_thresholds_out_of_range(values, words):
+    with pytest.raises(ValueError, match=words):
+        Thresholds(**values)
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_warns_of_a_state_that_is_not_measured(trained, shipped):
+    """The reactor's concentration moves, too; its temperature alone does not tell where it is."""
+    run = driven(two_state_reactor(), 20.0, coolant=(294.0, 302.0), seed=2, noise=0.03)
+    found = identify(shipped.plant, [run.episode()], degrees=(1, 2), methods=methods(20))
+    decision = decide(found, trained, shipped, Thresholds())
+    coloured, warning = decision.warnings
+    # what is not measured moves slowly
+    assert coloured.startswith('the noise of temperature is coloured (autocorrelation 0.')
+    assert warning.startswith(
+        f'the best drift errs by {decision.drift_rmse[0]:.3g} K in temperature, of which ')
+    assert 'something that is not measured acts too' in warning
+    # the noise is told apart from it
+    assert decision.noise == pytest.approx([0.03], rel=0.15)
+    assert decision.drift_rmse > 1.5 * decision.noise
+    # it is judged by what it does, not by the warning
+    assert warning not in decision.reasons
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_noise_that_is_coloured_is_named(found, trained, shipped):
+    """The autocorrelation of n_k = 0.8 n_(k-1) + e_k is 0.8."""
+    rng = np.random.default_rng(0)
+
+    def noisy(colour):
+        episodes = []
+        for clean in found.held_out:
+            n = rng.standard_normal(len(clean))
+            for k in range(1, len(n)):
+                n[k] = colour * n[k - 1] + np.sqrt(1.0 - colour ** 2) * n[k]
+            segments = Segments.of([clean], longest_step([clean]))
+            path = segments.path(found.drift.rate, clean.x[:1])[segments.measured[:, 0], 0]
+            episodes.append(replace(clean, x=path + NOISE * n[:, None]))
+        return decide(replace(found, held_out=tuple(episodes)), trained, shipped, Thresholds())
+
+    assert noisy(0.0).warnings == ()
+    (said, *_) = noisy(0.8).warnings
+    match = re.match(r'the noise of temperature is coloured \(autocorrelation (0\.\d\d) from '
+                     r'sample to sample .*it tells as much as (\d+) % of the samples', said)
+    # of three segments of 60 samples, whose starts are fitted
+    r = float(match[1])
+    assert r == pytest.approx(0.8, abs=0.2)
+    assert float(match[2]) == pytest.approx(100.0 * (1.0 - r) / (1.0 + r), abs=1.0)
+
+
+@pytest.mark.parametrize(('wanted', 'words'), [
+    ({}, ()), ({'temperature': (306.0, 326.0)}, ()),
+    # by less than a twentieth of 20 K
+    ({'temperature': (306.0, 327.9)}, ()),
+    ({'temperature': (306.0, 329.5)}, ('temperature was trained from 31.85 degC to 53.85 degC, '
+                                       'set-points are wanted from 32.85 degC to 56.35 degC',)),
+    ({'temperature': (290.0, 326.0)}, ('temperature was trained from',))])
+def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, words):
+    said = uncovered_setpoints(shipped.states, wanted)
+    assert len(said) == len(words)
+    assert all(text.startswith(word) for text, word in zip(said, words, strict=True))
+
+
+# The steady point and the samples of a drift.
+
+BOX = box([-1.0], [3.0], [-2.0], [2.0])
+
+
+def cubic(c0=0.5):
+    """Return dx/dt = c0 - x + 0.3 x^2 - 0.2 x^3 + 1.5 u as a drift model."""
+    middle, half = BOX.states.center, BOX.states.scale
+    xi = np.linspace(-1.0, 1.0, 4)
+    x = middle + half * xi
+    f = c0 - x + 0.3 * x ** 2 - 0.2 * x ** 3
+    rest = 1.5 * BOX.inputs.center
+    coefficients = np.polynomial.polynomial.polyfit(xi, (f + rest) / half, 3)
+    return DriftModel(BOX, 3, coefficients[:, None], BOX.input_matrix(np.array([[1.5]])))
+
+
+def held(drift, x0, u, count=60, period=0.1):
+    """Return a record of a drift's own path by another integrator."""
+    times = period * np.arange(count)
+    path = solve_ivp(lambda _, x: drift.rate(x, np.array([u])), (0.0, times[-1]), [x0],
+                     t_eval=times, rtol=1e-10, atol=1e-12).y.T
+    return Episode(times, path, np.zeros(1), np.array([[u]]))
+
+
+def test_steady_point_keeps_a_state_that_an_input_can_hold():
+    drift = cubic()
+    x, u = steady_point(drift, np.array([1.2]), np.array([0.0]))
+    assert x == pytest.approx([1.2], abs=1e-12)
+    f = 0.5 - 1.2 + 0.3 * 1.2 ** 2 - 0.2 * 1.2 ** 3
+    assert u == pytest.approx([-f / 1.5], abs=1e-12)
+
+
+def test_steady_point_of_two_states_and_one_input():
+    # dx1/dt = -x1 + x2, dx2/dt = -x2 - x1^2 + u on a box of halves of the width 2 and 4
+    wide = box([-2.0, -4.0], [2.0, 4.0], [-5.0], [5.0])
+    drift = DriftModel(wide, 2, np.zeros((6, 2)), wide.input_matrix(np.array([[0.], [1.]])))
+    # each monomial is known by its values at three points: x1, x2 and x1^2
+    orders = {tuple(row): k for k, row in enumerate(
+        np.round(drift.features(np.array([[0.5, 1.0], [1.0, 0.5], [0.5, 0.5]])), 12).T)}
+    for (values, row, value) in (((0.5, 1.0, 0.5), 0, -1.0), ((1.0, 0.5, 0.5), 0, 2.0),
+                                 ((1.0, 0.5, 0.5), 1, -1.0), ((0.25, 1.0, 0.25), 1, -1.0)):
+        drift.coefficients[orders[values], row] = value
+    probe = np.array([1.5, -2.0])
+    assert drift.rate(probe, np.array([0.7])) == pytest.approx([-3.5, 2.0 - 2.25 + 0.7])
+    x, u = steady_point(drift, np.array([1.0, 1.6]), np.array([2.0]))
+    assert x[0] == pytest.approx(x[1], abs=1e-9)
+    assert u == pytest.approx(x[1:] + x[0] ** 2, abs=1e-8)
+    # near where it was asked for, in units of the range
+    assert np.all(np.abs(x - [1.0, 1.6]) < 0.6)
+
+
+def test_steady_point_finds_the_root_where_the_input_does_nothing():
+    # with one state and an input without effect only the state can move
+    drift = cubic()
+    still = DriftModel(BOX, 3, drift.coefficients, np.zeros((1, 1)))
+    x, u = steady_point(still, np.array([1.0]), np.array([0.3]))
+    root = brentq(lambda x: 0.5 - x + 0.3 * x ** 2 - 0.2 * x ** 3, -1.0, 3.0, xtol=1e-14)
+    assert x == pytest.approx([root], abs=1e-9)
+    assert u == pytest.approx([0.3])
+
+
+@pytest.mark.parametrize('coefficients', [[1.0, 0.0, 0.3, 0.0], [1e3, 1.0, 0.0, 0.0],
+                                          [0.1, 0.0, 0.0, 1e-9]])
+def test_no_steady_point(coefficients):
+    still = DriftModel(BOX, 3, np.array(coefficients)[:, None], np.zeros((1, 1)))
+    with pytest.raises(ValueError, match='no steady state was found within the range of the epi'):
+        steady_point(still, np.array([1.0]), np.array([0.0]))
+
+
+def test_samples_lie_on_the_paths_of_the_drift():
+    drift = cubic()
+    records = tuple(held(drift, x0, u) for x0, u in ((2.5, -1.0), (-0.5, 1.5), (0.3, 0.2)))
+    noisy = tuple(Episode(r.time, r.x + 0.05 * np.random.default_rng(k).standard_normal(r.x.shape),
+                         r.input_time, r.u) for k, r in enumerate(records))
+    samples = drift_samples(drift, noisy)
+    assert len(samples) == 3 * 59
+    assert np.array_equal(samples.dxdt, drift.rate(samples.x, samples.u))
+    # free of the noise: the start of each path is fitted to 60 measurements of it
+    true = np.concatenate([r.x[:-1] for r in records])
+    error = samples.x - true
+    assert np.sqrt(np.mean(error ** 2)) < 0.05 / 4.0
+    # shares take part in turn, so that each covers the range
+    assert np.array_equal(samples.episode[:12], [*range(10), 0, 1])
+    # in the order of the segments and of their times
+    assert samples.u[:, 0].tolist() == [-1.0] * 59 + [1.5] * 59 + [0.2] * 59
+
+
+def test_segments_that_the_drift_does_not_follow_are_left_out():
+    # above 1 it runs away
+    drift = DriftModel(BOX, 3, np.array([[0.0], [-1.0], [0.0], [4.0]]), np.zeros((1, 1)))
+    calm = held(drift, 1.4, 0.0)
+    rising = Episode(calm.time, np.linspace(2.8, 3.0, 60)[:, None], calm.input_time, calm.u)
+    samples = drift_samples(drift, (calm, rising))
+    assert len(samples) == 59
+    assert np.max(np.abs(samples.x)) < 3.0
+    with pytest.raises(ValueError, match='the estimated drift follows none of the episodes'):
+        drift_samples(drift, (rising,))
+
+
+def test_samples_fill_the_range_and_few_are_all_kept():
+    # a thousand around 0, a few on the way out
+    xi = np.concatenate([np.random.default_rng(0).uniform(-0.1, 0.1, 5000),
+                         np.linspace(-1.0, 1.0, 40)])[:, None]
+    kept = _spread(xi)
+    assert len(kept) <= 2000
+    assert np.all(np.diff(kept) > 0)
+    # all that is rare is kept
+    assert set(kept) >= {i for i in range(5000, 5040) if abs(xi[i, 0]) > 0.15}
+    counts = np.histogram(xi[kept, 0], bins=20, range=(-1.0, 1.0))[0]
+    assert counts.min() == 2
+    assert counts.max() <= 1000
+    xi = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 2))
+    assert np.array_equal(_spread(xi), np.arange(300))
+    # of four states nearly every sample has a cell of its own
+    kept = _spread(np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 4)))
+    assert 1000 < len(kept) <= 2000

@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Classes of models learned from one record: the choice, by rule or by name; its report."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+
+from koopman_ros.execution.training import class_lines, scalars
+from koopman_ros.learning import (
+    compare_classes,
+    decide,
+    drift_sampling,
+    Growth,
+    NeuralDrift,
+    retrain,
+    Thresholds,
+    TrainingTask,
+)
+from koopman_ros.learning.identification import identify, Stopped
+from koopman_ros.lifting import load
+from koopman_ros.model_classes import BEST, CLASSES
+from support.known_plants import KnownPlant, methods
+from support.quick_retraining import page_of, quick_retraining
+from support.recorded_runs import INPUTS, linear_run, STATES, write_bag
+
+NOISE = 0.01  # m
+# dx/dt = -x - 0.3 x^2 + 2 u
+BENT = KnownPlant(((1, 0), (2, 0)), (-1.0, -0.3), np.array([[2.0]]))
+GATE = Thresholds()
+
+
+@pytest.fixture(scope='module', autouse=True)
+def small_networks():
+    """Learn small networks; that of the identity lift is the task's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drift_sampling, 'usual_recipes', lambda _: {
+            'neural drift': NeuralDrift(3, max_iterations=60), 'identity lift': Growth(2),
+            'free lift': Growth(1, identity=False, hidden_first=3, max_iterations=60)})
+        yield
+
+
+def identified(plant, noise):
+    """Return the estimate of a minute of steps, ten samples a second."""
+    rng = np.random.default_rng(0)
+    steps = np.arange(0.0, 60.0, 0.8)
+    record = plant.record(0.1 * np.arange(600), steps, rng.uniform(-0.5, 0.7, (len(steps), 1)),
+                          noise=noise)
+    return identify(plant.plant, [record], degrees=(1, 2), methods=methods(20))
+
+
+def compared(found, model_class=BEST, thresholds=GATE, n_z=2, **others):
+    return compare_classes(found, BENT.plant, thresholds, model_class=model_class, n_z=n_z, seed=0,
+                           starts=1, loops=16, **others)
+
+
+@pytest.fixture(scope='module')
+def found():
+    return identified(BENT, NOISE)
+
+
+@pytest.fixture(scope='module')
+def course():
+    """Return what is told of a comparison: of the starts, and of the closed loops."""
+    return [], []
+
+
+@pytest.fixture(scope='module')
+def best(found, course):
+    """Compare the classes on the record of the bent plant, whose drift is of degree 2."""
+    learning, judging = course
+    return compared(found, watch=lambda now: bool(learning.append(now)),
+                    judging=lambda *now: bool(judging.append(now)))
+
+
+def test_the_class_of_the_truth_is_chosen(found, best):
+    assert [one.name for one in best.contenders] == list(CLASSES)
+    linear, polynomial, *_ = best.contenders
+    assert best.chosen is polynomial
+    assert polynomial.model.n_z == 2
+    # the truth, as far as a minute with this noise tells
+    x, u = np.linspace(-0.8, 0.9, 20)[:, None], np.zeros((20, 1))
+    model = best.model
+    rate = model.states.scale * (model.drift(model.states.to_deviation(x))
+                                 + model.inputs.to_deviation(u) @ model.B.T)
+    assert np.max(np.abs(rate - BENT.rate(x, u))) < 0.02
+    assert linear.excess > 10.0 * polynomial.excess
+
+
+@pytest.mark.parametrize(('bend', 'chosen'), [(-0.03, 'linear'), (-0.06, 'polynomial')])
+def test_noise_neither_hides_an_error_nor_makes_one(bend, chosen):
+    """Linear predictions are 9 and 33 % off, by mean squares less than twice the others'."""
+    found = identified(replace(BENT, coefficients=(-1.0, bend)), NOISE)
+    assert found.drift.degree == 2
+    comparison = compared(found, thresholds=Thresholds(margin=0.0), n_z=1)
+    linear, polynomial = (float(one.figures.rollout_rmse[0]) for one in comparison.contenders[:2])
+    assert 1.05 < linear / polynomial < np.sqrt(2.0)
+    assert comparison.chosen.name == chosen
+    # which no linear model has to be better than
+    assert decide(found, comparison, None, GATE).accepted
+
+
+def test_a_class_that_the_gate_would_refuse_is_not_chosen(found, best):
+    # between the coordinates of the neural drift, which are the states, and those of the others
+    strict = Thresholds(condition=0.5 * (1.0 + best.contenders[1].figures.fit.cond))
+    again = compared(found, thresholds=strict, n_z=1)
+    assert again.chosen.name == 'neural drift'
+    assert again.contenders[1].refusal.startswith('the condition number of its coordinates')
+    # nor is one that cannot be learned: identity coordinates beyond the state are none here
+    assert again.contenders[3].model is None
+    assert again.contenders[3].refusal.startswith('n_z = 1 is too small for 1 states')
+    with pytest.raises(ValueError, match='n_z = 1 is too small for 1 states'):
+        compared(found, 'identity lift', n_z=1)
+
+
+@pytest.mark.parametrize('name', CLASSES)
+def test_a_class_that_is_named_is_learned_alone(found, name):
+    alone = compared(found, name)
+    assert [one.name for one in alone.contenders] == [name]
+    assert alone.chosen.name == name
+    decision = decide(found, alone, None, GATE, loops=16)
+    # its loops are not run again
+    assert decision.law_check is alone.chosen.law_check
+    assert decision.rmse == alone.figures.rollout_rmse
+    assert decision.accepted
+
+
+def test_progress_counts_the_starts_of_all_classes(course, best):
+    learning, judging = course
+    assert list(dict.fromkeys(now.name for now in learning)) == list(CLASSES[2:])
+    shares = [now.finished for now in learning]
+    assert shares == sorted(shares)
+    assert shares[-1] == learning[-1].total == 3
+    assert list(dict.fromkeys(name for name, _ in judging)) == list(CLASSES)
+    assert all(0.0 <= share < 1.0 for _, share in judging)
+
+
+def test_comparison_that_is_stopped(found):
+    with pytest.raises(Stopped):
+        compared(found, judging=lambda name, share: name == 'polynomial' and share > 0.5)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp('bag') / 'linear.mcap', linear_run(200))
+
+
+def task(bag, folder, model_class):
+    return TrainingTask((str(bag),), str(folder / 'new.safetensors'), '', STATES, INPUTS,
+                        coordinates=2, starts=1, model_class=model_class)
+
+
+@pytest.fixture
+def quick():
+    with quick_retraining(16, (1,), (10,)):
+        yield
+
+
+@pytest.mark.usefixtures('quick')
+def test_classes_side_by_side_in_report_and_summary(bag, tmp_path):
+    """A linear plant, of which the rule takes the linear model and training refuses networks."""
+    told = []
+    retrained = retrain(task(bag, tmp_path, BEST), lambda *now: bool(told.append(now)))
+    assert retrained.accepted
+    assert load(retrained.model_file).n_z == 1
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert 'judging: linear' in [text for _, text in told]
+    figures = json.loads(json.dumps(retrained.summary(), allow_nan=False))
+    assert figures['model_class'] == 'linear'
+    assert [name for name, one in figures['classes'].items() if one['chosen']] == ['linear']
+    assert list(figures['classes']) == list(CLASSES)
+    lift = figures['classes']['identity lift']
+    assert 'does not predict the motion better than a linear model' in lift['refusal']
+    assert 'heldout_error' not in lift
+    linear = figures['classes']['linear']
+    assert linear['heldout_error'] == figures['heldout_error']
+    page = page_of(retrained)
+    rows = [line for line in page.splitlines() if line.split(' | ')[0][2:] in CLASSES]
+    assert len(rows) == 5
+    assert rows[0].endswith('| chosen |')
+    lines = class_lines(figures)
+    assert list(lines) == list(CLASSES)
+    assert lines['linear'].startswith('chosen: drift rx ')
+    assert '; refused: ' in lines['identity lift']
+    assert scalars(figures)['class linear'] == lines['linear']
+
+
+@pytest.mark.usefixtures('quick')
+def test_one_class_has_no_lines_beside_others(bag, tmp_path):
+    retrained = retrain(task(bag, tmp_path, 'polynomial'))
+    figures = retrained.summary()
+    assert list(figures['classes']) == ['polynomial']
+    assert class_lines(figures) == {}
+    # exact, but no better than the linear model
+    assert 'is not 10 % below that of the best linear model' in retrained.reasons[0]
+    assert figures['model_class'] == 'polynomial'
+
+
+@pytest.mark.usefixtures('quick')
+def test_it_is_retrained_where_the_task_says(bag, tmp_path):
+    """The same lift comes of it, and what fails writes nothing."""
+    models = []
+    for scheduler in ('', 'process'):
+        done = retrain(replace(task(bag, tmp_path, 'linear'), scheduler=scheduler))
+        models.append(load(done.model_file))
+        (tmp_path / 'new.safetensors').unlink()
+    assert models[0].A.tobytes() == models[1].A.tobytes()
+    assert models[0].tried_loops == models[1].tried_loops
+    for change, error, text in (
+            ({'scheduler': 'joblib:0'}, ValueError, "scheduler is 'joblib:0', must be"),
+            ({'device': 'abacus'}, ValueError, "device is 'abacus', but torch")):
+        with pytest.raises(error, match=text):
+            retrain(replace(task(bag, tmp_path, 'linear'), **change))
+    assert list(tmp_path.glob('*.safetensors')) == []
+
+
+def test_a_class_that_there_is_not(bag, tmp_path):
+    with pytest.raises(ValueError, match="model_class = 'lift' must be one of linear, polynomial, "
+                                         'neural drift, identity lift, free lift, best'):
+        retrain(task(bag, tmp_path, 'lift'))

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Retraining from a record that is longer than what is learned from."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+import json
+from pathlib import Path
+
+import pytest
+
+from koopman_ros.learning import retrain, TrainingTask, write_report
+from koopman_ros.learning.identification import Stopped
+from koopman_ros.learning.record import read_record
+from support.long_records import bags_of, drift_error, source, task
+from support.long_records import SAMPLES as LENGTH
+from support.quick_retraining import quick_retraining
+
+BAGS = 10
+SAMPLES = BAGS * LENGTH
+
+
+@pytest.fixture(scope='module', autouse=True)
+def few_methods() -> Iterator[None]:
+    """Estimate by a few methods alone, and try laws in a few loops."""
+    with quick_retraining(16):
+        yield
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return bags_of(BAGS, tmp_path_factory.mktemp('bags'))
+
+
+def small(bags: list[Path], output: Path) -> TrainingTask:
+    return replace(task(bags, output), coordinates=2, starts=1, most_samples=3000)
+
+
+def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Path) -> None:
+    told: list[tuple[float, str]] = []
+    found = retrain(small(bags, tmp_path / 'long.safetensors'),
+                    lambda share, text: told.append((share, text)) or False)
+    assert found.accepted
+    assert found.reduction is not None
+    assert found.reduction.samples == found.account.measurements == SAMPLES
+    assert found.reduction.used <= 3000
+    # of rates up to 15 K/min
+    assert drift_error(found.found.drift) < 0.02
+    # a dozen segments of four minutes reach most of the range
+    assert min(found.coverage.values()) > 0.6
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    # it is read twice, bag by bag
+    assert sum(text == 'reading bags' for _, text in told) == 1 + 2 * BAGS
+    files = write_report(found)
+    assert json.loads(files[0].read_text())['reduction'] == {
+        'samples': SAMPLES, 'group': 1, 'segments': found.reduction.segments,
+        'chosen': found.reduction.chosen, 'used': found.reduction.used}
+    assert found.reduction.text() in files[1].read_text()
+
+
+def test_a_short_record_is_taken_whole(bags: list[Path]) -> None:
+    found = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH, 0)
+    assert found.reduction is None
+    assert [len(one) for one in found.episodes] == [LENGTH, LENGTH]
+    # a bag that is named twice is read once, here and there
+    twice = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH - 1000, 0)
+    assert twice.account.notes[0] == f'{bags[0]} is named twice: read once'
+    assert twice.account.used == 2 * LENGTH
+
+
+def test_reading_can_be_stopped(bags: list[Path], tmp_path: Path) -> None:
+    told: list[float] = []
+    with pytest.raises(Stopped):
+        retrain(small(bags, tmp_path / 'x.safetensors'),
+                lambda share, _: told.append(share) or len(told) == 4)
+    assert 0.0 < told[-1] < 0.05
+    assert list(tmp_path.iterdir()) == []

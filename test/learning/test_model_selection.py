@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The classes of models side by side: the rule of the choice, the figures, what may be asked."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+
+from koopman_ros.control.law_check import check_law
+from koopman_ros.learning import (
+    compare,
+    Contender,
+    Edmd,
+    evaluate,
+    fit,
+    Growth,
+    model_selection,
+    NeuralDrift,
+    NoUsefulLift,
+)
+from koopman_ros.learning.lift.neural_drift import with_units_of
+from koopman_ros.learning.model_selection import plainest
+from koopman_ros.lifting import Box, load, save
+from koopman_ros.plant_data import split_by_episode
+from support.random_lifts import random_lift
+from support.small_plants import (
+    BENT,
+    bent_samples,
+    SMALL,
+    TWO_STATE,
+    two_state_samples,
+    UNFORCED,
+    unforced_samples,
+)
+
+RECIPES = {'neural drift': NeuralDrift(3, max_iterations=40), 'identity lift': SMALL}
+
+
+def contender(name, rx, refusal=''):
+    return Contender(name, None, rx, None, None, 0.0, refusal)
+
+
+@pytest.mark.parametrize(('errors', 'refused', 'chosen'), [
+    ([1e-2, 1e-4, 1e-6], (), 2), ([1e-2, 1.9e-6, 1e-6], (), 1), ([1e-2, 2.1e-6, 1e-6], (), 2),
+    ([1.9e-6, 1.9e-6, 1e-6], (), 0), ([1e-2, 1e-4, 1e-6], (2,), 1),
+    ([1e-2, 1e-4, 1e-6], (1, 2), 0),
+    # rounding
+    ([1e-30, 1e-33, 0.0], (), 0), ([1e-2, 1.9e-20, 1e-33], (), 1),
+    ([1e-2, math.inf, 1e-6], (1,), 2)])
+def test_the_plainest_within_a_factor_of_two_is_taken(errors, refused, chosen):
+    those = [contender(str(i), rx, 'refused' if i in refused else '')
+             for i, rx in enumerate(errors)]
+    assert plainest(those) is those[chosen]
+
+
+@pytest.fixture(scope='module')
+def bent():
+    """Compare the models of the bent plant, whose drift is of degree 2."""
+    return compare(BENT, bent_samples(), RECIPES, starts=1, loops=16)
+
+
+def test_a_polynomial_drift_is_found_and_taken(bent, tmp_path):
+    linear, polynomial, drift, lift = bent.contenders
+    assert [one.name for one in bent.contenders] == [
+        'linear', 'polynomial', 'neural drift', 'identity lift']
+    assert bent.chosen is polynomial
+    assert bent.model is polynomial.model
+    # the smallest of the degrees that are exact
+    assert polynomial.model.n_z == 2
+    assert polynomial.rx < 1e-25 < drift.rx < linear.rx
+    assert lift.rx < linear.rx
+    training, validation, test = split_by_episode(bent_samples(), 0)
+    for one in bent.contenders:
+        assert one.figures.fit == evaluate(one.model, test).fit
+        assert one.rx == fit(one.model, validation.x, validation.dxdt, validation.u).rx
+        assert one.model.provenance.metrics == one.figures.metrics(('level',))
+    for one in bent.contenders:
+        assert one.law_check.loops == 16
+        assert one.law_check.accepted or one is linear
+    box = Box.of(BENT, bent_samples().x, bent_samples().u)
+    np.testing.assert_array_equal(linear.model.A, Edmd(1).learn(BENT, training, box).A)
+    save(bent.model, tmp_path / 'best.safetensors')
+    x = np.array([0.4])
+    np.testing.assert_array_equal(load(tmp_path / 'best.safetensors').drift(x),
+                                  bent.model.drift(x))
+
+
+def test_the_table_has_a_row_for_each(bent):
+    head, _, *rows = str(bent).splitlines()
+    assert head.startswith('| model | n_z | rx, validation | rx, test | roll-out of level, m |')
+    assert [row.split(' | ')[0] for row in rows] == [
+        '| linear', '| polynomial', '| neural drift', '| identity lift']
+    assert [row.endswith('| chosen |') for row in rows] == [False, True, False, False]
+
+
+def test_progress_is_that_of_all_classes():
+    told = []
+    compare(BENT, bent_samples(), RECIPES, starts=2, loops=0,
+            watch=lambda now: bool(told.append(now)))
+    assert list(dict.fromkeys(now.name for now in told)) == ['neural drift', 'identity lift']
+    counts = [now.finished for now in told]
+    assert counts == sorted(counts)
+    assert {now.total for now in told} == {4}
+    assert counts[-1] == 4
+
+
+def test_a_class_may_be_learned_alone():
+    alone = compare(BENT, bent_samples(), RECIPES, choose='polynomial', alone=True, loops=0)
+    assert [one.name for one in alone.contenders] == ['polynomial']
+    assert alone.model is alone.chosen.model
+    with pytest.raises(ValueError, match=r'choose must be one of .*, got None'):
+        compare(BENT, bent_samples(), RECIPES, alone=True)
+    with pytest.raises(ValueError, match='starts must be at least 1, got 0'):
+        compare(BENT, bent_samples(), RECIPES, starts=0)
+
+
+def test_a_class_that_cannot_be_learned_has_its_reason():
+    found = compare(BENT, bent_samples(), {'lift': Growth(1)}, degrees=(40,), starts=1, loops=0)
+    assert found.chosen.name == 'linear'
+    assert [one.model is None for one in found.contenders] == [False, True, True]
+    assert found.contenders[2].refusal.startswith('n_z = 1 is too small for 1 states')
+    none = [contender(name, math.inf, 'is none') for name in ('a', 'b')]
+    with pytest.raises(NoUsefulLift, match='no class has a model: a: is none; b: is none'):
+        plainest(none)
+
+
+def test_a_class_may_be_asked_for():
+    asked = compare(BENT, bent_samples(), RECIPES, starts=1, choose='identity lift', loops=0)
+    assert asked.chosen.name == 'identity lift'
+    with pytest.raises(ValueError, match='choose must be one of linear, polynomial, neural drift, '
+                                         "identity lift, got 'lift'"):
+        compare(BENT, bent_samples(), RECIPES, choose='lift')
+
+
+def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
+    samples = bent_samples()
+    linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
+    recipes = {'lift': Growth(2, hidden_first=3, max_iterations=5)}
+    found = compare(BENT, linear, recipes, starts=1, loops=16)
+    assert found.chosen.name == 'linear'
+    assert 'does not predict the motion better' in found.contenders[2].refusal
+    assert found.contenders[2].model is None
+    with pytest.raises(NoUsefulLift, match='does not predict the motion better'):
+        compare(BENT, linear, recipes, starts=1, choose='lift', loops=0)
+
+
+@pytest.mark.parametrize(('failing', 'chosen'), [
+    ({2: 16}, 'linear'), ({1: 8, 2: 5}, 'polynomial'), ({1: 5, 2: 5}, 'linear')])
+def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
+    """However close it is; where all fail, which fails least often."""
+    def fails(model, rate, loops, **_):
+        excess = np.ones(16)
+        excess[:failing.get(model.n_z, 0)] = np.inf
+        return replace(check_law(model, rate, loops=loops), excess=excess)
+
+    monkeypatch.setattr(model_selection, 'check_law', fails)
+    found = compare(BENT, bent_samples(), {}, loops=16)
+    assert found.chosen.name == chosen
+    refusal = f'no controller: the law fails in {failing[2]} of 16'
+    assert found.contenders[1].refusal.startswith(refusal)
+    assert f'{"chosen; " * (chosen == "polynomial")}{refusal}' in str(found)
+
+
+def test_all_laws_are_tried_where_the_data_are(monkeypatch):
+    tried = []
+
+    def noted(model, *_, **__):
+        tried.append(model.training_states)
+
+    monkeypatch.setattr(model_selection, 'check_law', noted)
+    found = compare(TWO_STATE, two_state_samples(), {'drift': NeuralDrift(3, max_iterations=5)},
+                    degrees=(2,), starts=1)
+    assert len(tried) == 3
+    for known, one in zip(tried, found.contenders, strict=True):
+        np.testing.assert_array_equal(known.states, tried[-1].states)
+        assert one.model.training_states is known
+
+
+def test_a_plant_without_inputs_and_degrees_that_cannot_be():
+    found = compare(UNFORCED, unforced_samples(), {}, degrees=(40,))
+    assert found.chosen.name == 'linear'
+    assert found.contenders[1].refusal
+    assert compare(UNFORCED, unforced_samples(), {}).chosen.law_check is None
+
+
+def test_units_of_a_drift_leave_the_lift_as_it_is():
+    lift, other = random_lift(2, 4), random_lift(2, 5, seed=5)
+    joined = with_units_of(other, lift)
+    x = np.random.default_rng(0).normal(size=(10, 2))
+    np.testing.assert_allclose(joined.lift(x), lift.lift(x), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(joined.drift(x), lift.drift(x), rtol=0, atol=1e-12)
+    phi = joined.observables.features.lift(x)
+    for model, at in ((lift, slice(2, 6)), (other, slice(6, None))):
+        np.testing.assert_allclose(phi[:, at], model.observables.features.lift(x)[:, 2:],
+                                   rtol=0, atol=1e-14)
+
+
+def test_a_lift_is_at_least_as_close_as_the_drift_before_it(bent):
+    _, _, drift, lift = bent.contenders
+    assert lift.rx <= 1.5 * drift.rx
+    assert lift.model.readout.shape == (1, 1 + 3 + 3)

@@ -1,0 +1,333 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Retraining from bags, end to end within one process."""
+
+from dataclasses import asdict, replace
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from koopman_ros.bags import BagReadError
+from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning import retrain, TrainingTask, write_report
+from koopman_ros.learning.downsampling import coverage, visited_cells
+from koopman_ros.learning.identification import Stopped
+from koopman_ros.lifting import load, ModelFileError, save
+from koopman_ros.plant_data import Episode
+from koopman_ros.resources import model_path
+from support.known_plants import box
+from support.quick_retraining import page_of, quick_retraining
+from support.random_lifts import random_lift
+from support.recorded_runs import (
+    driven,
+    INPUTS,
+    linear_run,
+    NOISE,
+    reactor,
+    STATES,
+    write_bag,
+)
+
+SHIPPED = str(model_path('reactor_nz4'))
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp('bag') / 'run.mcap', driven(reactor(0.8), 20.0))
+
+
+@pytest.fixture(scope='module', autouse=True)
+def few_methods():
+    """
+    Estimate by a few methods alone, and try laws in a few loops.
+
+    What they find is the matter of test_identify and test_law_check.
+    """
+    with quick_retraining(16, windows=(10, 20)):
+        yield
+
+
+def small(bag, output, present=SHIPPED, **others):
+    return TrainingTask((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2,
+                        starts=1, **others)
+
+
+@pytest.fixture(scope='module')
+def accepted(bag, tmp_path_factory):
+    """Return the result of a training that replaces a model, its progress, and its folder."""
+    folder = tmp_path_factory.mktemp('accepted')
+    (folder / 'new.safetensors').write_bytes(Path(SHIPPED).read_bytes())
+    told = []
+    retrained = retrain(small(bag, folder / 'new.safetensors'),
+                        lambda share, text: told.append((share, text)) or False)
+    return retrained, told, folder
+
+
+@pytest.fixture
+def estimated(accepted, monkeypatch):
+    """Let a retraining go on from what the accepted one has estimated."""
+    monkeypatch.setattr(task_module, 'identify', lambda *_, **__: accepted[0].found)
+
+
+@pytest.fixture
+def learned(accepted, estimated, monkeypatch):
+    """Let it go on from what the accepted one has learned, too."""
+    monkeypatch.setattr(task_module, 'compare_classes', lambda *_, **__: accepted[0].learned)
+
+
+def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
+    retrained, _, folder = accepted
+    assert retrained.accepted
+    assert retrained.model_file == str(folder / 'new.safetensors')
+    # no temporary file is left
+    assert sorted(path.name for path in folder.iterdir()) == [
+        'new.previous.safetensors', 'new.safetensors']
+    assert (folder / 'new.previous.safetensors').read_bytes() == Path(SHIPPED).read_bytes()
+
+
+def test_file_says_where_it_comes_from(accepted):
+    retrained, _, folder = accepted
+    origin, found = load(folder / 'new.safetensors').provenance, retrained.found
+    assert (origin.plant, origin.seed) == (load(SHIPPED).provenance.plant, 0)
+    assert len(origin.data_digest) == 64
+    assert origin.method == f'{found.method}, drift of degree {found.drift.degree}'
+    assert origin.metrics['noise'] == float(found.noise[0]) == pytest.approx(NOISE, rel=0.1)
+    assert origin.metrics['rollout_rmse'] == float(retrained.decision.rmse[0])
+    assert {('temperature', 'coolant_temperature'): origin.metrics['coverage']} == (
+        retrained.coverage)
+    assert 0.2 < origin.metrics['coverage'] < 1.0
+    assert {'rw', 'rx', 'cond'} < set(origin.metrics)
+
+
+def test_learned_lift_predicts_the_plant(accepted):
+    model = load(accepted[2] / 'new.safetensors')
+    # over the middle of the box, where twenty minutes tell enough
+    x, u = np.linspace(310.0, 322.0, 25)[:, None], np.full((25, 1), 288.0)
+    rate = model.states.scale * (model.drift(model.states.to_deviation(x))
+                                 + model.inputs.to_deviation(u) @ model.B.T)
+    # K/min, of rates up to 15
+    assert np.max(np.abs(rate - reactor(0.8).derivative(x, u))) < 0.6
+
+
+def test_progress_rises_to_the_end(accepted):
+    shares, words = zip(*accepted[1], strict=True)
+    assert list(shares) == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, pytest.approx(0.99))
+    assert words[0] == 'reading bags'
+    assert {'estimating: drift of degree 3', 'learning: identity lift, n_z 2, start 1 of 1',
+            'judging: identity lift'} < set(words)
+    assert words[-2:] == ('judging', 'writing')
+
+
+def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
+    present = accepted[2] / 'new.safetensors'
+    output = tmp_path / 'deep' / 'er' / 'new.safetensors'
+    retrained = retrain(small(bag, output, present))
+    assert not retrained.accepted
+    assert 'is not 10 % below that of the present model' in retrained.reasons[0]
+    # nothing replaces the output, and the same data and seed give the same numbers
+    assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
+    refused = load(retrained.model_file)
+    assert refused.provenance.accepted is False
+    assert refused.provenance.reasons == retrained.reasons
+    again = tmp_path / 'again.safetensors'
+    save(replace(refused, provenance=replace(
+        refused.provenance, accepted=True, reasons=())), again)
+    assert again.read_bytes() == present.read_bytes()
+
+
+def test_report(accepted):
+    retrained, _, _ = accepted
+    files = write_report(retrained)
+    assert [path.name for path in files] == ['new.json', 'new.md', 'new.png']
+    figures = json.loads(files[0].read_text())
+    assert figures == retrained.summary()
+    assert figures['accepted'] is True
+    assert figures['measurements_used'] == figures['measurements_read'] == 1201
+    # UA is 0.8 of 2.092 1/min
+    gain = figures['input_gain']['temperature']['coolant_temperature']
+    assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
+    page = files[1].read_text()
+    for words in ('is accepted.**', '1201 of 1201 measurements used',
+                  f'| the present model | {retrained.decision.current_rmse[0]:.5g} |',
+                  '![Data, drift and prediction](new.png)'):
+        assert words in page
+    assert files[2].read_bytes().startswith(b'\x89PNG')
+    diverging = replace(retrained, decision=replace(
+        retrained.decision, current_rmse=np.array([np.inf])))
+    figures = json.loads(json.dumps(diverging.summary(), allow_nan=False))
+    assert figures['heldout_error_of_present_lift'] == {'temperature': None}
+
+
+@pytest.mark.usefixtures('learned')
+def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
+    original = task_module.decide
+    monkeypatch.setattr(task_module, 'decide', lambda *arguments, **named: replace(
+        original(*arguments, **named), rmse=np.array([np.inf]), reasons=('it diverges',)))
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
+    metrics = load(retrained.model_file).provenance.metrics
+    assert 'rollout_rmse' not in metrics
+    assert 'noise' in metrics
+
+
+def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(task_module.os, 'link', refuse)
+    output = tmp_path / 'a.safetensors'
+    for content in (b'first', b'second'):
+        output.write_bytes(content)
+        assert task_module._place(output, True) == output
+        assert (tmp_path / 'a.previous.safetensors').read_bytes() == content
+        assert output.read_bytes() == content
+
+
+def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
+    """The gain is given in 1/s whatever the time unit of the present lift, here seconds."""
+    bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
+    present, seconds = load(SHIPPED), tmp_path / 'seconds.safetensors'
+    save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'), seconds)
+    gain = {'temperature': {'coolant_temperature': 1.0 / 60.0}}
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors', seconds, input_gain=gain))
+    (reason,) = retrained.reasons
+    assert 'does not predict the motion better than a linear model' in reason
+    assert (retrained.learned, retrained.decision, retrained.model_file) == (None, None, '')
+    assert list(tmp_path.glob('*.safetensors')) == [seconds]
+    # dT/dt = -(T - 315) / 2 + (Tc - 288), in minutes
+    assert retrained.found.drift.degree == 1
+    assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
+    assert retrained.summary()['input_gain'] == {
+        'temperature': {'coolant_temperature': pytest.approx(1.0 / 60.0, rel=1e-12)}}
+    files = write_report(retrained)
+    assert 'is refused.**' in files[1].read_text()
+    assert json.loads(files[0].read_text())['accepted'] is False
+
+
+@pytest.mark.parametrize(('stage', 'done_before'), [
+    ('reading bags', 'bag'), ('estimating: drift of degree 3', 'bag'),
+    ('learning: identity lift, n_z 2', 'estimated'), ('judging: id', 'estimated'),
+    ('judging', 'learned'), ('writing', 'learned')])
+def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, done_before):
+    request.getfixturevalue(done_before)
+    stopped = False
+
+    def tell(_, text):
+        nonlocal stopped
+        # whoever asked goes on asking
+        stopped = stopped or text.startswith(stage)
+        return stopped
+
+    with pytest.raises(Stopped):
+        retrain(small(bag, tmp_path / 'new.safetensors'), tell)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_task_survives_json():
+    task = TrainingTask(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
+                (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)), seed=3,
+                input_gain={'temperature': {'other': 2.1}})
+    assert TrainingTask.from_json(json.dumps(asdict(task))) == task
+    with pytest.raises(TypeError, match='nonsense'):
+        TrainingTask.from_json(json.dumps({**asdict(task), 'nonsense': 1}))
+    with pytest.raises(TypeError, match='nonsense'):
+        TrainingTask.from_json(json.dumps({**asdict(task), 'states': [
+            {**asdict(STATES[0]), 'nonsense': 1}]}))
+
+
+@pytest.mark.parametrize(('values', 'error', 'words'), [
+    ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
+    ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is not a regular file'),
+    ({'model': 'two.safetensors'}, ValueError, r'has the states x0 \[K\], x1 \[K\], the task has '
+     r'temperature \[K\]: give the same'),
+    ({'inputs': (replace(INPUTS[0], unit='degC'),)}, ValueError, r'inputs coolant_temperature '
+     r'\[K\], the task has coolant_temperature \[degC\]'),
+    ({'states': STATES * 2}, ValueError, r'has temperature \[K\], temperature \[K\]: give'),
+    ({'states': ()}, ValueError, 'the task has none'),
+    ({'input_gain': {'temperature': {'valve': 1.0}}}, ValueError,
+     'input_gain names valve acting on temperature'),
+    ({'input_gain': {'temperature': {'coolant_temperature': float('nan')}}}, ValueError,
+     'is nan, must be finite'),
+    ({'output': 'new.bin'}, ValueError, "output = 'new.bin' must end in .safetensors"),
+    ({'output': 'file/new.safetensors'}, OSError, 'file'),
+    ({'bags': ('/nowhere/run.mcap',)}, BagReadError, '/nowhere/run.mcap'),
+    ({'bags': ('short.mcap',)}, ValueError, 'no usable segment of measurements: 0 of 9 '
+     'measurements used; 9 dropped: too short'),
+    ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
+     BagReadError, "has no topic '/other', it has /coolant_se"),
+    ({'margin': 2.0}, ValueError, 'margin = 2.0'),
+])
+def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, error, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'file').touch()
+    save(random_lift(), tmp_path / 'two.safetensors')
+    write_bag(tmp_path / 'short.mcap', linear_run(9))
+    with pytest.raises(error, match=words):
+        retrain(replace(TrainingTask((str(bag),), 'new.safetensors', SHIPPED, STATES, INPUTS),
+                        **values))
+
+
+BOX = box([0.0], [10.0], [100.0], [200.0])
+
+
+def record(x, u):
+    times = np.arange(float(len(x)))
+    return Episode(times, np.array(x)[:, None], times, np.array(u)[:, None])
+
+
+# inputs are those that held at the samples
+HELD = Episode(np.arange(3.0), np.full((3, 1), 0.5), np.array([-1.0, 0.5]),
+               np.array([[105.0], [195.0]]))
+TWO_STATES = Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.zeros(1),
+                     np.array([[0.35]]))
+
+
+@pytest.mark.parametrize(('episodes', 'within', 'cells'), [
+    ([record([0.0, 0.5, 9.9, 10.0], [100.0, 105.0, 199.0, 200.0]),
+      record([0.2, 5.0], [101.0, 150.0])], BOX, [[0, 0], [5, 5], [9, 9]]),
+    # outside counts for the border
+    ([record([-3.0, 40.0], [90.0, 150.0])], BOX, [[0, 0], [9, 5]]),
+    ([HELD], BOX, [[0, 0], [0, 9]]),
+    ([TWO_STATES], box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0]), [[0, 9, 3], [5, 4, 3]])])
+def test_visited_cells_and_their_share_of_all(episodes, within, cells):
+    assert visited_cells(episodes, within).tolist() == cells
+    shares = coverage(episodes, within)
+    if len(cells[0]) == 2:
+        assert shares == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
+    else:
+        # no two of these cells share a pair of states, or of a state and the input
+        assert shares == dict.fromkeys([('x1', 'x2'), ('x1', 'u1'), ('x2', 'u1')], 0.02)
+
+
+def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
+    """Its nominal point is found in the data; B is known here, in 1/s."""
+    rate = float(reactor(0.8).B[0, 0]) / 60.0
+    retrained = retrain(small(
+        bag, tmp_path / 'first.safetensors', '', plant='jacket',
+        input_gain={'temperature': {'coolant_temperature': rate}}))
+    assert retrained.reasons == ()
+    assert retrained.present is None
+    model = load(retrained.model_file)
+    assert (model.provenance.plant, model.time_unit) == ('jacket', 's')
+    assert [(box.names, box.units) for box in (model.states, model.inputs)] == [
+        ((signal.name,), (signal.unit,)) for signal in (*STATES, *INPUTS)]
+    # in the middle of the data, and held there by its nominal input, but for 0.01 K/s
+    middle = 0.5 * (model.states.lower + model.states.upper)
+    np.testing.assert_allclose(model.states.center, middle, atol=0.1 * model.states.scale[0])
+    drift = reactor(0.8).derivative(model.states.center, model.inputs.center) / 60.0
+    assert abs(drift[0]) < 0.01
+    # compared with a linear model alone, in figures and on the page
+    figures = retrained.summary()
+    assert figures['heldout_error_of_present_lift'] is None
+    assert figures['heldout_error']['temperature'] < 0.9 * figures[
+        'heldout_error_of_linear_model']['temperature']
+    assert 'present model' not in page_of(retrained)
+
+
+def test_input_gain_of_a_first_lift_names_its_signals(bag, tmp_path):
+    with pytest.raises(ValueError, match='names steam acting on temperature: the lift has the st'):
+        retrain(small(bag, tmp_path / 'new.safetensors', '',
+                      input_gain={'temperature': {'steam': 1.0}}))

@@ -1,0 +1,252 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Retraining with two states and two inputs from a bag; the input as measured or as commanded."""
+
+from dataclasses import asdict, replace
+from functools import partial
+import importlib
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
+from koopman_ros.execution.training import constant_lines, scalars
+from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning import retrain, TrainingTask, write_report
+from koopman_ros.learning.identification import identify, identify_unmeasured
+from koopman_ros.learning.task import known
+from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
+from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
+from koopman_ros.plants.library.two_tanks import TwoTanks
+from koopman_ros.units import NANOSECONDS as SECOND
+from koopman_ros.wire import Place
+from support.known_plants import methods
+from support.quick_retraining import page_of, quick_retraining
+from support.recorded_runs import NOISE, reactor
+
+JOINTS, ARRAY = 'sensor_msgs/msg/JointState', 'std_msgs/msg/Float64MultiArray'
+LEVEL_NOISE = 2e-4  # m
+TANKS = TwoTanks().system()
+RANGE = 0.5 * TANKS.nominal_state, 1.6 * TANKS.nominal_state
+# not in the order of the model
+STATES = tuple(RecordedState(name, 'm', Place('/tanks', JOINTS, f'position[{name}]', 'cm'))
+               for name in ('level_2', 'level_1'))
+INPUTS = tuple(RecordedInput(name, 'V', Place('/pumps', ARRAY, f'data[{k}]', 'mV'))
+               for k, name in ((1, 'pump_2'), (0, 'pump_1')))
+
+
+def write_tanks(path, seconds=1000.0):
+    """Write a quarter of an hour of the tanks under random steps of both pumps, at 1 Hz."""
+    serialize = importlib.import_module('rclpy.serialization').serialize_message
+    joints = importlib.import_module('sensor_msgs.msg').JointState(name=list(TANKS.state_names))
+    pumps = importlib.import_module('std_msgs.msg').Float64MultiArray()
+    design = RandomStepDesign([3.0, 0.0], [9.0, 4.0], *RANGE, (15.0, 45.0), 1.0, rtol=1e-9)
+    run = random_steps(TANKS, design, seconds, 0)
+    x = run.x + LEVEL_NOISE * np.random.default_rng(0).standard_normal(run.x.shape)
+    with BagWriter(path) as writer, warnings.catch_warnings():
+        # The type support imports its generator, whose parser imports a deprecated module.
+        warnings.simplefilter('ignore', DeprecationWarning)
+        writer.add_topic('/tanks', message_definition(JOINTS))
+        writer.add_topic('/pumps', message_definition(ARRAY))
+        for k, u in enumerate(run.u, 1):
+            joints.header.stamp.sec = k
+            joints.position, pumps.data = (100.0 * x[k - 1]).tolist(), (1000.0 * u).tolist()
+            writer.write('/tanks', serialize(joints), k * SECOND)
+            writer.write('/pumps', serialize(pumps), k * SECOND)
+    return path
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return write_tanks(tmp_path_factory.mktemp('bags') / 'run.mcap')
+
+
+@pytest.fixture(scope='module')
+def retrained(bag, tmp_path_factory):
+    """Return what became of a linear model whose pumps are half as strong again."""
+    folder = tmp_path_factory.mktemp('tanks')
+    names = TANKS.state_names, TANKS.input_names
+    boxes = (Coordinates.spanning(names[0], ('m', 'm'), *RANGE, TANKS.nominal_state),
+             Coordinates.spanning(names[1], ('V', 'V'), np.array([3.0, 0.0]),
+                                  np.array([9.0, 4.0]), TANKS.nominal_input))
+    present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), 1.5 * TANKS.B, *boxes,
+                               's', Provenance('two tanks'))
+    save(present, folder / 'present.safetensors')
+    with quick_retraining(128):
+        return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
+                            str(folder / 'present.safetensors'), STATES, INPUTS, coordinates=4,
+                            starts=1))
+
+
+def test_lift_of_two_states_and_two_inputs_is_accepted(retrained):
+    assert retrained.reasons == ()
+    decision = retrained.decision
+    assert decision.warnings == ()
+    assert decision.law_check.loops == decision.law_check.arrived > 100
+    # nothing but noise is left of the drift's error, in either state, and little of the lift's
+    assert decision.drift_rmse == pytest.approx([LEVEL_NOISE] * 2, rel=0.1)
+    assert np.all(decision.rmse < 2.0 * LEVEL_NOISE)
+    assert np.all(decision.current_rmse > 10.0 * decision.rmse)
+    assert (retrained.account.measurements, retrained.account.used) == (2000, 2000)
+    model = load(retrained.model_file)
+    assert (model.states.names, model.inputs.names) == (TANKS.state_names, TANKS.input_names)
+    rng = np.random.default_rng(1)
+    x = TANKS.nominal_state * rng.uniform(0.8, 1.3, (50, 2))
+    u = rng.uniform([4.0, 1.0], [8.0, 3.0], (50, 2))
+    rate = model.states.scale * (model.drift(model.states.to_deviation(x))
+                                 + model.inputs.to_deviation(u) @ model.B.T)
+    true = TANKS.derivative(x, u)
+    assert np.max(np.abs(rate - true)) < 0.05 * np.max(np.abs(true))
+
+
+def test_summary_and_report_name_the_signals(retrained):
+    files = write_report(retrained)
+    figures = json.loads(files[0].read_text())
+    gains = [[figures['input_gain'][x][u] for u in TANKS.input_names] for x in TANKS.state_names]
+    assert np.array(gains) == pytest.approx(TANKS.B, abs=0.01 * TANKS.B[0, 0])
+    assert figures['units'] == {'level_1': 'm', 'level_2': 'm', 'pump_1': 'V', 'pump_2': 'V'}
+    assert figures['noise'] == dict.fromkeys(
+        TANKS.state_names, pytest.approx(LEVEL_NOISE, rel=0.1))
+    assert list(figures['heldout_error'].values()) == retrained.decision.rmse.tolist()
+    assert len(figures['coverage']) == 6
+    # fifty steps of both at once
+    assert 0.25 < figures['coverage']['pump_1, pump_2'] < 0.5
+    metrics = load(retrained.model_file).provenance.metrics
+    assert metrics['noise_level_2'] == figures['noise']['level_2']
+    page = files[1].read_text()
+    for words in ('noise of level_2 from sample to sample', '% of the cells of level_1 and pump_2',
+                  '| prediction by | error of level_1 [m] | error of level_2 [m] |'):
+        assert words in page
+    assert files[2].read_bytes().startswith(b'\x89PNG')
+
+
+# An actuator with a lag.
+
+
+@pytest.fixture(scope='module')
+def lagging():
+    """Return twenty minutes of the reactor behind a lag of 10 s: x, input and command, at 1 s."""
+    system, rng = reactor(), np.random.default_rng(0)
+    process = Process(system, 0, system.nominal_state, system.nominal_input, Actuator(lag=10.0))
+    rows, left, level = [], 0, 0.0
+    for k in range(1200):
+        process = process.until(k * SECOND)
+        if left == 0:
+            left, level = int(rng.integers(30, 120)), rng.uniform(281.33, 300.55)
+        # held in the range in which the reactor is safe
+        level = 281.33 if process.x[0] > 324.0 else 300.55 if process.x[0] < 307.0 else level
+        rows.append((process.x[0], process.u[0], level))
+        process, left = process.commanded(np.array([level]), k * SECOND), left - 1
+    return system, np.array(rows)
+
+
+def learned_errors(lagging, measured):
+    """Return relative error of B and largest error of the drift [K/min], learned from an input."""
+    system, rows = lagging
+    x = rows[:, :1] + NOISE * np.random.default_rng(1).standard_normal((len(rows), 1))
+    minutes = np.arange(len(rows)) / 60.0
+    episode = Episode(minutes, x, minutes, rows[:, 1:2] if measured else rows[:, 2:],
+                      (True,) if measured else ())
+    plant = Plant('reactor', ('temperature',), ('K',), ('coolant',), ('K',), 'min',
+                  system.nominal_state, system.nominal_input, None)
+    found = identify(plant, [episode], degrees=(1, 3), methods=methods(40)).drift
+    states = np.linspace(308.0, 320.0, 25)[:, None]
+    u = np.full((25, 1), 288.0)
+    error = np.max(np.abs(found.rate(states, u) - system.derivative(states, u)))
+    return found.input_matrix[0, 0] / system.B[0, 0] - 1.0, error
+
+
+def test_measured_input_tells_what_the_command_hides(lagging):
+    gain, drift = learned_errors(lagging, measured=True)
+    # of rates up to 15 K/min
+    assert abs(gain) < 0.01
+    assert drift < 0.3
+    # to the command the plant seems sluggish
+    gain, drift = learned_errors(lagging, measured=False)
+    assert -0.4 < gain < -0.2
+    assert drift > 3.0
+
+
+def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monkeypatch):
+    """Tank 1 flows into tank 2, so that what it holds shows there."""
+    monkeypatch.setattr(task_module, 'identify_unmeasured',
+                        partial(identify_unmeasured, highest_degree=2))
+    found = retrain(TrainingTask((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1],
+                                 INPUTS, model_class='polynomial', hidden_states=1))
+    assert found.reasons == ()
+    assert not any('hidden_1' in warning for warning in found.decision.warnings)
+    model = load(found.model_file)
+    assert model.states.names == ('level_2', 'hidden_1')
+    assert model.states.units == ('m', '1')
+    modes = np.linalg.eigvals(model.drift_jacobian(np.zeros(2))).real
+    truth = np.linalg.eigvals(TANKS.drift_jacobian(TANKS.nominal_state)).real
+    assert np.sort(modes) == pytest.approx(np.sort(truth), rel=0.25)
+    assert found.decision.rmse[0] < 2.0 * LEVEL_NOISE
+    page = page_of(found)
+    assert 'of the next measurement foreseen' in page
+    assert 'innovations form, 1 state not measured' in page
+
+
+@pytest.fixture(scope='module')
+def by_equations(tmp_path_factory):
+    """Return what the equations make of eight minutes of the lower level alone."""
+    folder = tmp_path_factory.mktemp('equations')
+    task = TrainingTask((str(write_tanks(folder / 'run.mcap', 500.0)),),
+                        str(folder / 'new.safetensors'), '', STATES[:1], INPUTS,
+                        model_class='polynomial', equations='two_tanks',
+                        constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
+    # as the process that retrains is given it
+    return retrain(TrainingTask.from_json(json.dumps(asdict(task))))
+
+
+def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
+    found = by_equations.found
+    assert found.hidden == 1
+    model = load(by_equations.model_file)
+    assert (model.states.names, model.states.units) == (('level_2', 'level_1'), ('m', 'm'))
+    assert model.provenance.method == 'output error, equations of TwoTanks'
+    x, u = TANKS.nominal_state, TANKS.nominal_input
+    assert found.drift.rate(x[::-1], u[::-1]) == pytest.approx([0.0, 0.0], abs=2e-5)
+
+
+def test_constants_are_in_summary_report_and_diagnostics(by_equations):
+    figures = by_equations.summary()
+    assert figures['drift'] == 'equations of TwoTanks'
+    assert set(figures['constants']) == {'orifice_1', 'pump_gain'}
+    own = TwoTanks()
+    for name, one in figures['constants'].items():
+        assert one['standing'] == 'estimated'
+        assert abs(one['value'] - getattr(own, name)) < 3.5 * one['standard_error']
+        assert scalars(figures)[f'constant {name}'] == one['text']
+    assert constant_lines(figures)['orifice_1'].endswith('m^2')
+    page = page_of(by_equations)
+    for words in ('| constant | unit | estimate | standard error |', '| pump_gain | m^3/(s V) |',
+                  'of the next measurement foreseen'):
+        assert words in page
+
+
+@pytest.mark.parametrize(('given', 'words'), [
+    ({'equations': 'two_tanks', 'hidden_states': 1}, 'set hidden_states to 0'),
+    ({'equations': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
+    ({'constants': {'orifice_1': None}}, 'constants name orifice_1, but there are no equations')])
+def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        known(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)
+
+
+def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
+    boxes = (Coordinates.spanning(TANKS.state_names, ('m', 'm'), *RANGE, TANKS.nominal_state),
+             Coordinates.spanning(TANKS.input_names, ('V', 'V'), np.array([3.0, 0.0]),
+                                  np.array([9.0, 4.0]), TANKS.nominal_input))
+    present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), TANKS.B, *boxes, 's',
+                               Provenance('two tanks'))
+    task = TrainingTask((), '', 'present', STATES[:1], INPUTS)
+    plant, states, inputs = known(replace(task, equations='two_tanks'), present)
+    assert plant.state_names == tuple(state.name for state in states) == ('level_2',)
+    assert plant.input_names == tuple(one.name for one in inputs) == TANKS.input_names
+    with pytest.raises(ValueError, match=r'has the states level_1 \[m\], level_2 \[m\]'):
+        known(task, present)

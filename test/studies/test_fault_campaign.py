@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The fault campaign: its judge, its alterations, cases across real processes, its report."""
+
+from dataclasses import replace
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from koopman_ros.reasons import Code
+from koopman_ros.replay.records import parse
+from studies.faults import interceptor
+from studies.faults.__main__ import main
+from studies.faults.case import Case, Command, Status, Trace
+from studies.faults.cases import CASES
+from studies.faults.endurance import run_endurance
+from studies.faults.harness import FaultHarness, run
+from studies.faults.interceptor import Packet
+from studies.faults.judge import judge, out_of_range, responses
+from studies.faults.plants import QUADRUPLE_TANK
+from studies.faults.processes import second_controller
+from studies.faults.report import write
+from support.recorded_runs import Recorded, STEADY
+
+# the type support's parser imports a module that Python deprecated
+pytestmark = pytest.mark.filterwarnings('ignore::DeprecationWarning')
+
+CASE = Case('test', 'test', '', lambda _: None, recovery=50.0,
+            says=('^controller: control: .*frozen',))
+BEGIN, END = 50, 60
+CONTROL, RECORDING = 'controller: control', 'trainer: recording'
+
+
+def trace(temperature: Any = lambda t: 47.0 if BEGIN <= t < END + 20 else 46.0,
+          coolant: Any = lambda t: 20.0 + 0.01 * t, **changes: Any) -> Trace:
+    """Return a trace that keeps to the bounds: 1 K off until 20 s after the fault."""
+    return replace(Trace(
+        samples=[(float(t), (temperature(t),)) for t in range(200)],
+        setpoints=[(0.0, (46.0,))], begin=float(BEGIN), end=float(END),
+        statuses=[Status(55.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
+                  Status(70.0, CONTROL, 0, 'automatic', {})],
+        commands=[Command(float(t), (coolant(t),), t) for t in range(200)]), **changes)
+
+
+def reasons(found: Trace, **bounds: Any) -> str:
+    return '; '.join(judge(found, replace(CASE, **bounds))['reasons'])
+
+
+def test_figures_of_a_survived_case() -> None:
+    assert judge(trace(), CASE) == {
+        'survived': True, 'reasons': [], 'unit': 'K', 'input_unit': 'K', 'worst_error': 1.0,
+        'worst_step': 0.01, 'time_to_recover_s': 20.0, 'offset_at_the_end': 0.0}
+
+
+@pytest.mark.parametrize(('found', 'bounds', 'words'), [
+    (trace(), {'bump': 0.001}, 'stepped by 0.01 K after the fault'),
+    (trace(), {'worst': 0.9}, '1 K from the set-point'),
+    (trace(lambda t: 46.0 if t < BEGIN else 46.02), {'offset': 0.01}, 'offset of 0.02 K'),
+    (trace(lambda t: 47.0 if BEGIN <= t < END + 51 else 46.0), {}, 'back only after 51 s'),
+    (trace(lambda t: 46.0 if t < BEGIN else 46.4), {}, 'not back'),
+    *((trace(coolant=lambda t, value=value: value if t == 100 else 20.0), {}, 'is not within')
+      for value in (4.9, 32.1, math.nan, math.inf)),
+    (trace(coolant=lambda t: 20.0 if t < 100 else 25.0), {}, 'stepped by 5 K at 100 s'),
+    (trace(commands=[]), {}, 'never commanded'),
+    (trace(end=math.inf), {}, 'not back'),
+    (trace(begin=math.inf), {}, 'nothing was measured'),
+    (trace(samples=[*trace().samples, (200.0, (61.0,)), (201.0, (46.0,))]), {}, 'lost from 60'),
+    (trace(complaints=['ended with code -6']), {}, 'code -6'),
+    # before the fault, or by another node
+    (trace(statuses=[Status(10.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
+                     Status(56.0, 'plant: simulation', 0, 'frozen', {})]), {}, 'never said'),
+    (trace(statuses=[*trace().statuses, Status(150.0, RECORDING, 2, 'the disk is full', {})]), {},
+     'still say ERROR'),
+    (trace(records=[(60.0, '{}')]), {}, 'cannot be replayed')])
+def test_a_missed_bound_is_a_reason(found: Trace, bounds: dict[str, Any], words: str) -> None:
+    assert words in reasons(found, **bounds)
+
+
+def test_steps_count_from_the_applied_input_and_from_missed_measurements() -> None:
+    found = trace(coolant=lambda t: 20.0 if t < 100 else 25.0)
+    found.applied[100] = {'coolant_temperature': 24.8}
+    assert not reasons(found)
+    assert judge(found, CASE)['worst_step'] == 0.2
+    for missed, step, allowed in ((1, 2.0, True), (1, 2.1, False), (9, 3.1, False)):
+        found = trace(coolant=lambda t, step=step: 20.0 if t < 100 else 20.0 + step)
+        del found.commands[100 - missed:100]
+        assert bool(reasons(found)) is not allowed
+
+
+def test_commands_must_follow_from_the_records_which_give_the_reason() -> None:
+    controller = Recorded()
+    for k in range(5):
+        controller.measure(STEADY + 0.1 * k)
+    controller.measure(math.nan)
+    found = trace(records=[(60.0, text) for text in controller.texts])
+    assert not reasons(found, code=Code.NOT_FINITE)
+    assert 'no record gives the reason' in reasons(found, code=Code.FROZEN)
+    altered = parse(controller.texts[3])
+    altered.fields['command'][0] += 1e-12
+    found.records[3] = 60.0, altered.text()
+    assert 'do not follow' in reasons(found)
+    del found.records[3]
+    assert 'are missing' in reasons(found)
+
+
+@pytest.mark.parametrize(('delivered', 'answers', 'expected'), [
+    ([1, 2, 2, 3], [1, 2, 2, 3], (4, 4, 0, 0, 0, 0)),
+    ([1, 2, 3], [1, 3], (3, 2, 1, 0, 0, 0)),
+    ([1, 2, 3], [1, 2, 2, 3], (3, 2, 0, 1, 0, 0)),
+    ([1, 2, 3], [1, 2, 3, 4], (3, 3, 0, 0, 1, 0)),
+    ([1, 2, 3], [2, 1, 3], (3, 3, 0, 0, 0, 1))])
+def test_responses_are_counted(
+        delivered: list[int], answers: list[int], expected: tuple[int, ...]) -> None:
+    assert tuple(responses(delivered, answers).values()) == expected
+
+
+VALUES = [5, 6, 7, 8]
+SENT = [Packet(k * 1_000_000_000, {'x': float(k)}) for k in VALUES]
+BOTH = Packet(7, {'x': 1.0, 'y': 2.0})
+
+
+@pytest.mark.parametrize(('alter', 'values'), [
+    (interceptor.frozen(), [5] * 4),
+    (interceptor.value(lambda seconds, shown: shown + 10.0 * seconds), [5, 16, 27, 38]),
+    (interceptor.lost(), []), (interceptor.lost(0.0), VALUES),
+    (interceptor.twice, [5, 5, 6, 6, 7, 7, 8, 8]), (interceptor.swapped(), [6, 5, 8, 7]),
+    (interceptor.delayed(2), [5, 6])])
+def test_alterations(alter: interceptor.Alteration, values: list[int]) -> None:
+    assert [packet.values['x'] for sent in SENT for packet in alter(sent)] == values
+
+
+@pytest.mark.parametrize(('alter', 'arriving'), [
+    # in one message where the stamp is the same
+    (interceptor.value(lambda *_: 5.0), [BOTH._replace(values={'x': 1.0, 'y': 5.0})]),
+    (interceptor.lost(), [Packet(7, {'x': 1.0})]),
+    (interceptor.twice, [BOTH, Packet(7, {'y': 2.0})]),
+    (interceptor.stamped(lambda stamp_ns: stamp_ns - 2),
+     [Packet(7, {'x': 1.0}), Packet(5, {'y': 2.0})])])
+def test_alterations_of_one_of_two_signals(
+        alter: interceptor.Alteration, arriving: list[Packet]) -> None:
+    assert interceptor.part(alter, 'y')(BOTH) == arriving
+
+
+def test_distances_and_steps_of_several_signals_are_the_largest() -> None:
+    """Of tanks whose levels 3 and 4 have no set-point."""
+    found = Trace(QUADRUPLE_TANK, samples=[(float(t), (0.15, 0.11, t, t)) for t in range(3)],
+                  setpoints=[(0.0, (0.15, 0.1))],
+                  commands=[Command(0.0, (3.0, 3.0), 0), Command(1.0, (3.1, 10.5), 1)])
+    np.testing.assert_allclose(found.errors()[1], 0.01)
+    np.testing.assert_allclose(found.steps()[1], 7.5)
+    assert 'pump_2' in ''.join(out_of_range(found))
+
+
+def test_faults_of_messages_models_and_processes_are_survived(tmp_path: Path) -> None:
+    """One case of each, in turn in one loop."""
+    nan, garbage, killed = (
+        CASES[name] for name in ('nan-short', 'model-garbage', 'controller-killed'))
+
+    def play(loop: FaultHarness) -> None:
+        for case in (nan, garbage, killed):
+            case.play(loop)
+            loop.run_for(20.0)
+        loop.trace.begin = nan.settle
+
+    result, _ = run(replace(
+        nan, play=play, says=garbage.says, bump=killed.bump, plant=killed.plant,
+        afterwards=60.0, recovery=60.0), tmp_path)
+    assert result['reasons'] == []
+
+
+def test_a_bad_signal_of_two_and_a_second_controller_are_survived(tmp_path: Path) -> None:
+    case = CASES['two_tanks-nan-one']
+
+    def play(loop: FaultHarness) -> None:
+        second_controller(loop, says=('^controller: control: 2 nodes command the pump_1',))
+        loop.run_for(20.0)
+        case.play(loop)
+
+    result, _ = run(replace(
+        # as fast as it can, it would work on while the second one starts
+        case, play=play, largest_step=math.inf, plant={**case.plant, 'speed': 20.0},
+        settle=60.0, afterwards=60.0), tmp_path)
+    assert result['reasons'] == []
+
+
+def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_path: Path) -> None:
+    case = replace(CASES['saddle-solver-missing'], play=CASES['saddle-lost'].play, between=True,
+                   settle=15.0, afterwards=30.0, recovery=0.0, largest_step=2.0)
+    result, found = run(case, tmp_path)
+    assert result['reasons'] == []
+    # with the solver the law would have planned
+    assert judge(found, replace(case, missing=()))['reasons'] != []
+
+
+def test_a_case_that_is_not_survived(tmp_path: Path) -> None:
+    """A process that dies, words that nobody reports, and a reactor that stays away."""
+    def play(loop: FaultHarness) -> None:
+        with loop.fault():
+            pass
+        loop.request(53.0)
+        loop.processes['controller'].process.kill()
+
+    result, _ = run(Case('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
+                         says=('nobody says this',)), tmp_path)
+    found = '; '.join(result['reasons'])
+    for words in ('ended early, with code -9', 'not back', 'never said "nobody says this"'):
+        assert words in found
+
+
+def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
+    found = run_endurance(tmp_path / 'soak', lambda: None, hours=0.03)
+    assert found['reasons'] == []
+    assert found['answers']['measurements'] > 100
+    assert set(found['recorded'].values()) == {found['answers']['answered']}
+
+
+def test_report_and_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = {'plant': 'reactor', 'group': 'sensor', 'does': 'NaN', 'notes': ['a note'],
+            'survived': True, 'reasons': [], 'worst_error': 1.0, 'worst_step': 0.5,
+            'time_to_recover_s': 20.0, 'offset_at_the_end': 0.0, 'wall_seconds': 2.0}
+    bad = {**good, 'survived': False, 'reasons': ['not back'], 'time_to_recover_s': math.inf}
+    skipped = {'plant': 'two_tanks', 'group': 'processes', 'does': 'full', 'notes': [],
+               'survived': False, 'skipped': 'no disk'}
+    assert not write(tmp_path, {'nan-short': good, 'bias': bad, 'disk-full': skipped})
+    text = (tmp_path / 'report.md').read_text()
+    for words in ('1 of 3 cases survived, 1 skipped', '## two_tanks: processes',
+                  '**bias**: not back', 'skipped: no disk', 'a note'):
+        assert words in text
+    assert json.loads((tmp_path / 'summary.json').read_text())['results']['bias'][
+        'time_to_recover_s'] is None
+    assert write(tmp_path, {'good': good, 'skipped': skipped})
+    assert len(CASES) == 167
+    assert main(['sensor', 'feed-warm', '--list']) == 0
+    assert 'nan-short' in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(['no-such-case'])
