@@ -225,9 +225,9 @@ class PanelNode(LoopNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {item.key: item.value for item in status.values}
-            self.view.take_status(status.name, status.level[0], status.message, values,
+            self.view.conditions.take_status(status.name, status.level[0], status.message, values,
                                   time.time(), status.hardware_id)
-            name = self.view.task(status.name)
+            name = self.view.conditions.task(status.name)
             if name == REQUESTS:
                 self._requests.take_status(status.message)
             elif name == TRAINING:
@@ -286,7 +286,7 @@ class PanelNode(LoopNode):
                 self.get_logger().error(
                     f'alarms are not written to {self.settings.alarm_file}: {error}',
                     throttle_duration_sec=60.0)
-        self.diagnostics.hardware_id = self.view.plant or self.settings.system
+        self.diagnostics.hardware_id = self.view.conditions.plant or self.settings.system
         self._requests.advance(time.monotonic())
         self._watch.advance()
         self.snapshot = self.view.snapshot(now)

@@ -79,7 +79,7 @@ class _Row:
         self._page, self._node, self._parameter = page, node, parameter
         self._text = ''
         unit = f' [{parameter.unit}]' if parameter.unit else ''
-        notes = [parameter.meaning, _range(parameter),
+        notes = [parameter.meaning.rstrip('.'), _range(parameter),
                  'fixed at start' if parameter.read_only else '']
         with attribute(box('parameter'), 'data-parameter', parameter.name):
             with box(''):

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
@@ -13,21 +12,16 @@ import re
 from types import MappingProxyType
 from typing import Any
 
-from koopman_ros.panel.alarms import Alarms, Priority
+from koopman_ros.panel.conditions import Conditions
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
-from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
-    ERROR,
     OK,
     PLANT,
-    REQUESTS,
     ROLES,
-    Silence,
     Snapshot,
     TaskStatus,
-    TRAINER,
 )
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.description import ParameterDescription
@@ -36,13 +30,7 @@ from koopman_ros.reasons import level_words
 from koopman_ros.resources import predecessor
 from koopman_ros.units import conversion, display_unit, printed
 
-_SILENT = 3.5  # s without a status, of which there is one per second
-_PERIODS = 5.0  # usual times between two measurements without one
 _BACK = 1.0  # s; a stamp that is earlier by more restarts the time
-_MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
-_MAX_NAME = 200  # characters
-# So many errors within so many seconds are an alarm, however short each of them is.
-_REPEATED, _WITHIN = 5, 60.0
 _SIGNAL = re.compile(r'(?:(estimated|deviation)_)?(\w+) \[(.+)\]')
 _LIMIT = re.compile(r'at_(range|rate|limit)_(\w+) \[')
 _OF_LIMITS: Mapping[tuple[str, float], str] = {
@@ -68,9 +56,9 @@ class LoopViewModel:
     def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float,
                  nodes: Mapping[str, str] = ROLES) -> None:
         self.signals, self.read = signals, read
-        self.alarms, self.trends = Alarms(), Trends(span)
-        self.plant = ''
-        self._nodes, self._span, self._start = dict(nodes), span, now
+        self.conditions, self.trends = Conditions(nodes, now), Trends(span)
+        self.alarms = self.conditions.alarms
+        self._span = span
         self._states = {name: SignalValues(name, unit, read[name])
                         for name, unit in signals.states.items()}
         self._inputs = {name: SignalValues(name, unit, read[name])
@@ -79,14 +67,8 @@ class LoopViewModel:
         self._time = math.nan
         self._unplanned = 0
         self._mode = self._level = ''
-        self._statuses: dict[str, TaskStatus] = {}
-        # wall time and message of the last changes to ERROR, by task
-        self._errors: dict[str, deque[tuple[float, str]]] = {}
         self._estimates: tuple[tuple[str, str], ...] = ()
         self._parameters: dict[str, Mapping[str, ParameterDescription]] = {}
-        self._last: dict[str, float] = {}  # wall time of the last message, by role
-        self._period = 0.0
-        self._watched = [CONTROLLER, PLANT]
         self._marked = now  # time of the last alarm that is a mark in the trends
         self._about: Mapping[str, str] = MappingProxyType({})
         self._previous_model = self._digest = ''
@@ -113,10 +95,8 @@ class LoopViewModel:
         if stamp < self._time - _BACK:
             # a simulation has restarted
             self.trends.rewind(stamp)
-        last = self._last.get(PLANT)
-        if last is not None and now > last:
-            self._period = min(0.9 * (self._period or now - last) + 0.1 * (now - last), 600.0)
-        self._last[PLANT], self._time = now, stamp
+        self.conditions.take_message(PLANT, now)
+        self._time = stamp
 
     def _draw(self, name: str, stamp: float, value: float) -> None:
         # not before the first measurement, nor from before a restart of the time
@@ -174,7 +154,7 @@ class LoopViewModel:
 
     def take_record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
         """Take a record of the controller's event log; a malformed one is ignored."""
-        self._last[CONTROLLER] = now
+        self.conditions.take_message(CONTROLLER, now)
         try:
             self._take_event(event, fields)
         except (AttributeError, KeyError, TypeError, ValueError):
@@ -225,46 +205,6 @@ class LoopViewModel:
         if not math.isnan(self._time):
             self.trends.mark(self._time, kind, text)
 
-    def task(self, name: str) -> str:
-        """
-        Return ``<role>: <task>`` for a status of a node of this loop.
-
-        The name of another node is returned as it is, but '' for a node of another loop: one with
-        the base name of a role in another namespace.
-        """
-        node, _, task = name.partition(': ')
-        role = self._nodes.get(node)
-        if role is not None:
-            return f'{role}: {task}'
-        return '' if node.rsplit('/', 1)[-1] in self._nodes.values() else name
-
-    def take_status(self, name: str, level: int, message: str, values: Mapping[str, str],
-                    now: float, plant: str = '') -> None:
-        """Take the status of a task; WARN and ERROR raise an alarm."""
-        role = self._nodes.get(name.partition(': ')[0])
-        name = sanitize_text(self.task(name), _MAX_NAME)
-        # other nodes cannot crowd out the loop's
-        alike = [task for task in self._statuses
-                 if (task.partition(':')[0] in ROLES) is (role is not None)]
-        if not name or (name not in alike and len(alike) >= _MAX_TASKS):
-            return
-        if role in (CONTROLLER, TRAINER):
-            self._last[role] = now
-            if role not in self._watched:
-                self._watched.append(role)
-        if role in (PLANT, CONTROLLER):
-            self.plant = plant or self.plant
-        before = self._statuses.get(name)
-        self._statuses[name] = TaskStatus(name, level, message, dict(values))
-        if level >= ERROR and (before is None or before.level < ERROR):
-            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append((now, message))
-        # a refused request is shown to its operator
-        priority = Priority.HIGH if level >= ERROR else (
-            Priority.MEDIUM if role == CONTROLLER and name != REQUESTS else Priority.LOW)
-        # a warning that the control task repeats has a task and an alarm of its own
-        repeated = level < ERROR and values.get('condition', 'control') != 'control'
-        self.alarms.report(name, level > OK and not repeated, priority, f'{name}: {message}', now)
-
     def take_parameters(self, role: str, values: Mapping[str, ParameterDescription]) -> None:
         """Take all parameters of a node; none if it is gone."""
         before = self._parameters.get(role, {}).get('model')
@@ -288,44 +228,25 @@ class LoopViewModel:
     # Snapshots.
 
     def advance(self, now: float) -> None:
-        """Raise the alarms of silence and of repeated errors, and let delays run out."""
-        silent = {silence.role for silence in self._silences(now)}
-        for name, errors in self._errors.items():
-            often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
-            self.alarms.report(
-                f'{name}, repeated errors', often, Priority.HIGH, f'{name}: at least {_REPEATED} '
-                f'errors within {_WITHIN:g} s, the last: {errors[-1][1]}', now)
-        for role in self._watched:
-            text = 'no measurement' if role == PLANT else f'no message from the {role}'
-            self.alarms.report(f'silence of {role}', role in silent,
-                               Priority.LOW if role == TRAINER else Priority.HIGH, text, now)
-        self.alarms.advance(now)
+        """Let time pass: raise alarms, and mark them in the trends."""
+        self.conditions.advance(now)
         raised = [entry for entry in self.alarms.journal(self._marked)
                   if entry.what == 'raised' and entry.time > self._marked]
         for entry in reversed(raised):
             self._mark('alarm', entry.text)
             self._marked = entry.time
 
-    def _silences(self, now: float) -> tuple[Silence, ...]:
-        found = []
-        for role in self._watched:
-            patience = max(_SILENT, _PERIODS * self._period) if role == PLANT else _SILENT
-            last = self._last.get(role, self._start)
-            if now - last > patience:
-                found.append(Silence(role, last, role in self._last))
-        return tuple(found)
-
     def snapshot(self, now: float) -> Snapshot:
         """Return the state at this instant."""
-        silences = self._silences(now)
+        silences = self.conditions.silences(now)
         no_plant, no_controller = (any(one.role == role for one in silences)
                                    for role in (PLANT, CONTROLLER))
-        control = self._statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
+        control = self.conditions.statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
         levels = self._parameters.get(CONTROLLER, {}).get('levels')
         best = str(levels.value[0]) if levels else 'sdre'
         reason = control.values.get('reason', 'none')
         return Snapshot(
-            plant=self.plant, wall=now, time=self._time,
+            plant=self.conditions.plant, wall=now, time=self._time,
             mode='' if no_controller else self._mode,
             level='' if no_controller else level_words(self._level),
             fallback=bool(self._level) and self._level not in (best, 'manual'),
@@ -335,7 +256,7 @@ class LoopViewModel:
                          for name, own in self._states.items()),
             inputs=tuple(own.input(self._bounds(own), no_controller)
                          for own in self._inputs.values()),
-            estimates=self._estimates, statuses=MappingProxyType(dict(self._statuses)),
+            estimates=self._estimates, statuses=MappingProxyType(dict(self.conditions.statuses)),
             standing=self.alarms.standing, shelved=self.alarms.shelved, silences=silences,
             parameters=MappingProxyType(dict(self._parameters)), model=self._about,
             previous_model=self._previous_model)

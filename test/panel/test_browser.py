@@ -188,7 +188,7 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         assert site.plant.stop() == 0
         site.plant = ros.start('plant', {'speed': 10.0, 'start_time': 20_000.0})
         press(training, 'Train')
-        expect(training).to_contain_text('is accepted')
+        expect(training).to_contain_text('is accepted', timeout=5.0 * PATIENCE)
         report = card(page, 'Report')
         expect(report).to_contain_text('The new model is accepted.')
         expect(report.locator('img.picture')).to_be_visible()

@@ -64,6 +64,10 @@ def answered(own: LoopViewModel, level: str = 'sdre', mode: str = 'automatic', w
     own.take_record('measurement', {'mode': mode, 'level': level}, wall)
 
 
+def status(own: LoopViewModel, *given: Any) -> None:
+    own.conditions.take_status(*given)
+
+
 # Faceplates.
 
 
@@ -159,15 +163,6 @@ def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
     assert now.states[0].span[1] >= 60.0
 
 
-def test_the_first_of_the_levels_is_no_fallback() -> None:
-    for levels, fallback in ((('mpc', 'sdre'), True), (('sdre', 'linear'), False), (None, False)):
-        own = view()
-        if levels:
-            own.take_parameters('controller', {'levels': parameter('levels', levels)})
-        own.take_record('measurement', {'mode': 'automatic', 'level': 'sdre'}, NOW)
-        assert own.snapshot(NOW).fallback is fallback
-
-
 def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
     own = view()
     own.take_parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})
@@ -228,7 +223,7 @@ def test_a_snapshot_stays_what_it_was() -> None:
     before = own.snapshot(NOW)
     held = repr(before)
     measure(own, 60.0, 2.0)
-    own.take_status(CONTROL, ERROR, 'broken', {'a': 'b'}, NOW)
+    status(own, CONTROL, ERROR, 'broken', {'a': 'b'}, NOW)
     own.take_parameters(CONTROLLER, {'a': parameter('a', 1.0)})
     assert repr(before) == held
     with pytest.raises(TypeError):
@@ -238,20 +233,21 @@ def test_a_snapshot_stays_what_it_was() -> None:
 # Levels, silences, alarms and marks.
 
 
-def test_a_fallback_has_its_reason() -> None:
+@pytest.mark.parametrize(('levels', 'level', 'mode', 'reason', 'shown', 'fallback'), [
+    (None, 'sdre', 'automatic', 'none', 'learned law', False),
+    (('mpc', 'sdre'), 'sdre', 'automatic', 'none', 'learned law', True),
+    (('sdre', 'linear'), 'hold', 'automatic', 'the sensor is frozen', 'hold', True),
+    (('sdre', 'linear'), 'manual', 'manual', 'none', 'manual', False)])
+def test_a_fallback_has_its_reason(levels: tuple[str, ...] | None, level: str, mode: str,
+                                   reason: str, shown: str, fallback: bool) -> None:
     own = view()
-    answered(own)
-    own.take_status(CONTROL, OK, 'automatic', {'reason': 'none'}, NOW)
+    if levels:
+        own.take_parameters(CONTROLLER, {'levels': parameter('levels', levels)})
+    answered(own, level, mode)
+    status(own, CONTROL, OK, mode, {'reason': reason}, NOW)
     now = own.snapshot(NOW)
     assert (now.mode, now.level, now.fallback, now.reason) == (
-        'automatic', 'learned law', False, '')
-    answered(own, 'hold')
-    own.take_status(CONTROL, ERROR, 'held: check', {'reason': 'the sensor is frozen'}, NOW)
-    now = own.snapshot(NOW)
-    assert (now.level, now.fallback, now.reason) == ('hold', True, 'the sensor is frozen')
-    answered(own, 'manual', 'manual')
-    now = own.snapshot(NOW)
-    assert (now.mode, now.fallback) == ('manual', False)
+        mode, shown, fallback, '' if reason == 'none' else reason)
 
 
 @pytest.mark.parametrize('fields', [
@@ -274,7 +270,7 @@ def test_a_silence_has_its_node_and_time() -> None:
         (CONTROLLER, NOW, False), (PLANT, NOW, False)]
     for second in range(1, 20):
         measure(own, 50.0, float(second))
-        own.take_status(CONTROL, OK, 'automatic', {}, NOW + second)
+        status(own, CONTROL, OK, 'automatic', {}, NOW + second)
     assert own.snapshot(NOW + 20.0).silences == ()
     (silence,) = (one for one in own.snapshot(NOW + 30.0).silences if one.role == PLANT)
     assert (silence.since, silence.ever) == (NOW + 19.0, True)
@@ -292,9 +288,9 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     own = view()
     measure(own, 50.0, 1.0, NOW)
     for second in range(4):
-        own.take_status(CONTROL, WARN, 'extrapolates', {}, NOW + second)
-        own.take_status('trainer: recording', WARN, 'disk is filling', {}, NOW + second)
-        own.take_status('other', ERROR, 'is down', {}, NOW + second)
+        status(own, CONTROL, WARN, 'extrapolates', {}, NOW + second)
+        status(own, 'trainer: recording', WARN, 'disk is filling', {}, NOW + second)
+        status(own, 'other', ERROR, 'is down', {}, NOW + second)
         own.advance(NOW + second)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 3.0).standing] == [
         ('other', Priority.HIGH), (CONTROL, Priority.MEDIUM), ('trainer: recording', Priority.LOW)]
@@ -317,12 +313,12 @@ def test_nodes_of_another_loop_are_ignored() -> None:
     measure(own, 50.0, 1.0, NOW)
     answered(own)
     own.take_signals('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
-    own.take_status('line_1/controller: control', OK, 'automatic', {'reason': 'none'}, NOW)
-    own.take_status('line_1/trainer: training', OK, 'idle', {'model_file': 'a'}, NOW)
+    status(own, 'line_1/controller: control', OK, 'automatic', {'reason': 'none'}, NOW)
+    status(own, 'line_1/trainer: training', OK, 'idle', {'model_file': 'a'}, NOW)
     for second in range(1, 10):
         for node in ('controller: control', 'trainer: training', 'plant: simulation'):
-            own.take_status(f'line_2/{node}', ERROR, 'of the other line', {}, NOW + second,
-                            'other')
+            status(own, f'line_2/{node}', ERROR, 'of the other line', {}, NOW + second,
+                   'other')
         own.advance(NOW + second)
     now = own.snapshot(NOW + 10.0)
     assert {one.role for one in now.silences} == {CONTROLLER, PLANT, TRAINER}
@@ -330,11 +326,11 @@ def test_nodes_of_another_loop_are_ignored() -> None:
     assert all('other line' not in alarm.text for alarm in now.standing)
     for name, values in ((CONTROL, {'reason': 'none'}),
                          ('trainer: training', {'model_file': 'a'})):
-        status = now.status(name)
-        assert (status.level, status.message, status.values) == (ERROR, LOST, values)
+        task = now.status(name)
+        assert (task.level, task.message, task.values) == (ERROR, LOST, values)
     assert 'last command' in now.inputs[0].abnormal
     # one that is back is shown again
-    own.take_status('line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
+    status(own, 'line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
     now = own.snapshot(NOW + 10.0)
     assert (now.mode, now.status(CONTROL).message) == ('automatic', 'automatic')
     assert now.inputs[0].abnormal == ''
@@ -343,9 +339,9 @@ def test_nodes_of_another_loop_are_ignored() -> None:
 def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     own = view()
     for i in range(200):
-        own.take_status(f'driver_{i}: io', OK, 'ok', {}, NOW)
-    own.take_status(CONTROL, ERROR, 'held', {}, NOW)
-    own.take_status('controller: actuators', WARN, 'stuck', {}, NOW)
+        status(own, f'driver_{i}: io', OK, 'ok', {}, NOW)
+    status(own, CONTROL, ERROR, 'held', {}, NOW)
+    status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     now = own.snapshot(NOW + 2.0)
     assert {alarm.key for alarm in now.standing} == {CONTROL, 'controller: actuators'}
@@ -354,13 +350,13 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
 
 def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     own = view()
-    own.take_status(CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
-    own.take_status(REQUESTS, WARN, 'request refused: a', {}, NOW)
-    own.take_status('controller: actuators', WARN, 'stuck', {}, NOW)
+    status(own, CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
+    status(own, REQUESTS, WARN, 'request refused: a', {}, NOW)
+    status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
         ('controller: actuators', Priority.MEDIUM), (REQUESTS, Priority.LOW)]
-    own.take_status(REQUESTS, OK, 'in order', {}, NOW + 3.0)
+    status(own, REQUESTS, OK, 'in order', {}, NOW + 3.0)
     own.advance(NOW + 9.0)
     assert [alarm.key for alarm in own.snapshot(NOW + 9.0).standing
             if alarm.state is not AlarmState.RETURNED and 'silence' not in alarm.key] == [
@@ -373,7 +369,7 @@ def test_many_short_errors_are_an_alarm() -> None:
         for k in range(2 * errors):
             now = NOW + seconds * k / 2
             measure(own, 50.0, seconds * k / 2 + 1.0, now)
-            own.take_status(CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
+            status(own, CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
             own.advance(now)
         own.advance(now + 1.5)
         return any('repeated' in alarm.key and alarm.text.endswith('the last: held')

@@ -47,7 +47,7 @@ class HostileSource:
                 'done [%]': TEXT}
         for name in ('controller: control', 'trainer: training', 'trainer: recording',
                      'trainer: experiment', *TEXTS):
-            own.take_status(name, ERROR, TEXT, task, NOW, plant=TEXT)
+            own.conditions.take_status(name, ERROR, TEXT, task, NOW, plant=TEXT)
         parameters = {name: ParameterDescription(
             name, value, TEXT, TEXT, TEXT, -math.inf, math.inf, read_only, TEXTS)
                       for name, value, read_only in (
