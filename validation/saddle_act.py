@@ -154,7 +154,7 @@ def _controller_parameters(model: Path) -> dict[str, object]:
     return {
         'system': 'none', 'model': model, 'levels': ['pi'], 'pi.temperature.gain': PI_GAIN,
         'pi.temperature.integral_time': PI_TIME, 'temperature.setpoint_ramp': RAMP,
-        'temperature.noise': NOISE, 'temperature.max': to_celsius(LIMIT_TEMPERATURE),
+        'temperature.noise': NOISE, 'mpc.temperature.max': to_celsius(LIMIT_TEMPERATURE),
         'coolant_temperature.min': to_celsius(float(WIDE.lower[0])),
         'coolant_temperature.max': to_celsius(float(WIDE.upper[0])),
         'coolant_temperature.rate_limit': float(WIDE.rate[0]),
