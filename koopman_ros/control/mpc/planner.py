@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
-from koopman_ros.control.mpc.condensing import condense, roll_out
+from koopman_ros.control.mpc.condensing import condense, drift, roll_out
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.mpc.model_arrays import model_arrays
 from koopman_ros.estimation import Estimate
@@ -75,7 +75,7 @@ class Planner:
         self._rate = limits.rate * model.seconds_per_time_unit / inputs.scale
         self._state_lower, self._state_upper = (
             model.states.to_deviation(bound) for bound in (state_lower, state_upper))
-        self._slope = model.drift_jacobian(np.zeros(model.n_x))
+        self._slope = self._jacobian(np.zeros(model.n_x))
         # the same from sample to sample, mostly
         self._grid, self._cost_to_go = lru_cache(8)(self._new_grid), lru_cache(8)(self._new_cost)
 
@@ -95,8 +95,7 @@ class Planner:
             tuple(target.x.tolist()),
             () if model.input_terms is None else tuple(target.u.tolist()),
             float(grid.lengths[0]))
-        rate = max(_fastest(self._slope), fastest,
-                   _fastest(model.drift_and_jacobian(estimate.x)[1]))
+        rate = max(_fastest(self._slope), fastest, _fastest(self._jacobian(estimate.x)))
         steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
         return Problem(
             estimate.x, estimate.w, target,
@@ -127,7 +126,7 @@ class Planner:
                   ) -> tuple[float, Array]:
         """Return the rate of the fastest mode at a target, and the cost (n_x, n_x) from there."""
         model, x = self._model, np.array(x_ref)
-        A = model.drift_and_jacobian(x)[1]
+        A = self._jacobian(x)
         fastest = _fastest(A)
         if u_ref:
             A = A + model.forcing_jacobian(x, np.array(u_ref))
@@ -135,6 +134,10 @@ class Planner:
         # without a regulator the horizon alone counts
         return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
             self._weights.Q * float(self._grid(sample).lengths[-1]))
+
+    def _jacobian(self, x: Array) -> Array:
+        slope: Array = drift(self._arrays, np.array(x, dtype=np.float64, ndmin=2))[1][0]
+        return slope
 
     def _regulator(self, A: Array, B: Array, sample: float) -> RiccatiSolution:
         return solve_riccati(
