@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
+from koopman_ros.control.mpc import own_drift
 from koopman_ros.control.mpc.condensing import condense, drift, roll_out
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.mpc.model_arrays import model_arrays
@@ -68,7 +69,7 @@ class Planner:
     def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
                  state_upper: Array) -> None:
         self._model, self._tuning, self._weights = model, tuning, weights
-        self._arrays = model_arrays(model)
+        self._arrays, self._own_drift = model_arrays(model), own_drift.has_own_drift(model)
         inputs, limits = model.inputs, tuning.limits
         self._lower = np.maximum(inputs.to_deviation(limits.lower), -_INFINITY)
         self._upper = np.minimum(inputs.to_deviation(limits.upper), _INFINITY)
@@ -136,6 +137,8 @@ class Planner:
             self._weights.Q * float(self._grid(sample).lengths[-1]))
 
     def _jacobian(self, x: Array) -> Array:
+        if self._own_drift:
+            return self._model.drift_jacobian(x)
         slope: Array = drift(self._arrays, np.array(x, dtype=np.float64, ndmin=2))[1][0]
         return slope
 
@@ -191,9 +194,10 @@ class Planner:
         """
         start, w, x_ref, u_ref = (np.ascontiguousarray(value, dtype=np.float64) for value in (
             problem.start, problem.w, problem.target.x, problem.target.u))
-        ends, cost = roll_out(
-            self._arrays, u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps,
-            self._weights.Q, self._weights.R)
+        given = (u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps, self._weights.Q,
+                 self._weights.R)
+        ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
+                      roll_out(self._arrays, *given))
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
             return reason(Code.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
         nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
