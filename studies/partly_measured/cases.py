@@ -144,7 +144,8 @@ class Case:
             'estimator': 'extended_kalman_filter', 'noise': self.noise,
             'wander': self.wander * np.sqrt(60.0),
             'initial_error': self.initial_error,
-            'plugins': {'mpc': MPCParameters(upper=self.state_upper)}, **others})
+            'plugins': {'mpc': MPCParameters(upper=self.state_upper) if len(self.state_upper)
+                        else MPCParameters()}, **others})
 
     def target(self, setpoint: Array, w: Array) -> tuple[Array, Array]:
         """Return the state and the input that hold a set-point (n_c,) under rates w (n_x,)."""

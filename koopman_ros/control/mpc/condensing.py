@@ -123,13 +123,15 @@ def _add_product(C: Array, A: Array, B: Array) -> None:
     """Add A B', of as many rows of A as there are in C."""
     for i in range(C.shape[0]):
         for j in range(C.shape[1]):
+            total = 0.0
             for k in range(A.shape[1]):
-                C[i, j] += A[i, k] * B[j, k]
+                total += A[i, k] * B[j, k]
+            C[i, j] += total
 
 
 @_compiled()
 def _solve(S: Array, X: Array) -> None:
-    """Solve S X = X of a symmetric, definite S (n, n), which is overwritten, by L D L'."""
+    """Solve S X = X by L D L' of a definite S (n, n), whose lower half is overwritten."""
     n, m = X.shape
     for k in range(n):
         for j in range(k):
@@ -180,13 +182,15 @@ def drift(model: ModelArrays, x: Array) -> tuple[Array, Array]:
         _add_product(rates, Z[c], model.A)
         J, rate, of_J = Z[c, 1:], rates[0], rates[1:]
         for i in range(n):
-            solution[i, 0] = 0.0
+            total = 0.0
             for a in range(n_z):
-                solution[i, 0] += J[i, a] * rate[a]
-            for k in range(n):
-                square[i, k] = 0.0
+                total += J[i, a] * rate[a]
+            solution[i, 0] = total
+            for k in range(i + 1):
+                total = 0.0
                 for a in range(n_z):
-                    square[i, k] += J[i, a] * J[k, a]
+                    total += J[i, a] * J[k, a]
+                square[i, k] = total
         _solve(square.copy(), solution)
         for i in range(n):
             f[c, i] = solution[i, 0]
@@ -209,8 +213,10 @@ def drift(model: ModelArrays, x: Array) -> tuple[Array, Array]:
                     slope[c, i, k] += total
         for i in range(n):
             for k in range(n):
+                total = 0.0
                 for a in range(n_z):
-                    slope[c, i, k] += J[i, a] * of_J[k, a]
+                    total += J[i, a] * of_J[k, a]
+                slope[c, i, k] += total
         _solve(square, slope[c])
         for i in range(n):
             for k in range(n):
@@ -257,9 +263,10 @@ def _add_cost(cost: Array, X: Array, x_ref: Array, Q: Array, share: Array) -> No
             E[i, 0] -= x_ref[i]
         for i in range(n):
             for column in range(columns):
-                QE[i, column] = 0.0
+                total = 0.0
                 for k in range(n):
-                    QE[i, column] += share[c] * Q[i, k] * E[k, column]
+                    total += Q[i, k] * E[k, column]
+                QE[i, column] = share[c] * total
         for row in range(columns):
             for i in range(n):
                 for column in range(columns):

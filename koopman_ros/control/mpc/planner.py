@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
-from koopman_ros.control.mpc.condensing import condense, roll_out
+from koopman_ros.control.mpc import own_drift
+from koopman_ros.control.mpc.condensing import condense, drift, roll_out
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.mpc.model_arrays import model_arrays
 from koopman_ros.estimation import Estimate
@@ -68,14 +69,14 @@ class Planner:
     def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
                  state_upper: Array) -> None:
         self._model, self._tuning, self._weights = model, tuning, weights
-        self._arrays = model_arrays(model)
+        self._arrays, self._own_drift = model_arrays(model), own_drift.has_own_drift(model)
         inputs, limits = model.inputs, tuning.limits
         self._lower = np.maximum(inputs.to_deviation(limits.lower), -_INFINITY)
         self._upper = np.minimum(inputs.to_deviation(limits.upper), _INFINITY)
         self._rate = limits.rate * model.seconds_per_time_unit / inputs.scale
         self._state_lower, self._state_upper = (
             model.states.to_deviation(bound) for bound in (state_lower, state_upper))
-        self._slope = model.drift_jacobian(np.zeros(model.n_x))
+        self._slope = self._jacobian(np.zeros(model.n_x))
         # the same from sample to sample, mostly
         self._grid, self._cost_to_go = lru_cache(8)(self._new_grid), lru_cache(8)(self._new_cost)
 
@@ -95,8 +96,7 @@ class Planner:
             tuple(target.x.tolist()),
             () if model.input_terms is None else tuple(target.u.tolist()),
             float(grid.lengths[0]))
-        rate = max(_fastest(self._slope), fastest,
-                   _fastest(model.drift_and_jacobian(estimate.x)[1]))
+        rate = max(_fastest(self._slope), fastest, _fastest(self._jacobian(estimate.x)))
         steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
         return Problem(
             estimate.x, estimate.w, target,
@@ -127,7 +127,7 @@ class Planner:
                   ) -> tuple[float, Array]:
         """Return the rate of the fastest mode at a target, and the cost (n_x, n_x) from there."""
         model, x = self._model, np.array(x_ref)
-        A = model.drift_and_jacobian(x)[1]
+        A = self._jacobian(x)
         fastest = _fastest(A)
         if u_ref:
             A = A + model.forcing_jacobian(x, np.array(u_ref))
@@ -135,6 +135,12 @@ class Planner:
         # without a regulator the horizon alone counts
         return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
             self._weights.Q * float(self._grid(sample).lengths[-1]))
+
+    def _jacobian(self, x: Array) -> Array:
+        if self._own_drift:
+            return self._model.drift_jacobian(x)
+        slope: Array = drift(self._arrays, np.array(x, dtype=np.float64, ndmin=2))[1][0]
+        return slope
 
     def _regulator(self, A: Array, B: Array, sample: float) -> RiccatiSolution:
         return solve_riccati(
@@ -188,9 +194,10 @@ class Planner:
         """
         start, w, x_ref, u_ref = (np.ascontiguousarray(value, dtype=np.float64) for value in (
             problem.start, problem.w, problem.target.x, problem.target.u))
-        ends, cost = roll_out(
-            self._arrays, u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps,
-            self._weights.Q, self._weights.R)
+        given = (u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps, self._weights.Q,
+                 self._weights.R)
+        ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
+                      roll_out(self._arrays, *given))
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
             return reason(Code.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
         nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)

@@ -3,6 +3,7 @@
 
 """The predictive law against independent optima, its limits, and its failures."""
 
+from dataclasses import fields
 import json
 import math
 import sys
@@ -123,6 +124,25 @@ def test_without_limits_it_is_the_sampled_regulator_of_a_linear_plant(pair, inte
     assert found.failure is None
     # it integrates by Runge and Kutta, and its cost by Simpson
     np.testing.assert_allclose(found.u, -K @ x, rtol=3e-3, atol=1e-3 * np.max(np.abs(K @ x)))
+
+
+class Doubled(LiftedModel):
+    """A model with a drift of its own."""
+
+    def drift(self, x: np.ndarray) -> np.ndarray:
+        return 2.0 * super().drift(x)
+
+    def drift_and_jacobian(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        f, J = super().drift_and_jacobian(x)
+        return 2.0 * f, 2.0 * J
+
+
+def test_drift_of_a_subclass_is_planned_with():
+    _, model = OSCILLATOR
+    own = Doubled(**{item.name: getattr(model, item.name) for item in fields(model)})
+    _, same = linear_plant(2.0 * model.A, model.B)
+    np.testing.assert_allclose(compute(law(own), [0.7, -0.4]).u,
+                               compute(law(same), [0.7, -0.4]).u, rtol=1e-6)
 
 
 def test_range_is_planned_for_optimally():
