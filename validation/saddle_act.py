@@ -154,7 +154,7 @@ def _controller_parameters(model: Path) -> dict[str, object]:
     return {
         'system': 'none', 'model': model, 'levels': ['pi'], 'pi.temperature.gain': PI_GAIN,
         'pi.temperature.integral_time': PI_TIME, 'temperature.setpoint_ramp': RAMP,
-        'temperature.noise': NOISE, 'temperature.max': to_celsius(LIMIT_TEMPERATURE),
+        'temperature.noise': NOISE, 'mpc.temperature.max': to_celsius(LIMIT_TEMPERATURE),
         'coolant_temperature.min': to_celsius(float(WIDE.lower[0])),
         'coolant_temperature.max': to_celsius(float(WIDE.upper[0])),
         'coolant_temperature.rate_limit': float(WIDE.rate[0]),
@@ -292,7 +292,8 @@ def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) 
     return Controller(model, Tuning.for_model(
         model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,
         controlled=('temperature',), transfer_time=0.0,
-        plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(PI_GAIN, PI_TIME)},
+        plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(
+            np.full(n_x, PI_GAIN if alone else 0.0), np.full(n_x, PI_TIME))},
         noise=np.array([1e-4, NOISE])[-n_y:],
         wander=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
         **({'setpoint_ramp': np.array([RAMP])} if alone else

@@ -87,7 +87,7 @@ class Controller(ControlStep):
         level = self.best
         try:
             with np.errstate(all='ignore'):
-                acting, w = self.estimation.level(state), np.zeros(self.model.n_x)
+                acting, w = self.estimation.level(state.supervisor), np.zeros(self.model.n_x)
                 # where a law acts that needs no model, none is trusted
                 if state.estimate is not None and not acting.law.model_free:
                     w = self.estimation.rebase(state.estimate, acting, level).w
@@ -140,7 +140,7 @@ class Controller(ControlStep):
             with np.errstate(all='ignore'):
                 if estimate is not None:
                     estimate = self.estimation.rebase(
-                        estimate, self.estimation.level(state), self.best)
+                        estimate, self.estimation.level(state.supervisor), self.best)
         except BaseException as error:
             contained(error)
             estimate = None  # the next measurement starts it
@@ -189,7 +189,7 @@ class Controller(ControlStep):
                         state.transfer, state.law_input - now.u))
         except BaseException as error:
             contained(error)
-            return replace(state.restarted(), accepted=None,
+            return replace(state.restarted(state.time_ns), accepted=None,
                            setpoint=state.setpoint if same else setpoints.Setpoint())
 
     # Questions about the loop.
@@ -226,7 +226,7 @@ class Controller(ControlStep):
         """Return the sensor's error (n_x,) that would explain the disturbance; NaN for none."""
         if state.estimate is None:
             return np.full(self.model.n_x, np.nan)
-        model = self.estimation.level(state).model
+        model = self.estimation.level(state.supervisor).model
         try:
             return equivalent_bias(model, state.estimate) * self.model.states.scale
         except np.linalg.LinAlgError:

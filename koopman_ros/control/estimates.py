@@ -13,6 +13,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.fallback import Level
 from koopman_ros.control.state import State
 from koopman_ros.control.steady_state import held_at
+from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.estimation import check, Estimate, Standstill, Verdict
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code
@@ -51,9 +52,9 @@ class StateEstimation:
     tuning: Tuning  #: for these signals
     levels: dict[str, Level]  #: by name, best first
 
-    def level(self, state: State) -> Level:
+    def level(self, supervisor: Supervisor) -> Level:
         """Return the level in terms of whose model the estimate is: without a law, the last."""
-        name = state.supervisor.settled
+        name = supervisor.settled
         if name is None:
             return next(iter(self.levels.values()))
         found = self.levels.get(name)
@@ -153,7 +154,7 @@ class StateEstimation:
 
         :param lost: whether the model's prediction is worth nothing, after so long or so far out.
         """
-        xi, estimator = self.model.states.to_deviation(x), self.level(state).estimator
+        xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
         if predicted is None:
             # the last command, it is assumed, held the plant where it is
             return estimator.restart(None, xi, None if state.command is None else (
@@ -181,7 +182,7 @@ class StateEstimation:
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
         try:
-            predicted = self.level(state).estimator.predict(state.estimate, u, elapsed)
+            predicted = self.level(state.supervisor).estimator.predict(state.estimate, u, elapsed)
         except np.linalg.LinAlgError:
             predicted = None  # so far out that the model gives no rate
         return predicted if predicted is not None and predicted.finite else replace(
@@ -198,7 +199,7 @@ class StateEstimation:
         estimate, old, new = state.estimate, predecessor.model, self.model
         if estimate is None:
             return state
-        estimator = self.level(state).estimator
+        estimator = self.level(state.supervisor).estimator
         if not estimator.remembers:
             estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
         if old is new:
@@ -210,7 +211,7 @@ class StateEstimation:
             return replace(state, accepted=None, recovery=None, estimate=estimator.restart(
                 None, new.states.to_deviation(x), _command(new, state)))
         # the rates that the old model estimated, per second, which all models share
-        rate = estimate.w + predecessor.level(state).model.drift(estimate.x) + (
+        rate = estimate.w + predecessor.level(state.supervisor).model.drift(estimate.x) + (
             old.forcing(estimate.x, _command(old, state)))
         factor = (old.states.scale / old.seconds_per_time_unit
                   / (new.states.scale / new.seconds_per_time_unit))

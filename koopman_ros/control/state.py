@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 import math
+from typing import Any
 
 import numpy as np
 
@@ -59,14 +61,10 @@ class State:
 
     __repr__ = brief
 
-    def without_law(self, transfer: bool = False) -> State:
-        """Return the state without an acting law; with `transfer`, also without its transfer."""
-        return replace(self, law=None, law_input=None, law_memory=None,
-                       transfer=None if transfer else self.transfer)
-
-    def restarted(self) -> State:
-        """Return the state without what may have made a calculation fail."""
-        return replace(self.without_law(transfer=True), estimate=None, recovery=None, target=None)
+    def restarted(self, time_ns: int | None) -> State:
+        """Return the state without what may have made a calculation fail, after a measurement."""
+        return replace(self, **WITHOUT_LAW, estimate=None, recovery=None, target=None,
+                       time_ns=time_ns)
 
     @property
     def own_command(self) -> Array | None:
@@ -74,6 +72,11 @@ class State:
         if self.command is None or self.transfer is None:
             return self.command
         return self.command - self.transfer.offset
+
+
+#: what changes of a state in which no law acts
+WITHOUT_LAW: Mapping[str, Any] = {
+    'law': None, 'law_input': None, 'law_memory': None, 'transfer': None}
 
 
 class Arrival(Enum):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from koopman_ros.control.state import (
     Report,
     State,
     TargetReport,
+    WITHOUT_LAW,
 )
 from koopman_ros.control.supervisor import HOLD, MANUAL, Requested, SAFE, Supervisor
 from koopman_ros.control.timing import afresh, StepTime, time_of_measurement, time_of_silence
@@ -91,9 +93,8 @@ class ControlStep(Configuration):
                 missed, back, follows), time)
 
         return self._contained(
-            calculate, replace(state, time_ns=time_ns),
-            MeasurementReport(Arrival.ACCEPTED, np.nan, missed=missed, clock_went_back=back),
-            time)
+            calculate, state, MeasurementReport(
+                Arrival.ACCEPTED, np.nan, missed=missed, clock_went_back=back), time, time_ns)
 
     def hold(self, state: State, time_ns: int, cause: Code | None = Code.NO_MEASUREMENT
              ) -> tuple[State, Array | None, Report]:
@@ -125,10 +126,11 @@ class ControlStep(Configuration):
                 self._advanced(now, x, time), Verdict(now.accepted),
                 MeasurementReport(outside=self.model.distance(x)), time)
 
-        return self._contained(calculate, state, NOTHING_MEASURED, time)
+        return self._contained(calculate, state, NOTHING_MEASURED, time, state.time_ns)
 
     def _contained(self, calculate: Callable[[], tuple[State, Array, Report]], before: State,
-                   measured: MeasurementReport, time: StepTime) -> tuple[State, Array, Report]:
+                   measured: MeasurementReport, time: StepTime, time_ns: int | None
+                   ) -> tuple[State, Array, Report]:
         """
         Return the result of a calculation; where it fails the command is held, later the safe one.
 
@@ -136,6 +138,7 @@ class ControlStep(Configuration):
         calculates, is caught; that of a law is a reason for the next level (:class:`Level`).
 
         :param before: the state to hold from; its estimate restarts from the next measurement.
+        :param time_ns: stamp of the last measurement.
         """
         try:
             # a measurement of 1e300 may overflow on its way; the result is checked and limited
@@ -149,7 +152,7 @@ class ControlStep(Configuration):
         except BaseException as error:
             fault = reason(Code.CALCULATION_FAILED, error=contained(error))
             return self._command(
-                before.restarted(), Verdict(before.accepted, fault), measured, time)
+                before.restarted(time_ns), Verdict(before.accepted, fault), measured, time)
 
     def _advanced(self, state: State, x: Array, time: StepTime) -> State:
         """Return the state with the set-point of now; `x` (n_x,) is what it begins from."""
@@ -162,26 +165,30 @@ class ControlStep(Configuration):
         """Choose a level, and bring its input within the limits."""
         transfer = state.transfer and state.transfer.after(
             time.elapsed, self.tuning.transfer_time)
-        target = None
+        target, changes = None, dict(WITHOUT_LAW)
         if state.mode is Mode.MANUAL:
-            state = state.without_law(transfer=True)
             wanted = state.manual_input if state.manual_input is not None else (
                 self._last_command(state))
             done, why = NO_COMMAND, verdict.fault
         else:
             supervisor, target, result = self._choose(state, verdict, measured.outside, time)
-            state = self._supervised(state, supervisor, verdict, measured.outside, time)
-            state, wanted, done = self._act(state, result, transfer)
-            why = state.supervisor.reason
+            recovery = self._recovery(state, supervisor, verdict, measured.outside, time.now_ns)
+            changes, wanted, done = self._act(state, supervisor, recovery, result, transfer)
+            why = supervisor.reason
+            changes |= {'supervisor': supervisor, 'recovery': recovery}
+            if state.estimate is not None:
+                changes['estimate'] = self.estimation.rebase(
+                    state.estimate, self.estimation.level(state.supervisor),
+                    self.estimation.level(supervisor))
             if target is not None and not self.best.controls_all:
-                state = replace(state, target=kept(np.concatenate((
+                changes['target'] = kept(np.concatenate((
                     self.model.states.to_physical(target.x),
-                    self.model.inputs.to_physical(target.u)))))
+                    self.model.inputs.to_physical(target.u))))
         limited = limit(self.tuning.limits, wanted, state.command, time.counted)
         done = replace(
             done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
             outside=self.model.inputs.violation(limited.u))
-        state = replace(state, command=limited.u, commanded_ns=time.command_ns)
+        state = replace(state, **changes, command=limited.u, commanded_ns=time.command_ns)
         return state, limited.u, self._report(state, why, measured, target, done)
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime
@@ -200,7 +207,7 @@ class ControlStep(Configuration):
             if level is None or state.estimate is None or state.setpoint.active is None:
                 return supervisor, target, result
             estimate = self.estimation.rebase(
-                state.estimate, self.estimation.level(state), level)
+                state.estimate, self.estimation.level(state.supervisor), level)
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, memory, time.spacing, state.target,
@@ -219,15 +226,6 @@ class ControlStep(Configuration):
         return Requested(self.order.below(level.name), reason(
             Code.LAW_FAILED, level=level.name, cause=why), passing)
 
-    def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
-                    time: StepTime) -> State:
-        """Take over the supervisor's new state, and the estimate in terms of its level."""
-        before = self.estimation.level(state)
-        state = replace(state, supervisor=supervisor, recovery=self._recovery(
-            state, supervisor, verdict, outside, time.now_ns))
-        return replace(state, estimate=None if state.estimate is None else self.estimation.rebase(
-            state.estimate, before, self.estimation.level(state)))
-
     def _recovery(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> SafeStateRecovery | None:
         """Return how far the plant has come back where the safe input keeps it outside."""
@@ -243,26 +241,27 @@ class ControlStep(Configuration):
         kept_out = supervisor.bad_since_ns is None and supervisor.better_since_ns is None
         return SafeStateRecovery(outside, outside, time_ns) if kept_out and outside > 0.0 else None
 
-    def _act(self, state: State, result: LawResult | None, transfer: BumplessTransfer | None
-             ) -> tuple[State, Array, CommandReport]:
-        """Return the state with the acting law, the command before limits, and its report."""
-        level, held = state.supervisor.level, self._last_command(state)
+    def _act(self, state: State, supervisor: Supervisor, recovery: SafeStateRecovery | None,
+             result: LawResult | None, transfer: BumplessTransfer | None
+             ) -> tuple[dict[str, Any], Array, CommandReport]:
+        """Return what changes of the state, the command before limits, and its report."""
+        level, held = supervisor.level, self._last_command(state)
         if result is None or result.u is None:
             done = NO_COMMAND if result is None else CommandReport(
                 replace(result.info, form=''), at_range=result.clipped, plan=result.plan)
             if level == SAFE:
-                share = 0.0 if state.recovery is None else state.recovery.share
+                share = 0.0 if recovery is None else recovery.share
                 wanted = self.safe_input + share * (self.nominal_input - self.safe_input)
-                return state.without_law(transfer=True), wanted, replace(done, recovery=share)
-            passing = state.supervisor.resumes is not None
-            return state if passing else state.without_law(), held, done
+                return dict(WITHOUT_LAW), wanted, replace(done, recovery=share)
+            passing = supervisor.resumes is not None
+            return {} if passing else {**WITHOUT_LAW, 'transfer': state.transfer}, held, done
         if state.law != level and state.command is not None and self.tuning.transfer_time:
             # the command was not this law's so far
             transfer = with_step(None, held - result.u)
         offset = None if transfer is None else transfer.offset
-        state = replace(state, law=level, law_input=result.u, law_memory=result.memory,
-                        transfer=transfer)
-        return state, result.u if offset is None else result.u + offset, CommandReport(
+        changes = {'law': level, 'law_input': result.u, 'law_memory': result.memory,
+                   'transfer': transfer}
+        return changes, result.u if offset is None else result.u + offset, CommandReport(
             result.info, offset, at_range=result.clipped, plan=result.plan)
 
     def _last_command(self, state: State) -> Array:
@@ -282,11 +281,11 @@ class ControlStep(Configuration):
         active, manual = state.setpoint.active, state.mode is Mode.MANUAL
         depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
         known = None if state.estimate is None else EstimateReport.of(
-            state.estimate, self.estimation.level(state).estimator)
-        aim = None if active is None else TargetReport(active, self.controlled.violation(active))
-        if aim is not None and target is not None:
-            aim = replace(aim, residual=target.residual,
-                          state=self.model.states.to_physical(target.x),
-                          input=self.model.inputs.to_physical(target.u))
+            state.estimate, self.estimation.level(state.supervisor).estimator)
+        steady = () if target is None else (
+            target.residual, self.model.states.to_physical(target.x),
+            self.model.inputs.to_physical(target.u))
+        aim = None if active is None else TargetReport(
+            active, self.controlled.violation(active), *steady)
         return Report(state.mode, MANUAL if manual else self.order.levels[depth], depth, why,
                       measured, known, aim, command)

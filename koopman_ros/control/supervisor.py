@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
@@ -41,7 +42,7 @@ class FallbackOrder:
                              'margin of a level must not be below that of a better one, got '
                              f'{list(self.margins)}')
 
-    @property
+    @cached_property
     def levels(self) -> tuple[str, ...]:
         """The names of all levels, best first."""
         return (*self.laws, HOLD, SAFE)

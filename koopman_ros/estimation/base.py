@@ -70,8 +70,8 @@ class Estimate:
     @property
     def finite(self) -> bool:
         """Whether state, disturbance and covariance are finite numbers."""
-        return all(np.all(np.isfinite(value)) for value in (self.x, self.w, self.covariance)
-                   if value is not None)
+        return bool(np.isfinite(self.x).all() and np.isfinite(self.w).all() and (
+            self.covariance is None or np.isfinite(self.covariance).all()))
 
     def check(self, n_x: int) -> None:
         """Raise a TypeError or ValueError unless it is one of so many states, and finite."""

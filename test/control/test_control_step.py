@@ -314,7 +314,8 @@ def test_the_mode_changes_between_operator_and_law():
     ('', 'input_weight', np.nan), ('', 'setpoint_ramp', 0.0), ('', 'safe', np.inf),
     ('', 'tolerance', -1.0), ('', 'transfer_time', np.inf), ('sensor', 'rate', 0.0),
     ('sensor', 'jump', np.nan), ('sensor', 'frozen_timeout', -1.0), ('limits', 'rate', 0.0),
-    ('', 'state_weight', 'heavy'), ('', 'levels', ()), ('', 'levels', ('sdre', 'sdre'))])
+    ('', 'state_weight', 'heavy'), ('', 'validity_margin', -0.1), ('', 'hold_timeout', -1.0),
+    ('', 'recovery_time', math.nan), ('', 'levels', ()), ('', 'levels', ('sdre', 'sdre'))])
 def test_a_tuning_that_makes_no_sense_is_refused(part, name, value):
     loop = controller()
     tuning = loop.tuning
@@ -322,6 +323,12 @@ def test_a_tuning_that_makes_no_sense_is_refused(part, name, value):
         tuning, **{part: replace(getattr(tuning, part), **{name: value})})
     with pytest.raises(ValueError, match=f'{name} must'):
         replace(loop, tuning=changed)
+
+
+def test_margins_in_the_wrong_order_are_refused():
+    loop = controller()
+    with pytest.raises(ValueError, match='margin'):
+        replace(loop, tuning=replace(loop.tuning, validity_margin=2.0))
 
 
 @pytest.mark.parametrize('part', ['limits', 'sensor'])

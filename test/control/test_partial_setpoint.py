@@ -7,8 +7,6 @@ from dataclasses import replace
 import json
 import math
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -33,10 +31,10 @@ from koopman_ros.lifting.observables import PolynomialObservables
 from koopman_ros.plants import Actuator, Process
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from koopman_ros.reasons import Code, Words
-from koopman_ros.replay.records import decoded, event_of, fields_of, Record
+from koopman_ros.replay.records import event_of, fields_of, Record
 from koopman_ros.units import Displays
 from koopman_ros.units import NANOSECONDS as SECOND
-from support.closed_loops import content, EPOCH
+from support.closed_loops import EPOCH
 
 LEVELS, FLOWS = ('h1', 'h2', 'h3'), ('q1', 'q2')
 say = Words(Displays({**dict.fromkeys(LEVELS, 'm'), **dict.fromkeys(FLOWS, 'L/s')}))
@@ -209,19 +207,6 @@ def test_a_refusal_names_the_nearest_level_and_what_the_pump_would_need(
     assert (why.values['lower'], why.values['upper']) == (2.5, upper)
     assert why.values['value'] == pytest.approx(needed, abs=1e-9)
     assert asked(controller, refused.values['nearest'], state)[1] is None
-
-
-def test_the_words_of_a_refusal():
-    controller = loop(SERIES, 'h2', upper=3.5)
-    assert say(asked(controller, 1.9)[1]) == (
-        'h2 set-point 1.9 m cannot be held, since q1 would have to be 3.9 L/s, its range is '
-        '0 L/s to 3.5 L/s: the old one is kept; the nearest that can be held is h2 1.5 m')
-    assert asked(controller, 2.1)[1].code is Code.SETPOINT_OUTSIDE
-    # nothing is held where no input of the range balances the disturbance
-    state = disturbed(controller, [1.0, 1.0], [-0.5, 0.0])
-    refused = asked(controller, 1.2, state)[1]
-    assert refused.code is Code.NO_SETPOINT_HELD
-    assert 'no other one is found that can' in say(refused)
 
 
 def test_another_level_that_would_overflow_refuses_too():
@@ -453,43 +438,6 @@ def test_the_records_of_requests():
     assert fields['signals'] == ['h3']
     assert (again.stamp_ns, again.value.tolist(), again.signals) == (7, [1.5], ('h3',))
 
-
-changes = st.lists(st.tuples(
-    st.sampled_from(['measure'] * 4 + ['ask', 'schedule', 'silence']),
-    st.lists(st.one_of(st.floats(-0.5, 2.5), st.sampled_from([math.nan, math.inf, -1e300])),
-             min_size=3, max_size=3)), min_size=1, max_size=25)
-
-
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(st.sampled_from([
-    loop(SERIES, 'h2', lower=2.0, upper=4.0), loop(BOTH, 'h2', lower=2.0, upper=4.0),
-    loop(THREE, 'h2', 'h3', setpoint_ramp=np.array([0.1, np.inf])), loop(SERIES, 'h1'),
-    parabola(setpoint_filter=3.0)]), changes)
-def test_commands_are_numbers_within_limits_and_follow_from_the_state_alone(controller, sequence):
-    n, limits, state = controller.model.n_x, controller.tuning.limits, State()
-    signals = controller.controlled.names
-    for second, (kind, values) in enumerate(sequence):
-        kept, now = content(state), EPOCH + second * SECOND
-        command = None
-        match kind:
-            case 'measure':
-                state, command, report = result = controller.step(state, np.array(values[:n]), now)
-                # a controller built afresh goes on from what was written down
-                again = replace(controller).step(
-                    decoded(json.loads(kept)), np.array(values[:n]), now)
-                assert content(again) == content(result)
-                target = report.target
-                if target is not None and target.state is not None:
-                    assert np.all(np.isfinite([*target.state, *target.input]))
-            case 'silence':
-                state, command, _ = controller.hold(state, now)
-            case _:
-                state, refused = asked(
-                    controller, values[0], state, signals=signals[second % len(signals):][:1],
-                    effective_ns=(now + 2 * SECOND) * (kind == 'schedule'))
-                assert refused is None or say(refused)
-        if command is not None:
-            assert np.all((limits.lower <= command) & (command <= limits.upper))
 
 
 @pytest.mark.parametrize(('model', 'controlled', 'asked', 'w'), [

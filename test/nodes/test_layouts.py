@@ -18,8 +18,9 @@ from koopman_ros.control.laws import Plan
 from koopman_ros.control.state import EstimateReport
 from koopman_ros.demo import reactor
 from koopman_ros.estimation import Innovation
+from koopman_ros.lifting import load
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.resources import config_directory
+from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_messages import active_limits, internals
 
@@ -34,6 +35,7 @@ assert WIRING is not None
 TYPES = {topic: kind for topic, (kind, _) in topics.known(WIRING).items()}
 ONE, NONE = np.ones(1), np.zeros(1)
 # by a Kalman filter, which says more than the observer, and a law that plans
+MODEL = load(model_path('reactor_nz4'))
 ESTIMATE = EstimateReport(ONE, NONE, False, np.eye(1), Innovation(NONE, 1.0, 1))
 PLAN = Plan(np.arange(2.0), np.ones((2, 1)), np.ones((1, 1)), NONE, NONE, NONE)
 NAMES = {

@@ -149,7 +149,7 @@ def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
     own = view(coolant_temperature='degC')
     own.parameters('controller', {name: parameter(
         name, value, unit='degC', lower=-273.15, upper=1e9) for name, value in (
-        ('temperature.min', -273.15), ('temperature.max', 60.0),
+        ('mpc.temperature.min', -273.15), ('mpc.temperature.max', 60.0),
         ('coolant_temperature.min', 5.0), ('coolant_temperature.max', 40.0))})
     measure(own, 50.0, 1.0)
     now = own.snapshot(NOW)

@@ -66,7 +66,7 @@ def test_an_hour_is_drawn_to_a_page_that_comes_late_and_finely_where_it_is_zoome
         said = DiagnosticArray(status=[DiagnosticStatus(
             name='trainer: recording', values=[KeyValue(key='bag', value=str(bag))])])
         # a limit on one side alone is drawn, too, and the chart goes on
-        ros.start('controller', {'temperature.max': 60.0})
+        ros.start('controller', {'mpc.temperature.max': 60.0})
         ros.start('plant', {'speed': 2.0, 'start_time': BEGIN + 0.1 * SAMPLES})
         address = ros.wait_until(lambda: ADDRESS.search(panel.output()))
         assert address is not None

@@ -7,22 +7,18 @@ from collections.abc import Iterator, Mapping
 import contextlib
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 import sys
 import tempfile
 import time
 from typing import Any
 
-from koopman_ros.kernels import PACKAGE
 import numpy as np
 import psutil
 from sensor_msgs.msg import Temperature
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.demo import reactor
-from koopman_ros.replay.records import NUMERICS
 from koopman_ros.reports import table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
@@ -246,22 +242,18 @@ def _answering(harness: Harness) -> Iterator[tuple[dict[str, NodeProcess], dict[
     _tell('controllers, a PID controller and an echo')
     echo, pid = ((sys.executable, '-m', f'validation.benchmarks.{name}')
                  for name in ('echo', 'pid'))
-    # without what compiles, `compiled` is the first one again
-    records = harness.listen(String, f'{_NAMESPACE}/compiled/{topics.CONTROLLER_EVENTS}')
+    # nothing is compiled: `compiled` is the first one again
     with contextlib.ExitStack() as stack:
         nodes = {name: stack.enter_context(
             _start(harness, program, f'{_NAMESPACE}/{name}', command, **parameters))
             for name, program, command, parameters in (
                 ('controller', 'controller', None, {}),
-                ('compiled', 'controller', None, {'compiled': True}),
+                ('compiled', 'controller', None, {}),
                 ('pid', 'pid', pid, {}), ('echo', 'echo', echo, {}))}
         probes = {name: _Probe(harness, f'{_NAMESPACE}/{name}') for name in nodes}
         for probe in probes.values():
             probe.first_answer()
             probe.paced()
-        if find_spec(PACKAGE) is not None:
-            harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
-                               'the compiled step')
         yield nodes, probes
 
 

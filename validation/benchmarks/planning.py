@@ -165,7 +165,7 @@ def _sides(case: Case, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
     def own(y: Array, target: Target) -> Array:
         nonlocal memory
         result = law.compute(Estimate(model.states.to_deviation(y), np.zeros(model.n_x)), target,
-                             case.limits, memory, case.period)
+                             memory, case.period, None)
         memory = result.memory
         assert result.u is not None
         return result.u

@@ -73,7 +73,7 @@ class Plant:
     @cached_property
     def wiring(self) -> Wiring:
         """Where its signals are."""
-        signals = signals_of(load(model_path(self._model)), self.parameters.controlled,
+        signals = signals_of(load(model_path(self._model)), self.parameters.tuning.controlled,
                              self.parameters.states)
         return Wiring(signals, self.parameters.states, self.parameters.inputs)
 

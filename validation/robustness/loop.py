@@ -25,7 +25,7 @@ PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
 # Margins that are never exceeded: without fallback the learned law acts everywhere.
-NO_FALLBACK = {'validity_margin': 1e9, 'linear_margin': 1e9}
+NO_FALLBACK: dict[str, Any] = {'validity_margin': 1e9, 'linear_margin': 1e9}
 
 
 @lru_cache
