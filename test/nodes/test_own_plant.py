@@ -17,6 +17,7 @@ import pytest
 from sensor_msgs.msg import Temperature
 import yaml
 
+from koopman_ros.bags import summary
 from koopman_ros.lifting import load
 from koopman_ros.nodes import controller, plant, trainer
 from koopman_ros.ros import topics
@@ -87,6 +88,7 @@ def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempP
 
 def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
         overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
+    assert summary(recorded).counts['/power_setpoint'] > 0
     lift, linear = train(ros, overlay, TRAIN, 'training_starts:=1')
     # the noise of the sensor is 0.2 K
     assert lift < 0.25 < 1.0 < linear
