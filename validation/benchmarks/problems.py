@@ -87,6 +87,6 @@ def artificial(samples: int, n_x: int, n_z: int, hidden: int) -> Case:
     """Build a problem of given sizes for timing: smooth data, a random start of useful size."""
     rng = np.random.default_rng(_SEED)
     x = rng.uniform(-1.0, 1.0, (samples, n_x))
-    layout = Layout(n_x, n_z, (hidden,), identity=True)
+    layout = Layout(n_x, n_z, hidden, identity=True)
     return Case(layout, x, -x + 0.3 * np.sin(2.0 * x[:, ::-1]) - 0.2 * x ** 2,
                 0.3 * rng.standard_normal(layout.size))
