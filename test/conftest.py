@@ -37,7 +37,8 @@ LONGEST = ('test_node_benchmarks', 'test_browser', 'test_learning', 'test_replay
            'test_grey_box', 'test_panel', 'test_retraining_tanks', 'test_laws',
            'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_pipeline',
            'test_observer', 'test_backends', 'test_fleet', 'test_kalman', 'test_training',
-           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom', 'test_unmeasured_states',
+           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom',
+           'test_unmeasured_states',
            'test_least_squares', 'test_law_check')
 
 
