@@ -121,8 +121,6 @@ def _limit(pid: int) -> None:
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
         resource.prlimit(pid, resource.RLIMIT_CPU, (int(_TIME), int(_TIME)))
         os.setpriority(os.PRIO_PROCESS, pid, _NICE)
-        # where sessions share the processors before processes do
-        Path(f'/proc/{pid}/autogroup').write_text(f'{_NICE}\n')
 
 
 class ReplayJob(Job):
@@ -134,6 +132,9 @@ class ReplayJob(Job):
 
     def __init__(self, arguments: Sequence[str]) -> None:
         super().__init__('koopman_ros.nodes.replay', arguments, interrupted=130)
+        # where sessions share the processors before processes do
+        with contextlib.suppress(OSError):
+            Path(f'/proc/{self.process.pid}/autogroup').write_text(f'{_NICE}\n')
 
     @property
     def said(self) -> str:

@@ -278,8 +278,9 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
            ) -> tuple[Comparison | None, Decision | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
     task, found = bare.task, bare.found
-    learned = decision = None
-    reasons: tuple[str, ...] = ('',)
+    learned: Comparison | None = None
+    decision: Decision | None = None
+    reasons: tuple[str, ...] = ()
     warnings: list[str] = []
     for begin in (None,) if sibling is None else (sibling, None):
         course = _Course(on_progress)

@@ -196,8 +196,6 @@ def test_names_of_other_nodes_are_ignored_with_one_warning(
     ('controller', ('coolant_temperature.min:=20.0',
                     'coolant_temperature.max:=20.00000000000001'),
      'coolant_temperature.min = 20.0 degC must be below coolant_temperature.max'),
-    ('trainer', ('coolant_temperature.experiment_max:=8.500000000000002',),
-     'coolant_temperature.experiment_max = 8.500000000000002 degC cannot be used: '),
     ('trainer', ('max_bag_size:=1.0e+308',),
      'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
 ])

@@ -258,7 +258,6 @@ def test_smoothing_of_a_parabola_finds_it_and_leaves_what_has_no_noise():
 
 @pytest.mark.parametrize(('call', 'words'), [
     (lambda r, b: weak_form([r], b, 3, None, 40), 'no episode has 40 samples: record longer'),
-    (lambda r, b: weak_form([r], b, 3, None, 3), 'a window of 3 samples is too short'),
     (lambda r, b: weak_form([r], b, 3, None, 20), '3 equations do not determine 5 coefficients'),
     (lambda r, b: total_variation([r.part(0, 7)], b, 3, None, np.ones((1, 1))),
      'no episode has 8 samples'),
