@@ -29,7 +29,7 @@ from koopman_ros.estimation import Estimate
 from koopman_ros.plants import Process
 from koopman_ros.units import NANOSECONDS
 from studies.equations import EQUATIONS
-from studies.partly_measured.cases import Case, CASES
+from studies.partly_measured.cases import CASES, PartialCase
 
 # A state (n_x,) and its target, and what answers them.
 Call: TypeAlias = tuple[Array, Target]
@@ -110,7 +110,7 @@ def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
     return found
 
 
-def _controller(case: Case) -> Controller:
+def _controller(case: PartialCase) -> Controller:
     """Return a controller that measures every state, its law alone on the shipped lift."""
     model = case.lift
     return Controller(model, case.tuning(
@@ -118,7 +118,7 @@ def _controller(case: Case) -> Controller:
         levels=('mpc',), validity_margin=_MARGIN))
 
 
-def _course(case: Case, controller: Controller, samples: int
+def _course(case: PartialCase, controller: Controller, samples: int
             ) -> tuple[list[Call], Array, dict[int, Array]]:
     """Let the controller lead the true plant; return calls, commands, set-points by sample."""
     wanted = SETPOINTS[case.plant]
@@ -140,7 +140,7 @@ def _course(case: Case, controller: Controller, samples: int
     return calls, loop.commands, requested
 
 
-def _problem(case: Case, controller: Controller) -> Problem:
+def _problem(case: PartialCase, controller: Controller) -> Problem:
     """Return what the law plans, with the plant's own equations."""
     model, law = controller.model, controller.levels['mpc'].law
     assert isinstance(law, RecedingHorizon) and law.planner is not None
@@ -153,7 +153,7 @@ def _problem(case: Case, controller: Controller) -> Problem:
                    case.upper, (model.states.scale, model.inputs.scale))
 
 
-def _sides(case: Case, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
+def _sides(case: PartialCase, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
     """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
     # here, as whoever starts a comparison does without do-mpc
     from studies.partly_measured.dompc import Planner

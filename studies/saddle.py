@@ -63,7 +63,7 @@ STARTS, ARRIVAL = 40, 600.0  # s
 
 
 @dataclass(frozen=True)
-class Figures:
+class RunFigures:
     """What a run was worth."""
 
     #: integrals of (T - T_ref)^2 + (T_c - T_c,ref)^2 in K^2 min: until the jacket fouls, and after
@@ -116,7 +116,7 @@ def reactor(constants: dict[str, float]) -> ControlAffineSystem:
     return two_state_reactor(ReactorParameters(**constants), nominal_state=SADDLE)
 
 
-def run(one: Controller, seed: int, period: float = 1.0) -> Figures:
+def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
     """Take the temperature along its course, and let the jacket foul."""
     x0, u0 = steady(COURSE[0.0])
     fouled, informed = reactor(FOULING), one.measured.all_states
@@ -141,7 +141,7 @@ def run(one: Controller, seed: int, period: float = 1.0) -> Figures:
     known = np.array([np.nan if report.estimate is None else report.estimate.state[0]
                       for report in loop.reports])
     error = (known - loop.states[:, 0])[(t > 60.0) & (t < FOULED)]
-    return Figures((costs[0], costs[1]), (offsets[0], offsets[1]),
+    return RunFigures((costs[0], costs[1]), (offsets[0], offsets[1]),
                    float(np.sqrt(np.mean(error ** 2))))
 
 
@@ -182,7 +182,7 @@ def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS,
     """Return a row for each law and time between samples, over all models."""
     periods = tuple(periods)
 
-    def three(key: tuple[str, float, int]) -> list[Figures]:
+    def three(key: tuple[str, float, int]) -> list[RunFigures]:
         name, period, seed = key
         return [run(controller(model, LAWS[name], informed=informed), seed, period)
                 for model, informed in ((models[seed], False), (truth(), False), (truth(), True))]

@@ -153,9 +153,14 @@ class Operator:
 
     def set(self, node: str, **values: object) -> None:
         """Set parameters of a node."""
-        for result in self.harness.set_parameters(node, **values):
-            if not result.successful:
-                raise HarnessError(f'{node}: {result.reason}')
+        for name, value in values.items():
+            # a busy machine may not read a model in the time that the loop can wait
+            while 'still being read' in (reason := ''.join(
+                    result.reason for result in self.harness.set_parameters(
+                        node, **{name: value}) if not result.successful)):
+                pass
+            if reason:
+                raise HarnessError(f'{node}: {reason}')
 
     def record_anew(self, bag: Path) -> None:
         """End the recording, and begin another one."""

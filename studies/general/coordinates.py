@@ -21,7 +21,7 @@ from koopman_ros.plants import describe
 from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import LEARNERS, RECIPES
 from studies.general.loops import judged, known, loops, STARTS
-from studies.general.systems import Case, CASES
+from studies.general.systems import CASES, Regulation
 
 PLACE = 'coordinates'  # of its figures in the summary
 SEEDS = 3  # as many of those of the study
@@ -52,7 +52,7 @@ CONDITIONS: Mapping[str, Callable[[Samples, int], Samples]] = {
     'rx': lambda samples, seed: samples, 'rx_noisy': noisy, 'rx_few': few}
 
 
-def beyond(case: Case, box: Box, seed: int) -> Samples:
+def beyond(case: Regulation, box: Box, seed: int) -> Samples:
     """Return held-out samples outside of a box, of episodes that go beyond its upper ends."""
     more = BEYOND * (box.states.upper - box.states.lower)
     wider = replace(case, lower=0.5 * (box.states.lower + box.states.upper),
@@ -90,7 +90,8 @@ def rolled_in_z(model: LiftedModel, samples: Samples) -> Array:
     return np.sqrt(squares / count)
 
 
-def discrete(case: Case, box: Box, samples: Samples, held_out: Samples, delays: int) -> float:
+def discrete(case: Regulation, box: Box, samples: Samples, held_out: Samples, delays: int
+             ) -> float:
     """
     Predict held-out episodes by EDMD in discrete time, with inputs and delay coordinates.
 

@@ -16,7 +16,7 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants.optimum import optimum, Task
 from koopman_ros.solvers import solve_riccati
 from studies.campaign import Metrics
-from studies.general.systems import Case, CASES
+from studies.general.systems import CASES, Regulation
 
 STARTS = 20
 OPTIMA = 5  # of the first of them, as the least cost takes a second to find
@@ -27,7 +27,7 @@ _MAX_EVALUATIONS = 5000  # of a law; what needs more chatters
 
 
 @dataclass(frozen=True)
-class End:
+class LoopEnd:
     """How a loop ended."""
 
     cost: float  #: infinite where the plant did not arrive
@@ -38,8 +38,9 @@ class End:
 class Known:
     """What laws that know the plant get, by start."""
 
-    lqr: tuple[End, ...]  #: with the linear-quadratic gain of the nominal state
-    sdre: tuple[End, ...]  #: with that of the true drift as :meth:`Case.factorised` factorises it
+    lqr: tuple[LoopEnd, ...]  #: with the linear-quadratic gain of the nominal state
+    #: with that of the true drift as :meth:`Regulation.factorised` factorises it
+    sdre: tuple[LoopEnd, ...]
     least: tuple[float, ...]  #: least costs; infinite where none was found, or looked for
 
     @property
@@ -67,8 +68,8 @@ def known(name: str, starts: int) -> Known:
                        for number, x0 in enumerate(case.starts(starts))))
 
 
-def loops(case: Case, model: LiftedModel, starts: int,
-          law: Callable[..., Feedback] = feedback) -> list[End]:
+def loops(case: Regulation, model: LiftedModel, starts: int,
+          law: Callable[..., Feedback] = feedback) -> list[LoopEnd]:
     """Regulate the true plant by a law on a model, in continuous time, from the first starts."""
     nominal, ends = case.system.nominal_state, []
     for x0 in case.starts(starts):
@@ -84,11 +85,11 @@ def loops(case: Case, model: LiftedModel, starts: int,
             law=watched, u_ref=case.system.nominal_input, samples=2, rtol=1e-4,
             max_evaluations=_MAX_EVALUATIONS)
         away = float(np.max(np.abs(loop.states[-1] - nominal) / case.units[0]))
-        ends.append(End(loop.cost if away < ARRIVED else math.inf, not all(solved)))
+        ends.append(LoopEnd(loop.cost if away < ARRIVED else math.inf, not all(solved)))
     return ends
 
 
-def _least(case: Case, x0: Array) -> float:
+def _least(case: Regulation, x0: Array) -> float:
     """Return the least cost from a start (n_x,), on the true equations with inputs held."""
     system = case.system
     Q, R = (1.0 / unit ** 2 for unit in case.units)
@@ -99,7 +100,7 @@ def _least(case: Case, x0: Array) -> float:
         return math.inf
 
 
-def judged(ends: Sequence[End], beside: Known) -> Metrics:
+def judged(ends: Sequence[LoopEnd], beside: Known) -> Metrics:
     """
     Count and compare how loops ended, start by start.
 

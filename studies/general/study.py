@@ -14,7 +14,7 @@ from koopman_ros.plants import describe
 from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import Learned, LEARNERS
 from studies.general.loops import judged, known, loops, STARTS
-from studies.general.systems import Case, CASES
+from studies.general.systems import CASES, Regulation
 
 _HELD_OUT = 40  # episodes that no training has seen
 LQR, SDRE = 'LQR on the truth', 'natural SDRE on the truth'
@@ -40,7 +40,7 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
             for figure, value in figures.items()}, {}
 
 
-def predicted(case: Case, learned: Learned, held_out: Samples) -> Metrics:
+def predicted(case: Regulation, learned: Learned, held_out: Samples) -> Metrics:
     """
     Judge a model on held-out episodes.
 

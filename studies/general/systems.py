@@ -31,7 +31,7 @@ _NEAR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class Regulation:
     """A plant to regulate to its nominal state from anywhere in a box."""
 
     system: ControlAffineSystem  #: the truth
@@ -120,7 +120,7 @@ def oscillator(name: str, force: Callable[[Array, Array], Array],
 
 def _case(system: ControlAffineSystem, lower: ArrayLike, upper: ArrayLike, inputs: ArrayLike,
           hold: tuple[float, float], period: float, episodes: int = 120, holds: int = 10,
-          room: float = 0.5) -> Case:
+          room: float = 0.5) -> Regulation:
     """
     Return a case whose episodes may leave the box of their starts.
 
@@ -135,15 +135,15 @@ def _case(system: ControlAffineSystem, lower: ArrayLike, upper: ArrayLike, input
         input_lower=system.nominal_input - u, input_upper=system.nominal_input + u,
         state_lower=lower - more, state_upper=upper + more, hold_time=hold, sample_period=period,
         max_redraws=20, rtol=1e-9)
-    return Case(system, lower, upper, design, episodes, holds * period)
+    return Regulation(system, lower, upper, design, episodes, holds * period)
 
 
-def _shipped(name: str) -> Case:
+def _shipped(name: str) -> Regulation:
     """Return the case of a shipped lift, whose episodes do not leave their box."""
     lift, system = LIFTS[name], library_system(name)
     lower, upper = (np.broadcast_to(np.asarray(bound, dtype=np.float64), system.n_x)
                     for bound in (lift.design.state_lower, lift.design.state_upper))
-    return Case(system, lower, upper, lift.design, lift.episodes, lift.duration)
+    return Regulation(system, lower, upper, lift.design, lift.episodes, lift.duration)
 
 
 # the steady state with a coolant of 300 K from which the reactor cools down or ignites

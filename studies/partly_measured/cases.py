@@ -27,7 +27,7 @@ _ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class PartialCase:
     """Rest at a set-point, a step of it, and a load in the end, on a plant of the library."""
 
     plant: str  #: its name in the catalogue, and that of its shipped lift
@@ -163,16 +163,16 @@ class Case:
 
 CASES = {case.plant: case for case in (
     # millimetres of noise on the lower tanks, the upper ones are not measured
-    Case('quadruple_tank', ('level_1', 'level_2'), np.full(2, 1e-3), np.full(2, 0.01),
+    PartialCase('quadruple_tank', ('level_1', 'level_2'), np.full(2, 1e-3), np.full(2, 0.01),
          np.array([1e-3, 1e-3, 1e-2, 1e-2]), np.array([1e4, 1e4, 0.0, 0.0]), np.ones(2),
          np.zeros(2), np.full(2, 10.0), 12.0, {'level_1': 0.10, 'level_2': 0.15},
          {'level_1': 0.15, 'level_2': 0.12}, 0.01, np.array([-0.3, 0.0]), 300.0, 900.0, 1800.0),
     # the motor holds it 57 degrees from upright
-    Case('pendulum', ('angle',), np.array([2e-3]), np.array([0.1]), np.array([2e-3, 0.5]),
+    PartialCase('pendulum', ('angle',), np.array([2e-3]), np.array([0.1]), np.array([2e-3, 0.5]),
          np.array([1.0, 0.1]), np.ones(1), np.array([-15.0]), np.array([15.0]), 0.0625,
          {'angle': 1.0}, {'angle': 0.0}, 0.1, np.array([0.5]), 1.5625, 5.3125, 10.5),
     # the hotter, the quicker it converts: without its limit it goes to 326.6 K
-    Case('fed_reactor', ('concentration', 'temperature'), np.array([2e-3, 0.1]),
+    PartialCase('fed_reactor', ('concentration', 'temperature'), np.array([2e-3, 0.1]),
          np.array([0.5, 0.05]), np.array([2e-3, 0.1]), np.array([1e5, 0.1]), np.full(2, 0.1),
          np.array([60.0, 278.15]), np.array([150.0, 305.15]), 9.0,
          {'concentration': 0.95, 'temperature': 315.0},

@@ -15,7 +15,7 @@ from koopman_ros.control.simulate import after_a_second
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import solve_riccati
 from koopman_ros.units import NANOSECONDS
-from studies.partly_measured.cases import Case
+from studies.partly_measured.cases import PartialCase
 
 MARGIN = 0.3  # half widths of the training box by which the laws may leave that
 _ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
@@ -58,7 +58,7 @@ class LinearQuadraticGaussian:
     See K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems* (1997), chapter 11.
     """
 
-    def __init__(self, case: Case, x: Array, u: Array) -> None:
+    def __init__(self, case: PartialCase, x: Array, u: Array) -> None:
         """Linearise at a steady state (n_x,) and its input (n_u,)."""
         system, outputs = case.system, case.outputs
         A, B, C = system.slope(x, u), system.input_matrix(x), outputs.C
@@ -96,13 +96,13 @@ class LinearQuadraticGaussian:
         return command
 
 
-OWN: dict[str, Callable[[Case], Contender]] = {
+OWN: dict[str, Callable[[PartialCase], Contender]] = {
     '`mpc`, lift': lambda case: Own(case, case.lift, ('mpc', 'sdre')),
     '`sdre`, lift': lambda case: Own(case, case.lift, ('sdre',)),
     '`mpc`, true model': lambda case: Own(case, case.truth, ('mpc', 'sdre')),
     '`sdre`, true model': lambda case: Own(case, case.truth, ('sdre',)),
 }
-LINEAR: dict[str, Callable[[Case], Contender]] = {
+LINEAR: dict[str, Callable[[PartialCase], Contender]] = {
     'LQG at the set-point': lambda case: LinearQuadraticGaussian(case, *case.goal(case.system)),
     'LQG at the nominal point': lambda case: LinearQuadraticGaussian(
         case, case.system.nominal_state, case.system.nominal_input),

@@ -18,7 +18,7 @@ import numpy as np
 from koopman_ros.arrays import Array
 from koopman_ros.estimation import Estimate, ExtendedKalmanFilter
 from studies.equations import EQUATIONS
-from studies.partly_measured.cases import Case
+from studies.partly_measured.cases import PartialCase
 
 with warnings.catch_warnings():
     # it tells what it would do with other packages
@@ -44,7 +44,7 @@ class Planner:
     cost to go at its end; a limit of a state is soft. The cost counts at the samples.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: PartialCase) -> None:
         self._case, n, n_u = case, case.system.n_x, case.system.n_u
         self._model = _model(case, measuring=False)
         self._planner = planner = do_mpc.controller.MPC(self._model)
@@ -89,7 +89,7 @@ class Planner:
 class WithFilter:
     """Its MPC on what the extended Kalman filter of this package says with the true model."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: PartialCase) -> None:
         self._case, self._planner, self._filter = case, Planner(case), true_filter(case)
         self._estimate: Estimate | None = None
         self._u = case.start[1]
@@ -116,7 +116,7 @@ class WithFilter:
 class WithWindow:
     """Its MPC on its own moving horizon estimator, of state and constant disturbances."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: PartialCase) -> None:
         self._case, self._planner = case, Planner(case)
         self._model = _model(case, measuring=True)
         self._window = window = do_mpc.estimator.MHE(self._model, ['d'])
@@ -150,7 +150,7 @@ class WithWindow:
         return self._u
 
 
-def horizon(case: Case) -> int:
+def horizon(case: PartialCase) -> int:
     """Return how many samples the law `mpc` looks ahead."""
     law = RecedingHorizon(case.truth, case.tuning(case.truth), MPCParameters())
     assert law.planner is not None
@@ -158,18 +158,18 @@ def horizon(case: Case) -> int:
     return round(float(np.sum(lengths) / lengths[0]))
 
 
-def true_filter(case: Case) -> ExtendedKalmanFilter:
+def true_filter(case: PartialCase) -> ExtendedKalmanFilter:
     """Return the filter that a controller of this package has with the true model."""
     model = case.truth
     return ExtendedKalmanFilter(model, case.outputs, case.tuning(model), None)
 
 
-def _guess(case: Case, y: Array) -> Array:
+def _guess(case: PartialCase, y: Array) -> Array:
     """Return what is known at first: the outputs, and of the rest the nominal point."""
     return case.outputs.state(y, case.system.nominal_state)
 
 
-def _model(case: Case, *, measuring: bool) -> Any:
+def _model(case: PartialCase, *, measuring: bool) -> Any:
     """Return the plant with disturbances along some directions, as a model of do-mpc."""
     n, n_u = case.system.n_x, case.system.n_u
     model = do_mpc.model.Model('continuous', 'SX')
@@ -186,7 +186,7 @@ def _model(case: Case, *, measuring: bool) -> Any:
     return model
 
 
-def _settled(case: Case) -> Array:
+def _settled(case: PartialCase) -> Array:
     """Return the filter's covariance of state and disturbances before a sample, in their units."""
     one, model = true_filter(case), case.truth
     x, u = case.goal(case.system)

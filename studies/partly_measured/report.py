@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.reports import draw_limits, drawing, legend, Picture, table
-from studies.partly_measured.cases import Case
-from studies.partly_measured.study import Figures, Run
+from studies.partly_measured.cases import PartialCase
+from studies.partly_measured.study import ComparedFigures, ComparedRun
 
 # By plant and controller, one for each seed.
-Found = Mapping[str, Mapping[str, Sequence[tuple[Run, Figures]]]]
+Found = Mapping[str, Mapping[str, Sequence[tuple[ComparedRun, ComparedFigures]]]]
 _HEAD = ('plant', 'controller', 'cost / least', 'worst', 'offset', 'offset under load',
          'farthest under load', 'above the limit', 'not held', 'step, median [ms]', '99 % [ms]')
 # The others lie upon one of these.
 _DRAWN = ('do-mpc with its MHE', 'LQG at the set-point', '`sdre`, lift', '`mpc`, lift')
 
 
-def figures_of(runs: Sequence[tuple[Run, Figures]]) -> dict[str, Any]:
+def figures_of(runs: Sequence[tuple[ComparedRun, ComparedFigures]]) -> dict[str, Any]:
     """Return the figures of a controller on a plant, all and in short."""
     judged = [one for _, one in runs]
     steps = np.concatenate([run.step_us for run, _ in runs])
@@ -38,8 +38,8 @@ def figures_of(runs: Sequence[tuple[Run, Figures]]) -> dict[str, Any]:
         'step_median_ms': 1e-3 * float(median), 'step_p99_ms': 1e-3 * float(p99)}
 
 
-def table_of(summary: Mapping[str, Mapping[str, Mapping[str, Any]]], cases: Mapping[str, Case]
-             ) -> str:
+def table_of(summary: Mapping[str, Mapping[str, Mapping[str, Any]]],
+             cases: Mapping[str, PartialCase]) -> str:
     """Return the table of what :func:`figures_of` has by plant and controller."""
     rows = []
     for plant, contenders in summary.items():
@@ -56,7 +56,7 @@ def table_of(summary: Mapping[str, Mapping[str, Mapping[str, Any]]], cases: Mapp
     return table(_HEAD, rows, range(2, len(_HEAD)))
 
 
-def draw(found: Found, cases: Mapping[str, Case], path: Path) -> Picture:
+def draw(found: Found, cases: Mapping[str, PartialCase], path: Path) -> Picture:
     """Draw some of the first seed: a state with a set-point above, an input below, by plant."""
     with drawing(path, 2, len(found), size=(4.2 * len(found), 6.4), sharex='col') as (
             figure, axes):

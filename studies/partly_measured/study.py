@@ -15,14 +15,14 @@ from koopman_ros.plants.optimum import cost_along, Course
 from koopman_ros.units import NANOSECONDS
 from studies.equations import EQUATIONS
 from studies.least import least_course
-from studies.partly_measured.cases import Case
+from studies.partly_measured.cases import PartialCase
 from studies.partly_measured.contenders import Contender
 
 _LATE = 1.0 / 3.0  # of a part, over which its offset is the mean
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class ComparedRun:
     """What a controller did."""
 
     times: Array  #: (N,) in s
@@ -32,7 +32,7 @@ class Run:
     failure: str  #: why it ended early, or empty
 
 
-def run(case: Case, contender: Contender, seed: int) -> Run:
+def run(case: PartialCase, contender: Contender, seed: int) -> ComparedRun:
     """Run a controller on the true plant, sampled; the noise follows from seed and sample."""
     plant = Process(case.system, 0, *case.start)
     rows: list[tuple[float, Array, Array, float]] = []
@@ -54,11 +54,11 @@ def run(case: Case, contender: Contender, seed: int) -> Run:
         rows.append((seconds, plant.x, command, spent))
         plant = plant.commanded(command, plant.time_ns)
     times, states, commands, step_us = map(np.array, zip(*rows, strict=True))
-    return Run(times, states, commands, step_us, failure)
+    return ComparedRun(times, states, commands, step_us, failure)
 
 
 @dataclass(frozen=True)
-class Figures:
+class ComparedFigures:
     """What a run was worth."""
 
     #: of the step of the set-point, over the least of all-knowing control from the same state
@@ -71,18 +71,18 @@ class Figures:
     lost: bool  #: whether one of them was further than what counts as reached
 
 
-def least(case: Case, x0: Array) -> Course:
+def least(case: PartialCase, x0: Array) -> Course:
     """Return the course of least cost of the step of the set-point from a state (n_x,)."""
     return least_course(case.task(x0), EQUATIONS[case.plant], case.lower, case.upper,
                         state_upper=case.state_upper)
 
 
-def judge(case: Case, found: Run) -> Figures:
+def judge(case: PartialCase, found: ComparedRun) -> ComparedFigures:
     """Judge a run."""
     first = round(case.stepped_at / case.period)
     end = first + round((case.loaded_at - case.stepped_at) / case.period)
     if found.failure or len(found.times) <= end:
-        return Figures(float('inf'), (float('inf'),) * 2, float('inf'), float('inf'), True)
+        return ComparedFigures(float('inf'), (float('inf'),) * 2, float('inf'), float('inf'), True)
     begin = found.states[first]
     cost = cost_along(case.task(begin), found.states[first:end], found.commands[first:end])
     units = dict(zip(case.system.state_names, case.system.state_units, strict=True))
@@ -97,5 +97,5 @@ def judge(case: Case, found: Run) -> Figures:
         offsets.append(float(np.max(np.abs(np.mean(away[late], axis=0)))))
         farthest = float(np.max(np.abs(away[within])))
     excess = found.states - case.state_upper if len(case.state_upper) else np.zeros(1)
-    return Figures(cost / least(case, begin).cost, (max(offsets[:2]), offsets[2]),
+    return ComparedFigures(cost / least(case, begin).cost, (max(offsets[:2]), offsets[2]),
                    farthest, float(max(np.max(excess), 0.0)), not max(offsets) <= case.reached)

@@ -34,7 +34,7 @@ REACHED = 298.15  # K, the coldest coolant of an actuator that is stuck
 
 
 @dataclass(frozen=True)
-class Case:
+class Disturbed:
     """A loop that is disturbed or whose set-point steps."""
 
     name: str  #: for the tables
@@ -58,15 +58,15 @@ class Case:
             sensor=self.sensor)
 
 
-def _step(words: str, *changes: Timed, **details: Any) -> Case:
-    return Case(f'set-point −10 K{words}', [at(LEAD, at_setpoint(SETPOINT)), *changes], SETPOINT,
-                overshoot=True, **details)
+def _step(words: str, *changes: Timed, **details: Any) -> Disturbed:
+    return Disturbed(f'set-point −10 K{words}', [at(LEAD, at_setpoint(SETPOINT)), *changes],
+                     SETPOINT, overshoot=True, **details)
 
 
-def cases() -> Iterator[Case]:
+def cases() -> Iterator[Disturbed]:
     """Make the cases of the table of offsets."""
     for name, system in CHANGED.items():
-        yield Case(f'{name}, in the loop', [at(LEAD, on_plant(system=system))])
+        yield Disturbed(f'{name}, in the loop', [at(LEAD, on_plant(system=system))])
     yield _step('')
     for name, system in CHANGED.items():
         yield _step(f', {name} all along', system=system)
@@ -78,15 +78,15 @@ def cases() -> Iterator[Case]:
     two = two_state_reactor()
     for words, change in (('−3 K', -3.0), ('+1.5 K', 1.5)):
         reference = float(two.nominal_state[1]) + change
-        yield Case(f'set-point {words} on the two-state reactor',
+        yield Disturbed(f'set-point {words} on the two-state reactor',
                    [at(LEAD, at_setpoint(reference))], reference, two, two.nominal_state.tolist(),
                    overshoot=True)
-    yield Case('sensor bias +2 K', [at(0.0, at_setpoint(START - 5.0))], START - 5.0,
+    yield Disturbed('sensor bias +2 K', [at(0.0, at_setpoint(START - 5.0))], START - 5.0,
                x0=[START - 5.0], sensor=loop.biased(BIAS, LEAD))
     end = LEAD + SATURATED_SECONDS
     for setpoint, words in ((SATURATED_SETPOINT, 'coolant saturated'),
                             (START, 'coolant in its range')):
-        yield Case(f'T_i +{WARM_FEED:g} K for 15 min, {words}, after its end',
+        yield Disturbed(f'T_i +{WARM_FEED:g} K for 15 min, {words}, after its end',
                    [at(0.0, at_setpoint(setpoint)),
                     at(LEAD, on_plant(system=changed_reactor(feed=WARM_FEED))),
                     at(end, on_plant(system=REACTOR))], setpoint, x0=[setpoint], since=end,
@@ -97,7 +97,7 @@ def cases() -> Iterator[Case]:
                     actuator=Actuator(lower=REACHED), tells=tells, seconds=end + SECONDS)
 
 
-def judge(case: Case) -> Metrics:
+def judge(case: Disturbed) -> Metrics:
     """Run a case; times are None for never, `learned` is whether no other law ever acted."""
     course = case.run()
     away = loop.errors(course, case.reference, case.since)
@@ -135,7 +135,7 @@ def noise_against_speed(bandwidth: float) -> Metrics:
     for name, change, reference in (
             ('fouled', on_plant(system=CHANGED['UA −20 %']), START),
             ('step', at_setpoint(SETPOINT), SETPOINT)):
-        course = Case(name, [at(LEAD, change)], reference).run(bandwidth)
+        course = Disturbed(name, [at(LEAD, change)], reference).run(bandwidth)
         for tolerance in (0.2, 1e-3):
             metrics[f'{name}_to_{tolerance:g}_kelvin'] = loop.settling(
                 course, reference, tolerance, LEAD)
