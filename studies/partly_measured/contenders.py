@@ -31,7 +31,7 @@ class Contender(Protocol):
 class Own:
     """A controller of this package with the extended Kalman filter."""
 
-    def __init__(self, case: Case, model: LiftedModel, laws: tuple[str, ...]) -> None:
+    def __init__(self, case: PartialCase, model: LiftedModel, laws: tuple[str, ...]) -> None:
         self._controller = Controller(model, case.tuning(
             model, levels=laws, validity_margin=MARGIN, linear_margin=MARGIN), case.outputs)
         self._state = self._controller.initialise(State(), case.start[1])
