@@ -10,7 +10,6 @@ import tempfile
 from time import perf_counter_ns, thread_time_ns
 from typing import Any, TypeAlias
 
-from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 import numpy as np
 
 from benchmarks.process import Tell
@@ -24,6 +23,7 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.laws.base import Target
+from koopman_ros.control.mpc import RecedingHorizon
 from koopman_ros.control.simulate import after_a_second
 from koopman_ros.estimation import Estimate
 from koopman_ros.plants import Process

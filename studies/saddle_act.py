@@ -285,9 +285,8 @@ def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) 
     alone = n_x == 1
     n_y = n_x if informed else 1
     # not when the harness starts, which needs neither
-    from koopman_ros.control.laws.receding_horizon import MPCParameters
-
     from koopman_ros.control.laws.pi import PIParameters
+    from koopman_ros.control.mpc import MPCParameters
 
     return Controller(model, Tuning.for_model(
         model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,

@@ -140,6 +140,11 @@ class _Run:
         self._parameters = {}
         controller = self._put_in_force(record, None)
         self._state = records.state_of(record)
+        command, n_u = self._state.command, controller.model.n_u
+        if command is not None and command.shape != (n_u,):
+            raise records.RecordError(
+                f'record {record.number} of run {record.run} cannot be replayed: it has a command '
+                f'of shape {command.shape} for {n_u} inputs')
         if self._other is not None:
             same = self._other.digest == record.fields['model']['digest']
             self._other_controller = self._tuned(controller.model if same else self._other.model)

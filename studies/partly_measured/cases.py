@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from koopman_ros.control.laws.receding_horizon import MPCParameters
 import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import InputLimits, Tuning
 from koopman_ros.control.laws.base import Target
+from koopman_ros.control.mpc import MPCParameters
 from koopman_ros.control.steady_state import partial_target
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.plants import ControlAffineSystem, steady_state

@@ -12,10 +12,10 @@ from typing import Any
 import warnings
 
 import casadi
-from koopman_ros.control.laws.receding_horizon import MPCParameters, RecedingHorizon
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
 from koopman_ros.estimation import Estimate, ExtendedKalmanFilter
 from studies.equations import EQUATIONS
 from studies.partly_measured.cases import PartialCase

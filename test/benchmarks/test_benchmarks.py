@@ -10,7 +10,7 @@ from typing import Any
 import warnings
 
 import casadi
-from koopman_ros.learning.levenberg_marquardt import normal_equations
+from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message

@@ -432,7 +432,7 @@ def test_the_records_of_requests():
             Record('run', 1, name, json.loads(json.dumps(fields))))
 
     fields, again = written(SetpointRequest(7, np.array([1.5])))
-    assert 'signals' not in fields
+    assert fields['signals'] is None
     assert again.signals is None
     fields, again = written(SetpointRequest(7, np.array([1.5]), ('h3',)))
     assert fields['signals'] == ['h3']

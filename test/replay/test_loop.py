@@ -210,7 +210,7 @@ def event(measured: object) -> dict[str, object]:
     (0, lambda fields: fields['state'].update({'@': 'os:system'}), "'os:system' is not known"),
     (0, lambda fields: fields['state'].update(extra=1), 'unexpected keyword'),
     (0, lambda fields: fields['state'].update(command={
-        '@': 'array', 'dtype': '<f8', 'shape': [3], 'values': [1.0, 2.0, 3.0]}), 'record 1'),
+        '@': 'array', 'dtype': '<f8', 'shape': [3], 'values': [1.0, 2.0, 3.0]}), 'record 0'),
     (0, lambda fields: fields['model'].update(digest='0' * 64), 'neither shipped nor found'),
     (0, lambda fields: fields['parameters'].update({'coolant_temperature.weight': -1.0}),
      r'refuses .coolant_temperature\.weight = -1\.0'),

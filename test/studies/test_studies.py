@@ -336,7 +336,7 @@ def test_a_lift_at_the_saddle_that_was_learned_in_a_hurry(
                         ('LIMITED_SAMPLES', 120)):
         monkeypatch.setattr(unstable, name, value)
     monkeypatch.setattr(unstable, 'RECIPES', {
-        'neural drift': NeuralDrift((12,), max_iterations=150),
+        'neural drift': NeuralDrift(12, max_iterations=150),
         'free lift': replace(unstable.LIFT, hidden_first=24, max_iterations=250)})
     assert unstable.main(['--seeds', '1']) == 0
     lines = capsys.readouterr().out.splitlines()
