@@ -19,6 +19,7 @@ from koopman_ros.replay.run import replay_records
 from studies.faults.case import Case, Trace
 
 LONGEST_GAP = 3.0  # samples between two commands, for which a larger step is allowed
+_PLANNER = 'koopman_ros.control.mpc.planner'
 _LAST = 30.0  # s at the end of a trace, in which an offset is looked for
 
 
@@ -119,8 +120,9 @@ def _records(trace: Trace, case: Case) -> Iterator[str]:
     """Say which reason the records lack, and where commands do not follow from them."""
     try:
         records = [(seconds, parse(text)) for seconds, text in trace.records]
-        # as the controller was
-        with patch.dict(sys.modules, dict.fromkeys(case.missing)):
+        # as the controller was; a module that found the packages before would find them again
+        missing = (*case.missing, _PLANNER) if case.missing else ()
+        with patch.dict(sys.modules, dict.fromkeys(missing)):
             found = replay_records(record for _, record in records)
     except RecordError as error:
         yield f'its records cannot be replayed: {error}'

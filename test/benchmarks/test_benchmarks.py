@@ -10,7 +10,6 @@ from typing import Any
 import warnings
 
 import casadi
-from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -20,6 +19,7 @@ from benchmarks import ipopt, loop, planning, recording, solvers, training
 from benchmarks.__main__ import main
 from benchmarks.problems import build
 from benchmarks.sqp import Problem, solver_of, Sqp
+from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from studies.equations import EQUATIONS
 from studies.general.learners import LEARNERS
 from support.tensors import assert_close

@@ -23,7 +23,7 @@ def model_arrays(model: LiftedModel) -> ModelArrays:
         P[:states, :n], P[states:, n:] = np.eye(states, n), lift.V
     if terms is not None:
         input_exponents = PolynomialObservables.total_degree(n, terms.degree).exponents
-    arrays = [np.array(part) for part in (
+    arrays = [np.array(part, order='C') for part in (
         W, b, np.tanh(b), exponents, P, model.A,
         np.zeros((0, P.shape[1])) if model.readout is None else model.readout,
         model.pre_feedback_slope, model.B, input_exponents,
