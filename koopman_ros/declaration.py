@@ -24,6 +24,10 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 
+__all__ = ['UNBOUNDED', 'Column', 'NoParameters', 'column', 'for_signals', 'group', 'nested',
+           'of_other_states', 'parameter', 'per_signal', 'plugin_parameters', 'signal_value',
+           'value_column']
+
 T = TypeVar('T')
 
 #: Stands for no bound, in any unit.

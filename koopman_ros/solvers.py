@@ -13,6 +13,9 @@ from scipy.linalg.lapack import dgees
 
 from koopman_ros.arrays import Array
 
+__all__ = ['RiccatiSolution', 'RiccatiStatus', 'over_interval', 'runge_kutta_step',
+           'solve_riccati']
+
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
 _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
