@@ -162,7 +162,8 @@ def _activated_again(loop: FaultHarness) -> None:
         _transit(loop, Transition.TRANSITION_ACTIVATE)
         before = len(loop.trace.commands)
         loop.wait(lambda: len(loop.trace.commands) > before + 3, 'no command after activation')
-    loop.ros.set_bool('controller/set_automatic', True)
+        # the plant is far away until then, however long the answer takes
+        loop.ros.set_bool('controller/set_automatic', True)
     loop.request_until_tracked(*loop.on.setpoint)
 
 
