@@ -151,11 +151,13 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
 
 
 def _activated_again(loop: FaultHarness) -> None:
-    """Deactivate and activate a controller that commands the lowest inputs by hand."""
+    """Deactivate and activate a controller that commands lower inputs by hand."""
     loop.ros.set_bool('controller/set_automatic', False)
-    lowest = tuple(tuned.min for tuned in loop.on.parameters.inputs.values())
-    loop.by_hand(*lowest)
-    loop.wait(lambda: loop.trace.commands[-1].values == lowest, 'the inputs are not commanded')
+    wanted = tuple(0.5 * (tuned.min + last) for tuned, last in zip(
+        loop.on.parameters.inputs.values(), loop.trace.commands[-1].values, strict=True))
+    loop.by_hand(*wanted)
+    loop.wait(lambda: np.allclose(loop.trace.commands[-1].values, wanted, rtol=0.0, atol=1e-6),
+              'the inputs are not commanded')
     with loop.fault():
         _transit(loop, Transition.TRANSITION_DEACTIVATE)
         loop.run_for(5.0)
