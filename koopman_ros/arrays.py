@@ -24,20 +24,6 @@ def along_last(*parts: ArrayLike) -> Array:
     return joined
 
 
-def as_arrays(holder: object, *names: str) -> None:
-    """
-    Turn what a frozen dataclass was given as lists into float64 arrays; leave arrays as they are.
-
-    :raises ValueError: naming the field that holds no numbers, or rows of different lengths.
-    """
-    for name in names:
-        try:
-            array = np.asarray(getattr(holder, name), dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f'{name} must be numbers, got {getattr(holder, name)!r}') from error
-        object.__setattr__(holder, name, array)
-
-
 def brief(holder: object) -> str:
     """Describe a dataclass on one line: long arrays by their shape, other dataclasses by name."""
     shown = ', '.join(f'{field.name}={_brief(getattr(holder, field.name))}'

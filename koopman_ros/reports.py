@@ -21,6 +21,7 @@ import platform
 from typing import Any, TYPE_CHECKING
 
 from koopman_ros import __version__
+from koopman_ros.resources import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,9 +83,7 @@ def write_figures(path: Path, figures: Mapping[str, Any]) -> Path:
     """
     text = json.dumps(_finite(figures), indent=2, allow_nan=False) + '\n'
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + '.part')
-    beside.write_text(text, encoding='utf-8')
-    os.replace(beside, path)
+    write_atomically(path, text.encode())
     return path
 
 

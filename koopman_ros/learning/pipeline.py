@@ -278,13 +278,12 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
            ) -> tuple[Comparison | None, Decision | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
     task, found = bare.task, bare.found
-    learned: Comparison | None = None
-    decision: Decision | None = None
     reasons: tuple[str, ...] = ()
     warnings: list[str] = []
     for begin in (None,) if sibling is None else (sibling, None):
         course = _Course(on_progress)
-        learned = decision = None
+        learned: Comparison | None = None
+        decision: Decision | None = None
         try:
             learned = compare_classes(
                 found, bare.plant, thresholds, model_class=task.model_class,
