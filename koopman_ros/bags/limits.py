@@ -46,8 +46,9 @@ def bounded_reading(bags: Sequence[str | os.PathLike[str]]) -> Iterator[None]:
     free = re.search(r'MemAvailable:\s*(\d+) kB', Path('/proc/meminfo').read_text())
     assert free is not None
     limits = {resource.RLIMIT_AS: used + int(_MEMORY_SHARE * 1024 * int(free[1]))}
+    handler = None
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGXCPU, _raise_time_is_up)
+        handler = signal.signal(signal.SIGXCPU, _raise_time_is_up)
         limits[resource.RLIMIT_CPU] = int(time.process_time() + seconds) + 1
     before = {kind: resource.getrlimit(kind) for kind in limits}
     try:
@@ -65,6 +66,8 @@ def bounded_reading(bags: Sequence[str | os.PathLike[str]]) -> Iterator[None]:
     finally:
         for kind, limit in before.items():
             resource.setrlimit(kind, limit)
+        if handler is not None:
+            signal.signal(signal.SIGXCPU, handler)
 
 
 def _raise_time_is_up(number: int, frame: FrameType | None) -> None:

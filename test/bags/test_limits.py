@@ -14,6 +14,7 @@ from support.bag_samples import NUMBER, number, TEXT, text
 
 # reads a bag with less memory and time than there is, then without
 PROGRAM = """
+import signal
 import sys
 from koopman_ros import bags
 from koopman_ros.bags import limits
@@ -23,6 +24,7 @@ try:
         print(sum(1 for _ in bags.read_messages(sys.argv[1], ['/x'], recover=True)))
 except bags.BagReadError as error:
     print(error)
+assert signal.getsignal(signal.SIGXCPU) is signal.SIG_DFL
 print(bags.summary(sys.argv[1]).message_count)
 """
 
