@@ -8,7 +8,7 @@ LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
 # The predictive law, which the first process would compile otherwise, a quarter of a minute.
 COMPILE := $(BIN)/python -c 'import koopman_ros.control.mpc.planner'
-# Where the environment forbids to keep byte code, each process would compile the package anew.
+# With this variable set, Python caches no byte code, and every process compiles the package again.
 unexport PYTHONDONTWRITEBYTECODE
 # All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
 unexport PYTHONPATH AMENT_PREFIX_PATH

@@ -52,7 +52,7 @@ class PidNode(Node):
 
 
 def main(name: str) -> int:
-    """Let a node answer, as plain as rclpy runs one, until the process is told to end."""
+    """Spin a node with rclpy's default executor until a signal ends the process."""
     rclpy.init()
     node = {'echo': echo, 'pid': PidNode}[name]()
     try:

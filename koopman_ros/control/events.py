@@ -41,7 +41,7 @@ class Silence:
 class SetpointRequest:
     """The operator asks for a set-point."""
 
-    stamp_ns: int  #: from when it is to hold; 0 for now
+    stamp_ns: int  #: time at which it takes effect; 0: immediately
     value: Array  #: of the signals, in the model's units
     #: which of the controlled ones are asked for, the others stay as they are; None for all
     signals: tuple[str, ...] | None = None

@@ -22,8 +22,8 @@ _MOST_MOVES = 10
 _SINGULAR = 1e9  # condition from which on a model has no steady state for each input
 # What rounding may add to an input, in scaled deviations, and to a state, in half-ranges.
 _SLACK = 1e-6
-# With fewer inputs than controlled states a set-point counts as held where a steady state is so
-# near, in half-ranges of the training box: nobody states one to all its digits.
+# With fewer inputs than controlled states a set-point counts as held if a steady state is within
+# this distance, in half-ranges of the training box: operators enter rounded values.
 _NEAR = 0.01
 
 

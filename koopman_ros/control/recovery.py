@@ -83,7 +83,7 @@ class RestState:
     #: (n_x,) in state units; where it leaves what the model knows, a linear extrapolation from
     #: there, and NaN where that does not come to rest
     x: Array
-    outside: float  #: its distance from the training data in half-ranges, NaN likewise
+    outside: float  #: its distance from the training data in half-ranges; NaN if x is NaN
     #: (n_u,) input that would keep the plant where it leaves what the model knows, in input units;
     #: None where it comes to rest before
     holding: Array | None = None

@@ -48,7 +48,8 @@ class ControllerParameters:
         ('',), 'Measured signals with their units, e.g. level [m], which the model must have; its '
         'other states are estimated; an empty name: all states.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'Inputs with their units, likewise.', read_only=True)
+        ('',), 'Inputs with their units, e.g. pump [V], which the model must have; an empty name: '
+        'all inputs.', read_only=True)
     autostart: bool = parameter(
         True, 'Configure and activate at the start; false: a lifecycle manager does.',
         read_only=True)

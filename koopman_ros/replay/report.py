@@ -60,7 +60,7 @@ class ReplayedBag:
     recorded: Array = field(init=False)  #: (n, n_u) commanded then
     #: (n, n_u) commanded by the replay; NaN where it knows no state
     commands: Array = field(init=False)
-    #: (n, n_u) commanded by the new model, NaN likewise
+    #: (n, n_u) commanded by the new model; NaN where it knows no state
     new_commands: Array = field(init=False)
     check: Comparison = field(init=False)  #: the replay beside the record
     #: the new model beside the record, or None without one
