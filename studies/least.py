@@ -7,7 +7,7 @@ import casadi
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.plants.optimum import Course, Task
+from koopman_ros.evaluation.optimal_cost import Course, Task
 from studies.equations import Rates
 
 

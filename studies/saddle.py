@@ -15,17 +15,9 @@ import time
 
 import numpy as np
 
-from koopman_ros.control import (
-    at,
-    Controller,
-    Initialisation,
-    InputLimits,
-    Loop,
-    SetpointRequest,
-    simulate,
-    Tuning,
-)
-from koopman_ros.control.simulate import Change, Simulation
+from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest, Tuning
+from koopman_ros.evaluation import at, Loop, simulate
+from koopman_ros.evaluation.simulate import Change, Simulation
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor

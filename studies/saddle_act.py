@@ -25,19 +25,13 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import (
-    at,
-    Controller,
-    Initialisation,
-    SetpointRequest,
-    simulate,
-    Tuning,
-)
-from koopman_ros.control.simulate import Simulation
+from koopman_ros.control import Controller, Initialisation, SetpointRequest, Tuning
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import FIRST_STAMP_NS, Operator, Row, running_loop, Scenario
 from koopman_ros.demo.reactor import constant
 from koopman_ros.demo.results import draw_phases
+from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation.simulate import Simulation
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT

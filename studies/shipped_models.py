@@ -15,7 +15,7 @@ import sys
 
 import numpy as np
 
-from koopman_ros.control.law_check import LOOPS
+from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.control import Simulation
+from koopman_ros.evaluation import Simulation
 from koopman_ros.plant_data import cut, Episode, Samples, split_by_episode, within
 from support.small_plants import BENT, bent_samples, TWO_STATE
 

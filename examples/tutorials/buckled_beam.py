@@ -21,7 +21,8 @@ import sys
 import matplotlib.pyplot as plt
 import numpy as np
 
-from koopman_ros.control import run_closed_loop, Weights
+from koopman_ros.control import Weights
+from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.learning import compare, Growth, NeuralDrift
 from koopman_ros.plants import (
     box_episodes,

@@ -19,15 +19,8 @@ import sys
 import matplotlib.pyplot as plt
 import numpy as np
 
-from koopman_ros.control import (
-    at,
-    check_law,
-    Controller,
-    InputLimits,
-    SetpointRequest,
-    simulate,
-    Tuning,
-)
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.evaluation import at, check_law, simulate
 from koopman_ros.learning import compare, Growth, NeuralDrift
 from koopman_ros.plants import box_episodes, describe, plant_class, Process, RandomStepDesign
 from koopman_ros.reports import draw_limits, DRAWN_RANGE, legend

@@ -20,7 +20,8 @@ import sys
 import matplotlib.pyplot as plt
 import numpy as np
 
-from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, simulate, Tuning
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.evaluation import at, simulate
 from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
 from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.lifting import load, save

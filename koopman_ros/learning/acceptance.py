@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.control.usable import unusable
+from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.execution import Backend
 from koopman_ros.learning.identification import (
     Drift,
@@ -139,7 +139,7 @@ def decide(found: Identified, learned: Trained | Comparison, current: LiftedMode
 
     :param learned: what was trained, or compared by :func:`compare_classes`, of which the chosen
         model is judged, and whose closed loops are not run again.
-    :param loops: see :func:`~koopman_ros.control.law_check.check_law`, as for `watch`.
+    :param loops: see :func:`~koopman_ros.evaluation.closed_loop_test.check_law`, as for `watch`.
     :raises Stopped: when `watch` ended it.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.law_check import LOOPS
+from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance import HeldOut, Thresholds
 from koopman_ros.learning.identification import Drift, fitted_starts, Identified, longest_step

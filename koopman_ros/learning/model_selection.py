@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 
-from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
+from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.learning.lift.edmd import Edmd

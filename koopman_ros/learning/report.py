@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control.law_map import draw_loops
+from koopman_ros.evaluation.closed_loop_plots import draw_loops
 from koopman_ros.learning.downsampling import CELLS, visited_cells
 from koopman_ros.learning.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate

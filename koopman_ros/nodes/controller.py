@@ -17,7 +17,8 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import Trigger
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import events, MANUAL, Mode, Recent, Report
+from koopman_ros.control import events, MANUAL, Mode, Report
+from koopman_ros.evaluation import Recent
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.model_checks import (
     load_suitable,

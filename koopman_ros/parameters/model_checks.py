@@ -12,8 +12,9 @@ import time
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import compare, Controller, State, Windows
+from koopman_ros.control import Controller, State
 from koopman_ros.control.usable import unusable
+from koopman_ros.evaluation import compare, Windows
 from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of, words_of

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control import ClosedLoop
+from koopman_ros.evaluation import ClosedLoop
 from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign

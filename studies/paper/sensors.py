@@ -10,7 +10,8 @@ import numpy as np
 from koopman_ros import experiment as experiments
 from koopman_ros import plants
 from koopman_ros.arrays import Array
-from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, simulate, Tuning
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.evaluation import at, simulate
 from koopman_ros.learning import (
     decide,
     Decision,

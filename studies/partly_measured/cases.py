@@ -14,9 +14,9 @@ from koopman_ros.control import InputLimits, Tuning
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.mpc import MPCParameters
 from koopman_ros.control.steady_state import partial_target
+from koopman_ros.evaluation.optimal_cost import Task
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.plants import ControlAffineSystem, steady_state
-from koopman_ros.plants.optimum import Task
 from koopman_ros.resources import model_path
 from koopman_ros.signals import Outputs
 from koopman_ros.solvers import solve_riccati

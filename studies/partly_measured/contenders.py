@@ -11,7 +11,7 @@ import numpy as np
 import control
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, State
-from koopman_ros.control.simulate import after_a_second
+from koopman_ros.evaluation.simulate import after_a_second
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import solve_riccati
 from koopman_ros.units import NANOSECONDS

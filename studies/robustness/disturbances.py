@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control import at, perfect, Sensor, Simulation, Timed
+from koopman_ros.evaluation import at, perfect, Sensor, Simulation, Timed
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
 from studies.campaign import Metrics
 from studies.robustness import loop

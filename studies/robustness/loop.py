@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros import control, plants
+from koopman_ros import control, evaluation, plants
 from koopman_ros.arrays import Array
-from koopman_ros.control import Controller, Simulation
+from koopman_ros.control import Controller
+from koopman_ros.evaluation import Simulation
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.resources import model_path
@@ -68,16 +69,16 @@ def at_setpoint(value: float) -> control.Event:
     return control.SetpointRequest(0, np.array([value]))
 
 
-def on_plant(**changes: Any) -> control.Change:
+def on_plant(**changes: Any) -> evaluation.Change:
     """Go on with another `system` or behind another `actuator` from the same state."""
-    def change(loop: control.Loop) -> control.Loop:
+    def change(loop: evaluation.Loop) -> evaluation.Loop:
         assert isinstance(loop.plant, plants.Process)
         return replace(loop, plant=replace(loop.plant, **changes))
 
     return change
 
 
-def biased(bias: float, since: float = 0.0) -> control.Sensor:
+def biased(bias: float, since: float = 0.0) -> evaluation.Sensor:
     """Let the sensor err by so much from a time in s on, in state units."""
     return lambda y, seconds: y + (bias if seconds >= since else 0.0)
 
@@ -105,7 +106,7 @@ def worst(run: Simulation) -> str:
 
 
 def run_loop(controller: Controller, system: plants.ControlAffineSystem, x0: Array,
-             coolant: float, seconds: float, events: Iterable[control.Timed] = (), *,
+             coolant: float, seconds: float, events: Iterable[evaluation.Timed] = (), *,
              actuator: plants.Actuator | None = None, tells: bool = False, noise: float = 0.0,
              **others: Any) -> Simulation:
     """
@@ -120,8 +121,8 @@ def run_loop(controller: Controller, system: plants.ControlAffineSystem, x0: Arr
     plant = plants.Process(system, 0, np.asarray(x0, dtype=np.float64), held,
                            actuator or plants.Actuator(), held)
     n_x = controller.model.n_x
-    return control.simulate(
-        controller, plant, [control.at(0.0, control.Initialisation(held)), *events],
+    return evaluation.simulate(
+        controller, plant, [evaluation.at(0.0, control.Initialisation(held)), *events],
         duration=seconds, C=np.eye(system.n_x)[-n_x:],
         noise=np.full(n_x, noise) if noise else None,
-        input_sensor=control.perfect if tells else None, **others)
+        input_sensor=evaluation.perfect if tells else None, **others)

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros import control
-from koopman_ros.control import at, Controller, Simulation
+from koopman_ros import control, evaluation
+from koopman_ros.control import Controller
+from koopman_ros.evaluation import at, Simulation
 from koopman_ros.learning import Growth, Linearisation, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign
@@ -41,7 +42,7 @@ class Trial:
     name: str  #: for the tables
     temperature: float  #: of the reactor at the start, in K
     bandwidth: float = loop.BANDWIDTH  #: of the observer, in 1/min
-    changes: Sequence[control.Timed] = ()  #: what happens when, in s
+    changes: Sequence[evaluation.Timed] = ()  #: what happens when, in s
 
     def run(self, controller: Controller) -> Simulation:
         """Drive the true reactor to its steady state."""
@@ -106,7 +107,7 @@ def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
         **({'recovery_time': 1.0} if fallback else loop.NO_FALLBACK)))
 
     # put into the controller's state, since it refuses set-points outside its data
-    def to_origin(before: control.Loop) -> control.Loop:
+    def to_origin(before: evaluation.Loop) -> evaluation.Loop:
         origin = control.Setpoint(np.zeros(2), np.zeros(2))
         return replace(before, state=replace(before.state, setpoint=origin))
 

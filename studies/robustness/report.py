@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import Simulation
+from koopman_ros.evaluation import Simulation
 from koopman_ros.reasons import level_words
 from koopman_ros.reports import drawing, DRAWN_RANGE, legend, Picture, table
 from studies import report

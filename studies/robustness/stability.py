@@ -13,8 +13,9 @@ from scipy.signal import cont2discrete
 
 import control
 from koopman_ros.arrays import Array
-from koopman_ros.control import at, Controller, Loop, Report, SAFE, State, Supervisor
+from koopman_ros.control import Controller, Report, SAFE, State, Supervisor
 from koopman_ros.estimation import Estimate
+from koopman_ros.evaluation import at, Loop
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
 from koopman_ros.units import NANOSECONDS

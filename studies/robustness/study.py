@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control import Simulation
+from koopman_ros.evaluation import Simulation
 from koopman_ros.execution import Backend
 from studies.campaign import over
 from studies.robustness import disturbances, narrow, stability

@@ -10,15 +10,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from koopman_ros.control import (
-    exchange,
-    InputLimits,
-    Mode,
-    ModeChange,
-    restart,
-    State,
-)
+from koopman_ros.control import InputLimits, Mode, ModeChange, State
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
+from koopman_ros.evaluation import exchange, restart
 from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,

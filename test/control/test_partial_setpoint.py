@@ -12,20 +12,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import lsq_linear
 
-from koopman_ros.control import (
-    at,
-    Controller,
-    InputLimits,
-    run_closed_loop,
-    SetpointRequest,
-    simulate,
-    State,
-    Tuning,
-    Weights,
-)
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
 from koopman_ros.control.events import Outcome
 from koopman_ros.control.steady_state import reachable_target
 from koopman_ros.estimation import Estimate
+from koopman_ros.evaluation import at, run_closed_loop, simulate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.lifting.observables import PolynomialObservables
 from koopman_ros.plants import Actuator, Process

@@ -8,16 +8,15 @@ import pytest
 from scipy.linalg import expm
 
 from koopman_ros.control import (
-    at,
     Controller,
     Initialisation,
     InputLimits,
     SetpointRequest,
-    simulate,
     State,
     Tuning,
 )
 from koopman_ros.control.laws.pi import PIParameters
+from koopman_ros.evaluation import at, simulate
 from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.reasons import Code

@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control import (
-    perfect,
-    SensorLimits,
-    Silence,
-    State,
-)
+from koopman_ros.control import SensorLimits, Silence, State
 from koopman_ros.estimation import (
     check,
     equivalent_bias,
     Estimate,
 )
+from koopman_ros.evaluation import perfect
 from koopman_ros.plants import Actuator, two_state_reactor
 from koopman_ros.signals import Outputs
 from studies.robustness.disturbances import CHANGED

@@ -13,14 +13,10 @@ from scipy.linalg import expm, solve_discrete_are
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import (
-    at,
     Controller,
-    exchange,
     Initialisation,
     InputLimits,
-    Loop,
     SetpointRequest,
-    simulate,
     State,
     Tuning,
 )
@@ -32,6 +28,7 @@ from koopman_ros.estimation import (
     UnscentedKalmanFilter,
 )
 from koopman_ros.estimation.kalman_filters import uncertainty
+from koopman_ros.evaluation import at, exchange, Loop, simulate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters

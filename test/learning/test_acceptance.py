@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from koopman_ros.control.law_check import LawCheck
+from koopman_ros.evaluation.closed_loop_test import LawCheck
 from koopman_ros.learning import decide, learn_lift, Thresholds
 from koopman_ros.learning.acceptance import uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.control.law_check import check_law
+from koopman_ros.evaluation.closed_loop_test import check_law
 from koopman_ros.learning import (
     compare,
     Contender,

@@ -9,14 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from koopman_ros.control import (
-    at,
-    Controller,
-    InputLimits,
-    SetpointRequest,
-    simulate,
-    Tuning,
-)
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
 from koopman_ros.learning import fit, roll_out
 from koopman_ros.lifting import load
 from koopman_ros.plants import (
@@ -26,7 +21,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
     steady_state,
 )
-from koopman_ros.plants.optimum import cost_along, linear_law, optimum, Task
 from koopman_ros.resources import model_path
 from studies import saddle
 from studies.paper import reactor

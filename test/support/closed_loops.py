@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import root
 
-from koopman_ros import control, plants
+from koopman_ros import control, evaluation, plants
 from koopman_ros.arrays import Array
 from koopman_ros.estimation import DisturbanceObserver
 from koopman_ros.lifting import LiftedModel, load
@@ -62,7 +62,7 @@ def reactor_weights(model: LiftedModel, R: float) -> control.Weights:
 
 def run_reactor(model: LiftedModel, law: Law, R: float, minutes: float) -> tuple[float, float]:
     """Drive the true reactor to the set-point; return its cost and its last temperature."""
-    run = control.run_closed_loop(
+    run = evaluation.run_closed_loop(
         model, REACTOR.derivative, np.array([START]), np.array([SETPOINT]),
         reactor_weights(model, R), minutes, law=law, samples=2, rtol=1e-10,
         u_ref=np.array([COOLANT]))
@@ -106,15 +106,15 @@ class Reactor:
     def __init__(self, controller: control.Controller,
                  plant: plants.ControlAffineSystem = REACTOR, kelvin: float = START, *,
                  actuator: plants.Actuator | None = None, noise: float = 0.0,
-                 sensor: control.Sensor = control.perfect,
-                 input_sensor: control.Sensor | None = None, coolant: float | None = None
+                 sensor: evaluation.Sensor = evaluation.perfect,
+                 input_sensor: evaluation.Sensor | None = None, coolant: float | None = None
                  ) -> None:
         x = np.append(plant.nominal_state[:-1], kelvin)
         u = plants.equilibrium_input(plant, x) if coolant is None else np.array([coolant])
-        self.loop = control.Loop(controller, controller.initialise(control.State(), u),
+        self.loop = evaluation.Loop(controller, controller.initialise(control.State(), u),
                          plants.Process(plant, 0, x, u, actuator or plants.Actuator(), u))
         self.noise, self.sensor, self.input_sensor = noise, sensor, input_sensor
-        self.waiting: list[control.Event | control.Change] = []
+        self.waiting: list[control.Event | evaluation.Change] = []
         self.samples: list[Sample] = []
 
     @property
@@ -122,7 +122,7 @@ class Reactor:
         second = len(self.samples)
         return float(self.loop.plant.until(second * SECOND).x[-1])
 
-    def do(self, *what: control.Event | control.Change) -> None:
+    def do(self, *what: control.Event | evaluation.Change) -> None:
         self.waiting += what
 
     def ask(self, kelvin: float) -> None:
@@ -147,9 +147,9 @@ class Reactor:
             found = sensor(float(y[0])) if sensor else self.sensor(y, second)
             return None if found is None else np.reshape(found, 1)
 
-        run = control.simulate(
+        run = evaluation.simulate(
             self.loop.controller, self.loop.plant.until(first * SECOND),
-            [control.at(0.0, what) for what in self.waiting], duration=seconds - 1.0,
+            [evaluation.at(0.0, what) for what in self.waiting], duration=seconds - 1.0,
             C=np.eye(len(self.loop.plant.x))[-1:], seed=first, sensor=measure,
             noise=np.array([self.noise]) if self.noise else None, state=self.loop.state,
             input_sensor=self.input_sensor, stamp=lambda time_ns: EPOCH + time_ns)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from koopman_ros.arrays import brief
-from koopman_ros.control.law_check import Rate
+from koopman_ros.evaluation.closed_loop_test import Rate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Array, Samples
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from koopman_ros import __version__
 from koopman_ros.arrays import brief
-from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
+from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.learning.lift.edmd import Edmd
@@ -89,7 +89,7 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
         refused.
     :param loops: closed loops in which the law is tried before, see
-        :func:`~koopman_ros.control.law_check.check_law`; 0 for none.
+        :func:`~koopman_ros.evaluation.closed_loop_test.check_law`; 0 for none.
     :param device: that evaluates the residuals, as torch names it, on every worker.
     :param threads: torch's threads for each start, for a number of which the bits are the same.
     :param backend: of starts and closed loops, see :func:`~koopman_ros.execution.backend_of`; this

@@ -9,12 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from koopman_ros.control import averaged, recentred, run_closed_loop, steady_state_target, Weights
-from koopman_ros.control.hindsight import Windows
-from koopman_ros.control.law_check import check_law
+from koopman_ros.control import averaged, recentred, steady_state_target, Weights
 from koopman_ros.control.steady_state import partial_target, resting_state
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
+from koopman_ros.evaluation import run_closed_loop
+from koopman_ros.evaluation.closed_loop_test import check_law
+from koopman_ros.evaluation.model_comparison import Windows
 from koopman_ros.learning import Edmd, fit, Growth, NeuralDrift, roll_out, train
 from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify

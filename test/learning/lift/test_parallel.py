@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import koopman_ros
-from koopman_ros.control.law_check import check_law
+from koopman_ros.evaluation.closed_loop_test import check_law
 from koopman_ros.learning import train
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.record import read_record

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.law_loops import (
+from koopman_ros.control.laws import Law, StateDependentRiccati, Weights
+from koopman_ros.evaluation.closed_loop_batch import (
     DriftPlant,
     judge_loops,
     Loops,
     MOST_EXCESS,
     Rate,
 )
-from koopman_ros.control.laws import Law, StateDependentRiccati, Weights
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
 from koopman_ros.lifting.training_data import MAX_TRIED_LOOPS

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
+from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
 from koopman_ros.plants import ControlAffineSystem, plant_class, two_state_example
-from koopman_ros.plants.optimum import cost_along, linear_law, optimum, Task
 
 A = np.array([[0.5, 1.0, 0.0], [-1.0, 0.2, 0.3], [0.0, 0.4, -0.8]])
 B = np.array([[0.0, 0.2], [1.0, 0.0], [0.0, 0.7]])

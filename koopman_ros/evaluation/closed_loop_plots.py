@@ -11,7 +11,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control.law_check import LawCheck, MOST_COST
+from koopman_ros.evaluation.closed_loop_test import LawCheck, MOST_COST
 from koopman_ros.reports import drawing, DRAWN_RANGE, legend
 from koopman_ros.units import shown, unit_label
 

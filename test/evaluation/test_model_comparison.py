@@ -17,9 +17,9 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.events import Measurement
-from koopman_ros.control.hindsight import Recent, Windows
-from koopman_ros.control.simulate import at, simulate
 from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.evaluation.model_comparison import Recent, Windows
+from koopman_ros.evaluation.simulate import at, simulate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
 from koopman_ros.signals import Outputs

@@ -14,7 +14,7 @@ from scipy.linalg import solve_continuous_are
 from koopman_ros.control import Controller, InputLimits, Mode, Tuning
 from koopman_ros.control.events import Initialisation, ManualCommand, ModeChange, SetpointRequest
 from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, Weights
-from koopman_ros.control.simulate import at, exchange, restart, run_closed_loop, simulate
+from koopman_ros.evaluation.simulate import at, exchange, restart, run_closed_loop, simulate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
     Actuator,

@@ -13,11 +13,11 @@ import pytest
 from scipy.integrate import quad
 
 from koopman_ros.control import Controller, InputLimits, State, Tuning
-from koopman_ros.control.law_check import check_law, LawCheck
-from koopman_ros.control.law_map import draw_loops, plot_law_check
 from koopman_ros.control.laws import Law, LawResult, Linear
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.estimation import Estimate
+from koopman_ros.evaluation.closed_loop_plots import draw_loops, plot_law_check
+from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck
 from koopman_ros.lifting import (
     Coordinates,
     LiftedModel,
