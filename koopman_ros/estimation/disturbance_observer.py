@@ -17,11 +17,14 @@ from koopman_ros.tuning import Tuning
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1
 _MAX_STEPS = 20
+# A prediction this many half-ranges out of the trained range is worth nothing: the model's drift
+# grows without bound there, and correction could not bring the estimate back.
+_LOST = 10.0
 _CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
 
 
 def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
-    """Integrate the model by Heun's method, as :meth:`Estimator.predict`; None for too long."""
+    """Integrate the model by Heun's method; None after too long, or where the estimate is lost."""
     duration = seconds / model.seconds_per_time_unit
     steps = max(1, math.ceil(duration * model.linearised.fastest_rate / _STEP_SHARE))
     if steps > _MAX_STEPS:
@@ -30,6 +33,8 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
     for _ in range(steps):
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
+    if not np.all(np.abs(x) <= _LOST * model.states.half_widths):
+        return None
     return Estimate(x, estimate.w)
 
 

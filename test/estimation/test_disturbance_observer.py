@@ -75,6 +75,17 @@ def test_prediction_is_that_of_the_differential_equation():
     assert observer.predict(estimate, u, 3600.0) is None
 
 
+def test_an_estimate_far_outside_returns_to_the_measurement():
+    # where a polynomial drift carries a prediction away faster than corrections bring it back
+    model = shipped('two_state')
+    observer = observing(model, 0.02)
+    estimate = Estimate(np.array([-0.697, 2.545]), np.array([0.253, 0.918]))
+    for _ in range(600):
+        predicted = observer.predict(estimate, np.array([-0.998]), 0.5) or estimate
+        estimate = observer.correct(predicted, np.zeros(2), 0.5)
+    assert np.max(np.abs(estimate.x)) < 0.5
+
+
 def test_the_disturbance_is_bounded():
     observer = observing(MODEL, 0.1, 0.5)
     huge = observer.correct(Estimate(np.zeros(1), np.zeros(1)), np.array([1e6]), 1.0)
