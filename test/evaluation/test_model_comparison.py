@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from koopman_ros.control import (
-    Controller,
-    hindsight,
-    InputLimits,
-    SetpointRequest,
-    Tuning,
-)
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
-from koopman_ros.evaluation.model_comparison import Recent, Windows
+from koopman_ros.evaluation import model_comparison
+from koopman_ros.evaluation.model_comparison import Comparison, Recent, Windows
 from koopman_ros.evaluation.simulate import at, simulate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
@@ -46,8 +41,8 @@ def one(model: LiftedModel, outputs: Outputs | None = None) -> Controller:
 
 
 def compare(present: LiftedModel, candidate: LiftedModel, windows: Windows,
-            outputs: Outputs | None = None) -> hindsight.Comparison | None:
-    return hindsight.compare(one(present, outputs), one(candidate, outputs), windows)
+            outputs: Outputs | None = None) -> Comparison | None:
+    return model_comparison.compare(one(present, outputs), one(candidate, outputs), windows)
 
 
 def recent(x: np.ndarray, u: np.ndarray, length: float, seconds: float = 1.0) -> Recent:
