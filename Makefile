@@ -136,7 +136,7 @@ docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a
 	  --doctree-dir out/docs/.doctrees docs out/docs
 
 config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from their tables
-	$(BIN)/python -m koopman_ros.ros.programs
+	$(BIN)/python -m koopman_ros.ros.node_descriptions
 
 lock: | $(BIN)/python  ## take the newest versions within the ranges of setup.py -> requirements.lock
 	$(BIN)/python -m pip install --quiet uv

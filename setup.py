@@ -84,12 +84,12 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'plant = koopman_ros.startup:plant',
-            'controller = koopman_ros.startup:controller',
-            'trainer = koopman_ros.startup:trainer',
-            'player = koopman_ros.startup:player',
-            'replay = koopman_ros.startup:replay',
-            'panel = koopman_ros.startup:panel',
+            'plant = koopman_ros.process_entry:plant',
+            'controller = koopman_ros.process_entry:controller',
+            'trainer = koopman_ros.process_entry:trainer',
+            'player = koopman_ros.process_entry:player',
+            'replay = koopman_ros.process_entry:replay',
+            'panel = koopman_ros.process_entry:panel',
         ],
     },
 )

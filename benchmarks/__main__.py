@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import sys
 
-from koopman_ros.reports import machine, write_figures
+from koopman_ros.core.plots import machine, write_figures
 
 # A part has its PLANS by extent, the PACKAGES whose versions matter, and `measure`, which fills
 # in the figures of one plan and yields them piece by piece as text.

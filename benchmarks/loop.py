@@ -18,12 +18,12 @@ import psutil
 from sensor_msgs.msg import Temperature
 
 from benchmarks import planning, process
+from koopman_ros.core.plots import table
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from koopman_ros.reports import table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, NodeProcess
-from koopman_ros.units import NANOSECONDS
 
 PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')
 MEANING = {

@@ -14,15 +14,15 @@ import numpy as np
 
 from benchmarks.process import Tell
 from benchmarks.sqp import Problem, solver_of, Sqp
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, SetpointRequest, State
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.mpc import RecedingHorizon
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.simulate import after_a_second
 from koopman_ros.plants import Process
-from koopman_ros.units import NANOSECONDS
 from studies.equations import EQUATIONS
 from studies.partly_measured.cases import CASES, PartialCase
 

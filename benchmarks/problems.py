@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.learning.lift.incremental import Growth
 from koopman_ros.learning.lift.network import Layout, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples

@@ -19,11 +19,11 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 
 from benchmarks.process import processor_seconds
-from koopman_ros.bags import BagMessage, BagWriter, message_definition, read_messages
-from koopman_ros.reports import table
+from koopman_ros.core.plots import table
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.records import BagMessage, BagWriter, message_definition, read_messages
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
 
 PACKAGES = ('mcap',)
 _TOPIC, _TYPE = '/temperature', 'sensor_msgs/msg/Temperature'

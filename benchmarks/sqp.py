@@ -14,7 +14,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from studies.equations import Rates
 
 # Its own solver of quadratic programs can be generated as C together with the rest.

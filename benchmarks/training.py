@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmarks import process, solvers
 from benchmarks.problems import build, Case, SYSTEMS
+from koopman_ros.core.plots import drawing, legend, table
 from koopman_ros.plants import describe
-from koopman_ros.reports import drawing, legend, table
 from studies.general.learners import LEARNERS
 from studies.general.study import predicted
 from studies.general.systems import CASES

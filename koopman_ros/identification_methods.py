@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from koopman_ros.declaration import NoParameters, parameter
-from koopman_ros.plugs import plug_class, short_name
+from koopman_ros.core.declaration import NoParameters, parameter
+from koopman_ros.core.plugins import plug_class, short_name
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief
-from koopman_ros.declaration import (
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.declaration import (
     ANY,
     column,
     for_signals,
@@ -20,8 +20,8 @@ from koopman_ros.declaration import (
     UNBOUNDED,
     value_column,
 )
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plugs import short_name
+from koopman_ros.core.plugins import short_name
+from koopman_ros.model import LiftedModel
 
 
 @dataclass(frozen=True)

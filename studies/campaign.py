@@ -17,9 +17,9 @@ from typing import Any, TypeAlias, TypeVar
 from tqdm import tqdm
 
 from koopman_ros import __version__
+from koopman_ros.core.plots import write_figures
 from koopman_ros.execution import Backend, backend_of, SchedulerLost, Serial, Tell, WorkerLost
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reports import write_figures
+from koopman_ros.model import LiftedModel
 
 Key = TypeVar('Key')
 Found = TypeVar('Found')

@@ -6,7 +6,7 @@
 import casadi
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.evaluation.optimal_cost import Course, Task
 from studies.equations import Rates
 

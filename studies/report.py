@@ -11,7 +11,7 @@ from pathlib import Path
 import statistics
 from typing import Any, TypeAlias
 
-from koopman_ros.reports import Picture, table, write_page
+from koopman_ros.core.plots import Picture, table, write_page
 
 Values: TypeAlias = Sequence[float | bool | None]  # of a figure, by seed
 Cell: TypeAlias = Callable[[Values | None], str]

@@ -16,14 +16,14 @@ import time
 import numpy as np
 
 from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest, Tuning
+from koopman_ros.core.plots import table
+from koopman_ros.core.signals import Outputs
 from koopman_ros.evaluation import at, Loop, simulate
 from koopman_ros.evaluation.simulate import Change, Simulation
 from koopman_ros.execution import Backend, backend_of
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
-from koopman_ros.reports import table
-from koopman_ros.signals import Outputs
 from studies.campaign import over, read_options
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel

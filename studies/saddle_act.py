@@ -24,24 +24,24 @@ import matplotlib.figure  # noqa: F401
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Initialisation, SetpointRequest, Tuning
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, LIMIT, write_figures
+from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_MINUTE, to_celsius, ZERO_CELSIUS
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import FIRST_STAMP_NS, Operator, Row, running_loop, Scenario
 from koopman_ros.demo.reactor import constant
 from koopman_ros.demo.results import draw_phases
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.simulate import Simulation
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, load, Provenance, save
+from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state
-from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, LIMIT, write_figures
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.topics import CONTROLLER_STATE, LOOP_QOS
-from koopman_ros.solvers import runge_kutta_step
 from koopman_ros.testing import HarnessError
-from koopman_ros.units import NANOSECONDS, SECONDS_PER_MINUTE, to_celsius, ZERO_CELSIUS
 from studies.saddle import (
     becomes,
     FIRST_GUESS,

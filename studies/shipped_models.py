@@ -15,11 +15,11 @@ import sys
 
 import numpy as np
 
+from koopman_ros.core.datasets import Samples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.learning.lift.multistart import Watch
-from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
-from koopman_ros.plant_data import Samples
+from koopman_ros.model import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import (
     box_episodes,
     ControlAffineSystem,

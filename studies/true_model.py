@@ -8,10 +8,10 @@ from typing import Self
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
-from koopman_ros.lifting.input_matrix import InputTerms
-from koopman_ros.lifting.model import NODES, WEIGHTS
+from koopman_ros.core.arrays import Array
+from koopman_ros.model import Coordinates, LiftedModel, NetworkObservables, Provenance
+from koopman_ros.model.input_matrix import InputTerms
+from koopman_ros.model.lifted_model import NODES, WEIGHTS
 from koopman_ros.plants import ControlAffineSystem
 
 _AFFINE = 1e-9  # relative, of what an input matrix may miss of a straight line

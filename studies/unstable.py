@@ -13,16 +13,17 @@ import time
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest, Tuning
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Samples
+from koopman_ros.core.plots import table
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, Course, optimum, Task
 from koopman_ros.evaluation.simulate import Simulation
 from koopman_ros.execution import Backend, backend_of, Tell
 from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
 from koopman_ros.learning.lift.multistart import Recipe
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Samples
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import (
     box_episodes,
     describe,
@@ -31,7 +32,6 @@ from koopman_ros.plants import (
     steady_state,
     two_state_reactor,
 )
-from koopman_ros.reports import table
 from studies.campaign import read_options
 from studies.equations import EQUATIONS
 from studies.general.systems import SADDLE

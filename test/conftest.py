@@ -19,7 +19,7 @@ os.environ.setdefault('MKL_NUM_THREADS', '1')
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-from koopman_ros.startup import SIGNALS
+from koopman_ros.process_entry import SIGNALS
 from support.disturbance import disturb_training
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message

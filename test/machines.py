@@ -22,7 +22,7 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 # What holds on every machine or not: the numerics, and what is made of them.
-NUMERICAL = ('test/plants', 'test/lifting', 'test/control', 'test/learning',
+NUMERICAL = ('test/plants', 'test/model', 'test/control', 'test/learning',
              'test/studies/test_studies.py', 'test/test_examples.py')
 # Trainings, which amplify rounding: half a minute of them.
 TRAINING = ('test/studies/test_shipped_models.py', 'test/learning/lift/test_training.py')

@@ -21,9 +21,9 @@ import pytest
 from scipy.linalg import solve_continuous_are
 from sensor_msgs.msg import JointState
 
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
 from support.nodes import ros, type_support
 from support.tanks import LEVELS, PUMPS, TANKS
 

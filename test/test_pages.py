@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from koopman_ros.control.laws import Plan
+from koopman_ros.core.message_fields import CARRIERS, place
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.ros import programs, topics
+from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_limits
-from koopman_ros.wire import CARRIERS, place
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
@@ -87,8 +87,8 @@ def test_interfaces_list_the_topics_with_their_types_and_the_services() -> None:
     services = {row[0].strip('`') for row in _rows('interfaces.md') if 'std_srvs/' in row[1]}
     text = (ROOT / 'docs' / 'interfaces.md').read_text()
     managed = set(re.findall(r'`(~/\w+_\w+)`', text[text.index('## Lifecycle'):]))
-    for name, node in programs.PROGRAMS.items():
-        serves = set(node.serves) - set(programs.STANDARD_SERVICES)
+    for name, node in node_descriptions.PROGRAMS.items():
+        serves = set(node.serves) - set(node_descriptions.STANDARD_SERVICES)
         own = {service for service in serves if service.replace('~', f'/{name}') in services}
         assert serves - own == (managed & serves), name
         assert not serves - own or managed <= {*node.serves, *node.publishes}, name
@@ -134,7 +134,7 @@ def test_interfaces_list_what_there_is_of_each_signal() -> None:
     """Beside its places, with the unit of each."""
     rows = {row[0]: row[1:] for row in _rows('interfaces.md') if 'unit]' in row[1]}
     for node, cells in rows.items():
-        table = programs.tables()[node]
+        table = node_descriptions.tables()[node]
         for cell, kind in zip(cells, ('states', 'inputs'), strict=True):
             (name, unit), = table.signals[kind].items()
             listed = {}

@@ -22,6 +22,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from koopman_ros.control import Weights
+from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.learning import compare, Growth, NeuralDrift
 from koopman_ros.plants import (
@@ -31,8 +33,6 @@ from koopman_ros.plants import (
     equilibrium_input,
     RandomStepDesign,
 )
-from koopman_ros.reports import draw_limits, DRAWN_RANGE, legend
-from koopman_ros.solvers import solve_riccati
 
 # a notebook has arguments of its own
 OUT = Path(*[word for word in sys.argv[1:2] if word[0] != '-'] or ['out/tutorials'])

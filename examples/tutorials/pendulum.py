@@ -20,10 +20,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
 from koopman_ros.evaluation import at, check_law, simulate
 from koopman_ros.learning import compare, Growth, NeuralDrift
 from koopman_ros.plants import box_episodes, describe, plant_class, Process, RandomStepDesign
-from koopman_ros.reports import draw_limits, DRAWN_RANGE, legend
 
 # a notebook has arguments of its own
 OUT = Path(*[word for word in sys.argv[1:2] if word[0] != '-'] or ['out/tutorials'])

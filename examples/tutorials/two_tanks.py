@@ -21,11 +21,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
 from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
-from koopman_ros.lifting import load, save
-from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.model import load, save
 from koopman_ros.plants import (
     equilibrium_input,
     plant_class,
@@ -33,7 +34,6 @@ from koopman_ros.plants import (
     random_steps,
     RandomStepDesign,
 )
-from koopman_ros.reports import draw_limits, DRAWN_RANGE, legend
 
 # a notebook has arguments of its own
 OUT = Path(*[word for word in sys.argv[1:2] if word[0] != '-'] or ['out/tutorials'])

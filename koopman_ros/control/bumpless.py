@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.tuning import InputLimits
 
 # In input units; what is left then is below the resolution of any actuator.

@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief, kept
 from koopman_ros.control.estimates import StateEstimation
 from koopman_ros.control.fallback import build_levels, Level
 from koopman_ros.control.supervisor import FallbackOrder
-from koopman_ros.lifting import Coordinates, LiftedModel
-from koopman_ros.signals import Outputs
+from koopman_ros.core.arrays import Array, brief, kept
+from koopman_ros.core.signals import Outputs
+from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import Tuning
 
 

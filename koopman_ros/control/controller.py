@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array, kept
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import with_step
 from koopman_ros.control.fallback import Level
@@ -21,10 +20,11 @@ from koopman_ros.control.state import Mode, State
 from koopman_ros.control.step import ControlStep
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.control.timing import usual_interval
+from koopman_ros.core.arrays import Array, kept
+from koopman_ros.core.plugins import contained
+from koopman_ros.core.signals import numbers
+from koopman_ros.core.status import Code, Reason, reason, UNMEASURED
 from koopman_ros.estimation import equivalent_bias, Estimate
-from koopman_ros.plugs import contained
-from koopman_ros.reasons import Code, Reason, reason, UNMEASURED
-from koopman_ros.signals import numbers
 
 
 @dataclass(frozen=True)

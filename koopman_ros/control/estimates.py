@@ -9,17 +9,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.fallback import Level
 from koopman_ros.control.state import State
 from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import Code
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import check, Estimate, Standstill, Verdict
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Code
-from koopman_ros.signals import Outputs
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
-from koopman_ros.units import NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,10 @@ that a command follows from the same numbers in each.
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.state import Mode, Report, State
-from koopman_ros.reasons import Code, Reason
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.status import Code, Reason
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws import LAWS
 from koopman_ros.control.laws.base import (
     Law,
@@ -23,11 +22,12 @@ from koopman_ros.control.laws.base import (
     Target,
 )
 from koopman_ros.control.steady_state import partial_target, reachable_target
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.plugins import contained, plug_in
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import Code, Reason, reason
 from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
-from koopman_ros.lifting import Coordinates, LiftedModel
-from koopman_ros.plugs import contained, plug_in
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.signals import Outputs
+from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import InputLimits, Tuning
 
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.fallback import Level
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.steady_state import nearest_steady_state, resting_state
-from koopman_ros.lifting import Coordinates
-from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.model import Coordinates
 
 _HALVINGS = 24  # to 1e-7 of the way
 _MOST_MOVES = 10

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.model import LiftedModel
 
 # The input is ahead of the plant by this share of the way from the safe input to the nominal
 # one; a sensor that stands still out there brings it no further.

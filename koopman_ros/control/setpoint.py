@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import Coordinates
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.model import Coordinates
 
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief
 from koopman_ros.control.bumpless import BumplessTransfer
 from koopman_ros.control.laws.base import NO_SOLUTION, Plan, SolutionInfo
 from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.plugins import contained
+from koopman_ros.core.status import Reason
 from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
-from koopman_ros.plugs import contained
-from koopman_ros.reasons import Reason
 
 
 class Mode(Enum):

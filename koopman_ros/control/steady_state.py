@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Target
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.core.arrays import Array
+from koopman_ros.model import LiftedModel
 
 _MOST_STEPS = 30
 # A step is no longer than this, in scaled deviations: Newton's method far out overshoots.

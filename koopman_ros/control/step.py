@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array, kept
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
 from koopman_ros.control.configuration import Configuration
@@ -37,11 +36,12 @@ from koopman_ros.control.state import (
 )
 from koopman_ros.control.supervisor import HOLD, MANUAL, Requested, SAFE, Supervisor
 from koopman_ros.control.timing import afresh, StepTime, time_of_measurement, time_of_silence
+from koopman_ros.core.arrays import Array, kept
+from koopman_ros.core.plugins import contained
+from koopman_ros.core.signals import numbers
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.units import LATE_NANOSECONDS
 from koopman_ros.estimation import Estimate, Verdict
-from koopman_ros.plugs import contained
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.signals import numbers
-from koopman_ros.units import LATE_NANOSECONDS
 
 
 @dataclass(frozen=True)

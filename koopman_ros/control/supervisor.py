@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.units import NANOSECONDS
 
 # What follows when no law can act, in this order.
 HOLD = 'hold'

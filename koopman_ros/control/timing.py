@@ -10,7 +10,7 @@ import math
 
 from koopman_ros.control.state import State
 from koopman_ros.control.supervisor import HOLD
-from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
+from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
 
 # s that the rate limit counts at most between two commands without a measurement, unless
 # measurements are usually further apart.

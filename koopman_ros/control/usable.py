@@ -5,9 +5,9 @@
 
 import math
 
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.units import Display, display_unit
-from koopman_ros.wire import SIGNAL_NAME
+from koopman_ros.core.message_fields import SIGNAL_NAME
+from koopman_ros.core.units import Display, display_unit
+from koopman_ros.model import LiftedModel
 
 
 def unusable(model: LiftedModel) -> str:

@@ -5,7 +5,7 @@
 
 import sys
 
-from koopman_ros.startup import run_program
+from koopman_ros.process_entry import run_program
 
 if __name__ == '__main__':
     sys.exit(run_program('koopman_ros.demo.setpoint_demo', 130))

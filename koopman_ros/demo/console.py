@@ -16,10 +16,10 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from koopman_ros.core.units import SECONDS_PER_MINUTE, shown, unit_label
 from koopman_ros.demo.loop import Row
-from koopman_ros.parameters.wire import Signals
+from koopman_ros.parameters.signal_topics import Signals
 from koopman_ros.testing import HarnessError, reserved_output
-from koopman_ros.units import SECONDS_PER_MINUTE, shown, unit_label
 
 _ROWS = 20  # in the table of a run
 _IN_MINUTES = 300.0  # s; so long a run is told in minutes

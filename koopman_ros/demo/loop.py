@@ -19,14 +19,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.parameters.signal_topics import Wiring
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.parameters.wire import Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.testing import deferred_interrupt, Harness, HarnessError
-from koopman_ros.units import NANOSECONDS
-from koopman_ros.wire import Place
 
 _START_TIME = 1.0  # s of plant time at the first measurement
 FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)

@@ -5,12 +5,12 @@
 
 from typing import Any
 
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import to_celsius
 from koopman_ros.demo.loop import Scenario
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.resources import model_path
-from koopman_ros.units import to_celsius
 
 SYSTEM, MODEL = 'reactor', 'reactor_nz4'
 TEMPERATURE = 'temperature'

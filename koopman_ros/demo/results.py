@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import matplotlib.figure  # noqa: F401
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.bags import read_series
-from koopman_ros.parameters.wire import Wiring
-from koopman_ros.units import conversion, NANOSECONDS
-from koopman_ros.wire import Place
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import conversion, NANOSECONDS
+from koopman_ros.parameters.signal_topics import Wiring
+from koopman_ros.records import read_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

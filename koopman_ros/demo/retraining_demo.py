@@ -16,12 +16,15 @@ import time
 
 import numpy as np
 
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.plots import draw_limits, drawing, LIMIT, write_figures
+from koopman_ros.core.units import to_celsius, ZERO_CELSIUS
 from koopman_ros.demo import reactor
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import Operator, running_loop
 from koopman_ros.demo.results import draw_phases, read_run, Run
 from koopman_ros.learning import roll_out
-from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.trainer import MANUAL
 from koopman_ros.plants import (
     one_state_reactor,
@@ -29,9 +32,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
     ReactorParameters,
 )
-from koopman_ros.reports import draw_limits, drawing, LIMIT, write_figures
-from koopman_ros.resources import model_path
-from koopman_ros.units import to_celsius, ZERO_CELSIUS
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left

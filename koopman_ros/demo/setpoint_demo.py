@@ -18,23 +18,23 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.bags import summary
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
+from koopman_ros.core.units import conversion, display_unit, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import run_loop, running_loop, Scenario
 from koopman_ros.demo.results import read_run, Run
 from koopman_ros.evaluation.optimal_cost import cost_along, Course, linear_law, optimum, Task
-from koopman_ros.lifting import load
-from koopman_ros.lifting.coordinates import Coordinates
+from koopman_ros.model import load
+from koopman_ros.model.coordinates import Coordinates
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.parameters.signal_topics import preset, shipped, Signals
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.parameters.wire import preset, shipped, Signals
 from koopman_ros.plants import steady_state
-from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
-from koopman_ros.resources import model_path
+from koopman_ros.records import summary
 from koopman_ros.tuning import Tuning
-from koopman_ros.units import conversion, display_unit, shown, unit_label
 
 PLANT = 'reactor'
 _PANEL_SPEED = 10.0  # at most, of a loop with the panel

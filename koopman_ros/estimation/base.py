@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.declaration import NoParameters
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.signals import Outputs
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import NoParameters
+from koopman_ros.core.signals import Outputs
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 
@@ -96,7 +96,7 @@ class Estimator(ABC):
     one. An exception holds the command, and the next measurement restarts the estimate.
     """
 
-    #: frozen dataclass of its own parameters, see :mod:`koopman_ros.declaration`
+    #: frozen dataclass of its own parameters, see :mod:`koopman_ros.core.declaration`
     Parameters: ClassVar[type[Any]] = NoParameters
     #: whether an estimate depends on more than the last measurement
     remembers: ClassVar[bool] = True

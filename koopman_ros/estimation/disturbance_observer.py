@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
 from koopman_ros.estimation.base import Estimate, Estimator
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.signals import Outputs
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 # One step of integration spans at most this share of the model's fastest time constant.

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.units import SECONDS_PER_MINUTE
 from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.signals import Outputs
-from koopman_ros.solvers import runge_kutta_step
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
-from koopman_ros.units import SECONDS_PER_MINUTE
 
 # Where the tuning does not say how uncertain the plant is: noise as a share of half the trained
 # range, the random walk as a share of the inputs', over the slowest time constant, and the first

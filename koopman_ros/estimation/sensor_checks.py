@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.signals import Outputs
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.tuning import SensorLimits
-from koopman_ros.units import NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)

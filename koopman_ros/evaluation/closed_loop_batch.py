@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, Linear, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 from koopman_ros.estimation import Estimate
 from koopman_ros.execution import Tell
-from koopman_ros.lifting import LiftedModel, NetworkObservables
-from koopman_ros.lifting.model import NODES, WEIGHTS
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.model import LiftedModel, NetworkObservables
+from koopman_ros.model.lifted_model import NODES, WEIGHTS
 from koopman_ros.tuning import InputLimits, Tuning
 
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in units a time unit of the model

@@ -11,9 +11,9 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend
+from koopman_ros.core.units import shown, unit_label
 from koopman_ros.evaluation.closed_loop_test import LawCheck, MOST_COST
-from koopman_ros.reports import drawing, DRAWN_RANGE, legend
-from koopman_ros.units import shown, unit_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,8 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, StateDependentRiccati, Weights
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation.closed_loop_batch import (
     DriftPlant,
     judge_loops,
@@ -23,9 +24,8 @@ from koopman_ros.evaluation.closed_loop_batch import (
     Rate,
 )
 from koopman_ros.execution import Backend, Serial
-from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
-from koopman_ros.lifting.training_data import MAX_TRIED_LOOPS
-from koopman_ros.solvers import solve_riccati
+from koopman_ros.model import Coordinates, LiftedModel, TriedLoops
+from koopman_ros.model.training_data import MAX_TRIED_LOOPS
 from koopman_ros.tuning import InputLimits, Tuning
 
 #: Closed loops that a law is judged by.

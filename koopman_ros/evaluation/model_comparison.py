@@ -12,14 +12,14 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.model import LiftedModel
 
 # A row for each hundredth of what is remembered: ten in a time constant by default.
 _ROWS = 100

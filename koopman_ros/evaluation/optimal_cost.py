@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 from koopman_ros.plants.system import ControlAffineSystem
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 
 _MAX_ITERATIONS = 200
 _SHORTEST_STEP = 2.0 ** -20

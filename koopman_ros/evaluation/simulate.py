@@ -10,17 +10,17 @@ from typing import Protocol, Self, TypeAlias
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import apply, Event, Measurement, Silence
 from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.state import Report, State
 from koopman_ros.control.steady_state import nearest_steady_state, partial_target
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Code, reason, Words
-from koopman_ros.signals import per_signal
-from koopman_ros.units import Displays, NANOSECONDS
+from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.signals import per_signal
+from koopman_ros.core.status import Code, reason, Words
+from koopman_ros.core.units import Displays, NANOSECONDS
+from koopman_ros.model import LiftedModel
 
 # what is measured (n,) of a value (n,) at a time in s; NaN for what is not, None for no message
 Sensor: TypeAlias = Callable[[Array, float], Array | None]

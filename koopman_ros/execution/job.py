@@ -16,7 +16,7 @@ import subprocess
 import threading
 from typing import IO
 
-from koopman_ros.startup import blocked_signals, command, ONE_THREAD
+from koopman_ros.process_entry import blocked_signals, command, ONE_THREAD
 
 _PATIENCE = 5.0  # s from the request to end until the process is killed
 _NICE = 10

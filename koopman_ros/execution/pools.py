@@ -36,7 +36,7 @@ from koopman_ros.execution.backends import (
     Watch,
     WorkerLost,
 )
-from koopman_ros.startup import ONE_THREAD
+from koopman_ros.process_entry import ONE_THREAD
 
 PERIOD = 0.1  # s between two calls of a watch, and between two messages of a task
 _PATIENCE = 5.0  # s from the request to end until a task is abandoned

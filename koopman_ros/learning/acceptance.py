@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief
 from koopman_ros.control.usable import unusable
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.units import Display, display_unit, SECONDS_PER_TIME_UNIT
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.execution import Backend
 from koopman_ros.learning.identification import (
@@ -23,9 +24,8 @@ from koopman_ros.learning.identification.drift import prediction_error, Segments
 from koopman_ros.learning.lift.metrics import Figures, lifted_rate
 from koopman_ros.learning.lift.training import Trained
 from koopman_ros.learning.model_selection import Comparison
-from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import LINEAR
-from koopman_ros.units import Display, display_unit, SECONDS_PER_TIME_UNIT
 
 # An error is more than noise when it is this unlikely, and this large beside the range.
 _SIGMAS = 5.0

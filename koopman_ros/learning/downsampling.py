@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import averaged, cut, Episode
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import averaged, cut, Episode
+from koopman_ros.model import Box
 
 CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
 SEGMENT = 240  # samples of a segment, or means of samples

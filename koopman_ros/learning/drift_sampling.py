@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode, Plant, Samples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance import HeldOut, Thresholds
@@ -26,9 +27,8 @@ from koopman_ros.learning.model_selection import (
     Judge,
     usual_recipes,
 )
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.model import LiftedModel
 from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
-from koopman_ros.plant_data import Episode, Plant, Samples
 
 # More samples of a smooth drift tell nothing new.
 _MAX_SAMPLES = 2000

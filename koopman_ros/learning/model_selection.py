@@ -13,6 +13,8 @@ import time
 
 import numpy as np
 
+from koopman_ros.core.datasets import Plant, Samples, split_by_episode
+from koopman_ros.core.plots import table
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
@@ -27,10 +29,8 @@ from koopman_ros.learning.lift.training import (
     train,
     training_states,
 )
-from koopman_ros.lifting import Box, LiftedModel, model_file
+from koopman_ros.model import Box, LiftedModel, model_file
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
-from koopman_ros.plant_data import Plant, Samples, split_by_episode
-from koopman_ros.reports import table
 
 DEGREES = (2, 3, 4, 5)
 # A plainer model may err by this much more, in the mean square.

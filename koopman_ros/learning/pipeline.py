@@ -14,9 +14,10 @@ import shutil
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief
-from koopman_ros.bags import Account
-from koopman_ros.bags.limits import bounded_reading
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.paths import predecessor
+from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import decide, Decision, Thresholds, uncovered_setpoints
 from koopman_ros.learning.downsampling import coverage
@@ -37,12 +38,11 @@ from koopman_ros.learning.lift.training import NoUsefulLift
 from koopman_ros.learning.model_selection import Comparison, Contender
 from koopman_ros.learning.record import read_record, Reduction, Source
 from koopman_ros.learning.task import FIRST, known, TrainingTask
-from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
-from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import plant_class
-from koopman_ros.resources import predecessor
-from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
+from koopman_ros.records import Account
+from koopman_ros.records.limits import bounded_reading
 
 # A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1

@@ -13,7 +13,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from koopman_ros.bags import (
+from koopman_ros.core.datasets import Episode
+from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
+from koopman_ros.records import (
     Account,
     loop_episodes,
     RecordedInput,
@@ -21,10 +24,7 @@ from koopman_ros.bags import (
     stream_episodes,
     summary,
 )
-from koopman_ros.bags.episodes import distinct
-from koopman_ros.execution import Backend, Serial, Tell
-from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
-from koopman_ros.plant_data import Episode
+from koopman_ros.records.episodes import distinct
 
 # Segments of a record with states that are not measured are longer by this: a filter has to find
 # these first.

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from koopman_ros.core.plots import bullets, drawing, table, write_figures, write_page
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 from koopman_ros.evaluation.closed_loop_plots import draw_loops
 from koopman_ros.learning.downsampling import CELLS, visited_cells
 from koopman_ros.learning.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.learning.pipeline import Retrained
-from koopman_ros.lifting import Coordinates
+from koopman_ros.model import Coordinates
 from koopman_ros.model_classes import BEST
-from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
-from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 
 
 def write_report(retrained: Retrained) -> list[Path]:

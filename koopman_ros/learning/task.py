@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.bags import RecordedInput, RecordedState
-from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Plant
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import IDENTITY_LIFT
-from koopman_ros.plant_data import Plant
-from koopman_ros.units import SECONDS_PER_TIME_UNIT
-from koopman_ros.wire import Place
+from koopman_ros.records import RecordedInput, RecordedState
 
 #: As a task's sibling, in a fleet: the first plant of its kind whose lift is accepted.
 FIRST = 'first'

@@ -16,9 +16,14 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import Trigger
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import events, MANUAL, Mode, Report
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import stem
+from koopman_ros.core.status import level_words
+from koopman_ros.core.time_base import Advance
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation import Recent
+from koopman_ros.event_log import records
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.model_checks import (
     load_suitable,
@@ -26,10 +31,15 @@ from koopman_ros.parameters.model_checks import (
     rests_outside,
     Situation,
 )
+from koopman_ros.parameters.signal_topics import (
+    preset,
+    shipped,
+    signals_of,
+    system_of,
+    Wiring,
+    words_of,
+)
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.wire import preset, shipped, signals_of, system_of, Wiring, words_of
-from koopman_ros.reasons import level_words
-from koopman_ros.replay import records
 from koopman_ros.ros import controller_status as status
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
@@ -46,9 +56,6 @@ from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import Outlet
 from koopman_ros.ros.timing import Timing
 from koopman_ros.ros.watchdog import PERIOD, Watchdog
-from koopman_ros.time_base import Advance
-from koopman_ros.units import NANOSECONDS
-from koopman_ros.wire import stem
 
 # A measurement and the inputs that acted on it are stamped no further apart.
 _SAME_TIME_NS = 2 * NANOSECONDS

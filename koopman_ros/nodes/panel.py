@@ -22,8 +22,11 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from koopman_ros.bags import BagReadError
-from koopman_ros.lifting import load
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.status import Code, reason
+from koopman_ros.core.units import conversion, Display, display_unit, NANOSECONDS, printed
+from koopman_ros.event_log import records
+from koopman_ros.model import load
 from koopman_ros.panel.alarm_store import AlarmStore
 from koopman_ros.panel.faceplates import Range
 from koopman_ros.panel.files import sanitize_text
@@ -43,11 +46,9 @@ from koopman_ros.panel.trend_backfill import backfill, read_past
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.panel import panel_signals, panel_table
+from koopman_ros.parameters.signal_topics import Wiring, words_of
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.wire import Wiring, words_of
-from koopman_ros.reasons import Code, reason
-from koopman_ros.replay import records
-from koopman_ros.resources import model_path
+from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.diagnostics import Level, Status
@@ -57,7 +58,6 @@ from koopman_ros.ros.process import run
 from koopman_ros.ros.remote import RemoteNode
 from koopman_ros.ros.repeated import RepeatedValues
 from koopman_ros.ros.signals import Heard, Inlet
-from koopman_ros.units import conversion, Display, display_unit, NANOSECONDS, printed
 
 # The panel never slows a publisher.
 _WATCHING = topics.profile(100, reliable=False)

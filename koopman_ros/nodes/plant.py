@@ -15,8 +15,16 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from koopman_ros import plants
+from koopman_ros.core.message_fields import stem
+from koopman_ros.core.units import (
+    display_unit,
+    LAST_STAMP_SECONDS,
+    NANOSECONDS,
+    seconds_text,
+    shown,
+)
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
-from koopman_ros.parameters.wire import PLANT_KINDS, SIGNALS, Wiring
+from koopman_ros.parameters.signal_topics import PLANT_KINDS, SIGNALS, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.diagnostics import Level, Status
@@ -26,8 +34,6 @@ from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.simulated_plant import SimulatedPlant
-from koopman_ros.units import display_unit, LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, shown
-from koopman_ros.wire import stem
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1

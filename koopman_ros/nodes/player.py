@@ -14,7 +14,8 @@ from rclpy.qos import QoSProfile
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from koopman_ros import bags
+from koopman_ros import records
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import player_table
 from koopman_ros.ros import topics
@@ -22,7 +23,6 @@ from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
-from koopman_ros.units import NANOSECONDS
 
 _POLL_PERIOD_NS = 10_000_000  # for what no message announces
 _PROGRESS_PERIOD = 3.0  # s
@@ -47,10 +47,10 @@ class PlayerNode(LoopNode):
             raise ConfigurationError(reason)
         # by topic of the bag
         names = {'/' + name.lstrip('/'): name for name in settings.topics}
-        content = bags.summary(settings.bag)
+        content = records.summary(settings.bag)
         begin_ns = (content.start_ns or 0) + round(settings.start_offset * NANOSECONDS)
-        self._messages = (message for message in bags.in_log_order(
-            bags.read_messages(settings.bag, names, recover=settings.recover))
+        self._messages = (message for message in records.in_log_order(
+            records.read_messages(settings.bag, names, recover=settings.recover))
             if message.log_time_ns >= begin_ns)
         played = {topic: name for topic, name in names.items() if content.counts.get(topic)}
         if not played:
@@ -83,7 +83,7 @@ class PlayerNode(LoopNode):
         except LookupError as error:
             raise ConfigurationError(str(error)) from error
 
-        self._next: bags.BagMessage | None = None
+        self._next: records.BagMessage | None = None
         self._open: int | None = None  # stamp of the measurement that has no answer yet
         self._began, self._sent = False, 0
         self._received: set[str] = set()  # topics of which subscribers have received a message
@@ -104,7 +104,7 @@ class PlayerNode(LoopNode):
                 self._play_in_lockstep()
             else:
                 self._play_in_time()
-        except bags.BagReadError as error:
+        except records.BagReadError as error:
             self._give_up(str(error))
         except MemoryError:
             self._give_up('memory does not suffice for what is recorded within five seconds: play '
@@ -174,7 +174,7 @@ class PlayerNode(LoopNode):
             self._received.add(message.topic)
         self._say_progress()
 
-    def _whole(self, message: bags.BagMessage) -> bool:
+    def _whole(self, message: records.BagMessage) -> bool:
         """Tell whether a part of a measurement is its last one."""
         stamp_ns = _stamp_ns(message) or 0
         if stamp_ns != self._parts[0]:
@@ -188,7 +188,7 @@ class PlayerNode(LoopNode):
             self._open = None
             self._on_timer()
 
-    def _publish(self, message: bags.BagMessage) -> None:
+    def _publish(self, message: records.BagMessage) -> None:
         if self._clock_publisher is not None and message.topic in self._measured:
             self._clock_publisher.publish(ClockMessage(clock=stamp_message(
                 _stamp_ns(message) or message.log_time_ns)))
@@ -215,7 +215,7 @@ class PlayerNode(LoopNode):
         self.exit_code = 1
 
 
-def _stamp_ns(message: bags.BagMessage) -> int | None:
+def _stamp_ns(message: records.BagMessage) -> int | None:
     """Return the stamp of a message, None for one that has none or an unset one."""
     try:
         return stamp_nanoseconds(message.message.header.stamp) or None

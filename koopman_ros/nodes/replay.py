@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 import sys
 from typing import Any
 
+from koopman_ros.event_log.run import replay_bags, Result, tuning
 from koopman_ros.parameters.controller import REPLAY_TABLE, ReplayParameters
 from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.replay.run import replay_bags, Result, tuning
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run_task

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
 
-from koopman_ros.units import conversion, printed
+from koopman_ros.core.units import conversion, printed
 
 Range = tuple[float, float]
 

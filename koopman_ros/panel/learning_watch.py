@@ -24,7 +24,7 @@ from koopman_ros.panel.training_report import (
     report_base,
     report_time,
 )
-from koopman_ros.parameters.wire import CONTROLLER_EVENTS, Wiring
+from koopman_ros.parameters.signal_topics import CONTROLLER_EVENTS, Wiring
 
 LAST = 3600.0  # s of the end of a bag that are compared
 _PERIOD = 1.0  # s between two looks at the files of a report

@@ -5,9 +5,9 @@
 
 from collections.abc import Mapping
 
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.core.units import unit_label
+from koopman_ros.model import LiftedModel
 from koopman_ros.panel.faceplates import Range, readable
-from koopman_ros.units import unit_label
 
 _METRICS = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
             'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}

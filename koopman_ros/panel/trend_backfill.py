@@ -8,14 +8,14 @@ import math
 import time
 from typing import Any
 
-from koopman_ros.bags import BagReadError, read_messages
-from koopman_ros.bags.series import stamped_number
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import conversion, NANOSECONDS
+from koopman_ros.event_log.records import parse, RecordError
 from koopman_ros.panel.faceplates import pen
 from koopman_ros.panel.view_model import LoopViewModel
-from koopman_ros.parameters.wire import CONTROLLER_EVENTS, Wiring
-from koopman_ros.replay.records import parse, RecordError
-from koopman_ros.units import conversion, NANOSECONDS
-from koopman_ros.wire import Place
+from koopman_ros.parameters.signal_topics import CONTROLLER_EVENTS, Wiring
+from koopman_ros.records import BagReadError, read_messages
+from koopman_ros.records.series import stamped_number
 
 _KINDS = ('measured', 'active_setpoints', 'predicted', 'applied', 'commands')
 _BUCKETS = 10_000

@@ -15,7 +15,7 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, pen, Range, StateFaceplate
 from koopman_ros.panel.layout import box, label, PageLayout
 from koopman_ros.panel.snapshot import Snapshot

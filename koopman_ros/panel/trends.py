@@ -12,7 +12,7 @@ import threading
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.panel.files import sanitize_text
 
 MAX_BUCKETS = 10_000

@@ -13,13 +13,13 @@ from typing import Any
 
 from nicegui import ui
 
+from koopman_ros.core.units import ZERO_CELSIUS
 from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import CONTROLLER, Snapshot, TRAINER
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.table import as_yaml, UNBOUNDED
-from koopman_ros.units import ZERO_CELSIUS
 
 _GENERAL = 'general'
 _NAME = re.compile(r'[A-Za-z_][\w.]*', re.ASCII)

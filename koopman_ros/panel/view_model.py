@@ -12,6 +12,9 @@ import re
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.core.paths import predecessor
+from koopman_ros.core.status import level_words
+from koopman_ros.core.units import conversion, display_unit, printed
 from koopman_ros.panel.conditions import Conditions
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
 from koopman_ros.panel.snapshot import (
@@ -25,10 +28,7 @@ from koopman_ros.panel.snapshot import (
 )
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.description import ParameterDescription
-from koopman_ros.parameters.wire import Signals
-from koopman_ros.reasons import level_words
-from koopman_ros.resources import predecessor
-from koopman_ros.units import conversion, display_unit, printed
+from koopman_ros.parameters.signal_topics import Signals
 
 _BACK = 1.0  # s; a stamp that is earlier by more restarts the time
 _SIGNAL = re.compile(r'(?:(estimated|deviation)_)?(\w+) \[(.+)\]')

@@ -14,11 +14,19 @@ import numpy as np
 
 from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
-from koopman_ros.declaration import nested, NoParameters, of_other_states, parameter, per_signal
+from koopman_ros.core.declaration import (
+    nested,
+    NoParameters,
+    of_other_states,
+    parameter,
+    per_signal,
+)
+from koopman_ros.core.plugins import plug_class, short_name
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.estimation import Estimator, ESTIMATORS
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.table import ConfigurationError, ParameterTable
-from koopman_ros.parameters.wire import (
+from koopman_ros.model import LiftedModel
+from koopman_ros.parameters.signal_topics import (
     DEFAULT_SYSTEM,
     InputPlaces,
     named_units,
@@ -29,10 +37,8 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
-from koopman_ros.plugs import plug_class, short_name
-from koopman_ros.signals import Outputs
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.tuning import Tuning
-from koopman_ros.units import conversion, display_unit
 
 
 @dataclass(frozen=True)

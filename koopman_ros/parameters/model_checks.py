@@ -11,16 +11,16 @@ import time
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, State
 from koopman_ros.control.usable import unusable
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.status import Code
+from koopman_ros.core.units import display_unit, NANOSECONDS, shown
 from koopman_ros.evaluation import compare, Windows
-from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
+from koopman_ros.model import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
-from koopman_ros.parameters.wire import Signals, signals_of, words_of
-from koopman_ros.reasons import Code
-from koopman_ros.resources import model_path
-from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.parameters.signal_topics import Signals, signals_of, words_of
 
 _LONGEST_PATH = 4096  # bytes, as Linux has it
 # What a control step may take of a processor, in s: the largest model that is read takes some

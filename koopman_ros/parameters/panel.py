@@ -9,10 +9,9 @@ from ipaddress import ip_network
 from types import MappingProxyType
 from typing import Any
 
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
-from koopman_ros.parameters.trainer import trainer_signals
-from koopman_ros.parameters.wire import (
+from koopman_ros.core.units import conversion, display_unit
+from koopman_ros.model import LiftedModel
+from koopman_ros.parameters.signal_topics import (
     DEFAULT_SYSTEM,
     InputPlaces,
     preset,
@@ -21,7 +20,8 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
-from koopman_ros.units import conversion, display_unit
+from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
+from koopman_ros.parameters.trainer import trainer_signals
 
 
 def _shown_unit() -> Any:

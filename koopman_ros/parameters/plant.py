@@ -11,15 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.declaration import group, parameter, per_signal, signal_value, UNBOUNDED
-from koopman_ros.parameters.table import (
-    ConfigurationError,
-    in_own_units,
-    ParameterTable,
-    Specification,
-)
-from koopman_ros.parameters.wire import (
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import group, parameter, per_signal, signal_value, UNBOUNDED
+from koopman_ros.core.units import check_unit, LAST_STAMP_SECONDS
+from koopman_ros.parameters.signal_topics import (
     CommandedPlaces,
     DEFAULT_SYSTEM,
     LONGEST_FRAME_ID,
@@ -30,6 +25,12 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
+from koopman_ros.parameters.table import (
+    ConfigurationError,
+    in_own_units,
+    ParameterTable,
+    Specification,
+)
 from koopman_ros.plants import (
     Actuator,
     build,
@@ -39,7 +40,6 @@ from koopman_ros.plants import (
     plant_class,
 )
 from koopman_ros.plants.simulation import integration_limits
-from koopman_ros.units import check_unit, LAST_STAMP_SECONDS
 
 
 @dataclass(frozen=True)

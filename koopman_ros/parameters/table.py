@@ -5,7 +5,7 @@
 Parameter tables: one frozen dataclass a node gives declarations, checks, snapshot and YAML.
 
 Rows of signals are named after the signal, ``temperature.weight``, and those of plug-ins after the
-plug-in, ``pi.temperature.gain``. See :mod:`koopman_ros.declaration`.
+plug-in, ``pi.temperature.gain``. See :mod:`koopman_ros.core.declaration`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,8 +18,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.declaration import (
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import (
     Column,
     group,
     parameter,
@@ -27,8 +27,8 @@ from koopman_ros.declaration import (
     signal_value,
     UNBOUNDED,
 )
-from koopman_ros.plugs import contained
-from koopman_ros.units import conversion, display_unit, ZERO_CELSIUS
+from koopman_ros.core.plugins import contained
+from koopman_ros.core.units import conversion, display_unit, ZERO_CELSIUS
 
 __all__ = ['UNBOUNDED', 'ConfigurationError', 'ParameterTable', 'Specification', 'as_yaml',
            'group', 'in_own_units', 'lowest', 'parameter', 'per_signal', 'signal_value']

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.declaration import (
+from koopman_ros.control.experiment import Experiment
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import (
     column,
     NO_LOWER,
     NO_UPPER,
@@ -23,25 +24,32 @@ from koopman_ros.declaration import (
     UNBOUNDED,
     value_column,
 )
+from koopman_ros.core.plugins import short_name
+from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.execution import scheduler_refusal
-from koopman_ros.experiment import Experiment
 from koopman_ros.identification_methods import parameters_of
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.model import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
-from koopman_ros.parameters import wire
 from koopman_ros.parameters.equations import named_ranges, refused
-from koopman_ros.parameters.table import ConfigurationError, ParameterTable
-from koopman_ros.parameters.wire import (
+from koopman_ros.parameters.signal_topics import (
+    ACTIVE_LIMITS,
+    CONTROLLER_EVENTS,
+    CONTROLLER_PLAN,
+    CONTROLLER_STATE,
+    DEFAULT_SYSTEM,
+    DIAGNOSTICS,
     InputPlaces,
+    named_units,
+    OPERATOR_ACTIONS,
     preset,
+    refusal,
     Signals,
     signals_of,
     StatePlaces,
     system_of,
     Wiring,
 )
-from koopman_ros.plugs import short_name
-from koopman_ros.units import conversion, display_unit
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
 FIRST = 'first'  # as `sibling`, the first plant of a fleet whose lift is accepted
@@ -52,7 +60,7 @@ class TrainerParameters:
     """Snapshot of the trainer's parameters, in the units that people read."""
 
     system: str = parameter(
-        wire.DEFAULT_SYSTEM, 'plant that is shipped, whose signals, topics and bounds are the '
+        DEFAULT_SYSTEM, 'plant that is shipped, whose signals, topics and bounds are the '
         'defaults here; any other name for none', read_only=True)
     states_measured: tuple[str, ...] = parameter(
         ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
@@ -260,9 +268,9 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     own = preset(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
-    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, wire.CONTROLLER_STATE,
-                          wire.CONTROLLER_PLAN, wire.ACTIVE_LIMITS, wire.CONTROLLER_EVENTS,
-                          wire.OPERATOR_ACTIONS, wire.DIAGNOSTICS)
+    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, CONTROLLER_STATE,
+                          CONTROLLER_PLAN, ACTIVE_LIMITS, CONTROLLER_EVENTS,
+                          OPERATOR_ACTIONS, DIAGNOSTICS)
     if present is not None:
         defaults['input_matrix_degree'] = present.input_matrix_degree
         for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
@@ -297,8 +305,8 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
     controlled = tuple(filter(None, given.get('controlled', ())))
     if present is not None and not states:
         return signals_of(present, controlled)
-    measured = wire.named_units(states)
-    return Signals(measured, wire.named_units(inputs), controlled or tuple(measured))
+    measured = named_units(states)
+    return Signals(measured, named_units(inputs), controlled or tuple(measured))
 
 
 def _wiring(signals: Signals, given: Mapping[str, Any]) -> Wiring:
@@ -320,7 +328,7 @@ def _plan(signals: Signals, values: TrainerParameters) -> None:
 
 
 def _cross_check(signals: Signals, values: TrainerParameters) -> str:
-    if reason := wire.refusal(values.topics):
+    if reason := refusal(values.topics):
         return reason
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
         return (f'output = {values.output!r} is one file, which max_bag_size and '
@@ -358,7 +366,7 @@ class PlayerParameters:
 
     bag: str = parameter('run_1', 'bag to play: a .mcap file or a bag folder', read_only=True)
     system: str = parameter(
-        wire.DEFAULT_SYSTEM, 'plant that is shipped, whose topics are the defaults here; any '
+        DEFAULT_SYSTEM, 'plant that is shipped, whose topics are the defaults here; any '
         'other name for none', read_only=True)
     topics: tuple[str, ...] = parameter(
         ('',), 'topics to play; a relative name stands for that below / in the bag, and follows '
@@ -393,7 +401,7 @@ class PlayerParameters:
 
 
 def _check_player(values: PlayerParameters) -> str:
-    return wire.refusal(values.topics) or wire.refusal((*values.measurement, values.answer))
+    return refusal(values.topics) or refusal((*values.measurement, values.answer))
 
 
 def player_table(given: Mapping[str, Any] = MappingProxyType({})

@@ -8,9 +8,9 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from koopman_ros.core.plugins import contained, plug
 from koopman_ros.plants.constants import in_plant_units
 from koopman_ros.plants.system import ControlAffineSystem
-from koopman_ros.plugs import contained, plug
 
 _LIBRARY = 'koopman_ros.plants.library'
 #: the classes of the library by name, each imported when it is asked for

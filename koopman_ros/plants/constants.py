@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
-from koopman_ros.units import to_celsius, to_kelvin
+from koopman_ros.core.units import to_celsius, to_kelvin
 
 
 def constant(default: float, unit: str, lower: float, upper: float, description: str, *,

@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from koopman_ros.arrays import Array
-from koopman_ros.plant_data import Episode, Samples
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode, Samples
 from koopman_ros.plants.recovery import recoverable
 from koopman_ros.plants.simulation import (
     integration_limits,

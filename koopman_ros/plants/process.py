@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.arrays import Array, brief
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ControlAffineSystem
-from koopman_ros.units import NANOSECONDS
 
 # After so many time constants exp(-40) of a step is left, less than a double can tell.
 _SETTLED = 40.0

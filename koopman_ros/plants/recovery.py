@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 
 # Of half the box: so near the nominal state the linear law holds the plant.
 _HOME = 0.1

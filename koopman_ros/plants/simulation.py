@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import DOP853
 
-from koopman_ros.arrays import Array, frozen
-from koopman_ros.plant_data import Episode, Samples
+from koopman_ros.core.arrays import Array, frozen
+from koopman_ros.core.datasets import Episode, Samples
 from koopman_ros.plants.system import ControlAffineSystem
 
 LOOSEST_RTOL = 1e-9

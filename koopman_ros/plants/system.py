@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array, brief, frozen
-from koopman_ros.plant_data import Plant
-from koopman_ros.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.datasets import Plant
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
 

@@ -5,7 +5,7 @@
 
 from builtin_interfaces.msg import Time
 
-from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS
+from koopman_ros.core.units import LAST_STAMP_SECONDS, NANOSECONDS
 
 
 def stamp_nanoseconds(stamp: Time) -> int:

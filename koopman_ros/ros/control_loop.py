@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, events, HOLD, Mode, Report, SAFE, Setpoint, State
 from koopman_ros.control.events import Event, Measurement, Outcome, Silence
-from koopman_ros.reasons import Code
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.status import Code
+from koopman_ros.core.time_base import Advance
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros.timing import Timing
-from koopman_ros.time_base import Advance
-from koopman_ros.units import NANOSECONDS
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _OVERDUE = 3.0  # usual intervals after which a measurement no longer decides the next command

@@ -18,14 +18,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from koopman_ros.arrays import along_last, Array
 from koopman_ros.control import events, Report
 from koopman_ros.control.laws.base import Plan
-from koopman_ros.parameters.wire import Signals, Wiring
-from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
+from koopman_ros.core.arrays import along_last, Array
+from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.event_log.records import fields_of, Record, SNAPSHOT, START
+from koopman_ros.parameters.signal_topics import Signals, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import Outlet
-from koopman_ros.units import display_unit, NANOSECONDS, shown
 
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _AGAIN = 1.0  # s, within which two nodes know each other

@@ -9,19 +9,19 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.assembler import Assembler
 from koopman_ros.control import Arrival, Controller, HOLD, Mode, Report, SAFE, State
 from koopman_ros.control.state import TargetReport
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import stem
+from koopman_ros.core.status import Code, level_words
+from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.time_base import Advance
+from koopman_ros.core.units import display_unit, shown
 from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.parameters.wire import Signals, words_of
-from koopman_ros.reasons import Code, level_words
+from koopman_ros.parameters.signal_topics import Signals, words_of
 from koopman_ros.ros.controller_messages import by_label
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.timing import PAUSED, Timing
-from koopman_ros.time_base import Advance
-from koopman_ros.units import display_unit, shown
-from koopman_ros.wire import stem
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
 _PATIENCE = 10.0  # s after which a measurement is old where no time-out is set

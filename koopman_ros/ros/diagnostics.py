@@ -14,8 +14,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from koopman_ros.parameters.wire import DIAGNOSTICS
-from koopman_ros.plugs import contained
+from koopman_ros.core.plugins import contained
+from koopman_ros.parameters.signal_topics import DIAGNOSTICS
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.hosted import HostedNode, wall_timer
 

@@ -10,10 +10,10 @@ import math
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import SetBool
 
-from koopman_ros.experiment import level, Phase
+from koopman_ros.control.experiment import level, Phase
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.parameters.signal_topics import Wiring, words_of
 from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
-from koopman_ros.parameters.wire import Wiring, words_of
-from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.experiment_run import ExperimentRun, other_publishers, stepped

@@ -20,9 +20,7 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_msgs.msg import String
 
-from koopman_ros.arrays import Array
-from koopman_ros.assembler import Assembler
-from koopman_ros.experiment import (
+from koopman_ros.control.experiment import (
     advance,
     begin,
     end,
@@ -31,17 +29,19 @@ from koopman_ros.experiment import (
     Progress,
     TrackingMonitor,
 )
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import Place, stem
+from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.event_log import records
+from koopman_ros.parameters.signal_topics import Wiring
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
-from koopman_ros.parameters.wire import Wiring
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.replay import records
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import Owned
 from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs, Outlet
-from koopman_ros.units import display_unit, NANOSECONDS, shown
-from koopman_ros.wire import Place, stem
 
 _TICK = 0.1  # s
 _DEVIATIONS = 10  # commands of a controller, and

@@ -12,9 +12,9 @@ from typing import Any
 import rclpy
 
 from koopman_ros.execution.training import JobState, TrainingJob
+from koopman_ros.parameters.signal_topics import SIGNALS, Wiring
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
-from koopman_ros.parameters.wire import SIGNALS, Wiring
 from koopman_ros.ros.managed import one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import init

@@ -15,9 +15,10 @@ import traceback
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.validate_namespace import validate_namespace
 
+from koopman_ros.core.paths import config_directory, LEAN_PROFILE
+from koopman_ros.core.plugins import contained
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.plugs import contained
-from koopman_ros.resources import config_directory, LEAN_PROFILE
+from koopman_ros.process_entry import handle_signals
 from koopman_ros.ros.diagnostics import Diagnostics, Level, Status
 from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
@@ -32,7 +33,6 @@ from koopman_ros.ros.process import (
     TAKE_DOWN_PATIENCE,
 )
 from koopman_ros.ros.watchdog import end_in_time
-from koopman_ros.startup import handle_signals
 
 _PERIOD = 0.1  # s between two looks at nodes that have ended
 _GOODBYE = 0.1  # s that taking down a node may take

@@ -19,7 +19,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from koopman_ros.plugs import contained
+from koopman_ros.core.plugins import contained
 
 _POLL = 0.02  # s between two steps of an asynchronous callback
 

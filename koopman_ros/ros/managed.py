@@ -16,7 +16,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
-from koopman_ros.plugs import contained
+from koopman_ros.core.plugins import contained
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 

@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 from rclpy.timer import Timer
 
-from koopman_ros.arrays import Array
-from koopman_ros.assembler import Assembler
-from koopman_ros.parameters.wire import LONGEST_FRAME_ID, Wiring
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.time_base import TimeBase
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
 from koopman_ros.ros.timing import Timing
-from koopman_ros.time_base import TimeBase
-from koopman_ros.units import NANOSECONDS
 
 _PATIENCE = 0.5  # s that the first measurement waits for the measured inputs
 

@@ -13,7 +13,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from koopman_ros.lifting import LiftedModel, ModelFileError
+from koopman_ros.core.plugins import contained
+from koopman_ros.model import LiftedModel, ModelFileError
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.model_checks import (
     load_suitable,
@@ -23,8 +24,7 @@ from koopman_ros.parameters.model_checks import (
     refuse_worse,
     Situation,
 )
-from koopman_ros.parameters.wire import Signals
-from koopman_ros.plugs import contained
+from koopman_ros.parameters.signal_topics import Signals
 
 _SHORT_WAIT = 0.2  # s that the loop may stand still for a parameter
 _LONG_WAIT = 10.0  # s that the service waits for a slow disk

@@ -22,11 +22,11 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
+from koopman_ros.core.plugins import own_code
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
-from koopman_ros.plugs import own_code
 from koopman_ros.ros.diagnostics import Diagnostics
 from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
-from koopman_ros.units import NANOSECONDS
 
 T = TypeVar('T')
 Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)

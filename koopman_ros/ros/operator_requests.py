@@ -11,14 +11,14 @@ import numpy as np
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import events, Mode
-from koopman_ros.parameters.wire import Wiring, words_of
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import stem
+from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.parameters.signal_topics import Wiring, words_of
 from koopman_ros.ros import topics
 from koopman_ros.ros.control_loop import ControlLoop
 from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
-from koopman_ros.units import display_unit, NANOSECONDS, shown
-from koopman_ros.wire import stem
 
 _SHOWN = 60.0  # s for which a request that was refused or limited is a warning
 

@@ -16,11 +16,11 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from koopman_ros.resources import LOOPBACK_PROFILE
+from koopman_ros.core.paths import LOOPBACK_PROFILE
+from koopman_ros.process_entry import end_by_force, handle_signals
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
-from koopman_ros.startup import end_by_force, handle_signals
 
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LOOPS = '--loops'
@@ -160,7 +160,7 @@ def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None
         return None
     if '--help' in rest or '-h' in rest:
         # the tables of all nodes
-        from koopman_ros.ros.programs import help_text
+        from koopman_ros.ros.node_descriptions import help_text
 
         try:
             print(help_text(name), flush=True)

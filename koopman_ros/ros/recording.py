@@ -13,9 +13,9 @@ import shutil
 
 from std_srvs.srv import SetBool
 
-from koopman_ros.bags import BagWriter
+from koopman_ros.parameters.signal_topics import Wiring
 from koopman_ros.parameters.trainer import TrainerParameters
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.records import BagWriter
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.managed import ManagedNode

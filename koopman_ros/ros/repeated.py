@@ -10,10 +10,10 @@ import time
 from builtin_interfaces.msg import Time
 import numpy as np
 
+from koopman_ros.core.message_fields import Place
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.signals import Outlet
-from koopman_ros.wire import Place
 
 _PERIOD = 0.05  # s between two looks
 _REPEAT = 0.7  # s without an answer until a value is published again

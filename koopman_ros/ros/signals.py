@@ -16,12 +16,12 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import Conversion, conversion, in_steps
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
-from koopman_ros.units import Conversion, conversion, in_steps
-from koopman_ros.wire import Place
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from koopman_ros import plants
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import stem
+from koopman_ros.core.units import display_unit, shown
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
-from koopman_ros.units import display_unit, shown
-from koopman_ros.wire import stem
 
 
 class SimulatedPlant:

@@ -8,8 +8,8 @@ import time
 
 from rclpy.node import Node
 
-from koopman_ros.time_base import Advance, TimeBase
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.core.time_base import Advance, TimeBase
+from koopman_ros.core.units import NANOSECONDS
 
 # Stamps further from the node's clock than this come from another clock.
 _SAME_CLOCK = 3600.0  # s

@@ -28,7 +28,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from koopman_ros.parameters.wire import (
+from koopman_ros.core.plugins import plug
+from koopman_ros.parameters.signal_topics import (
     ACTIVE_LIMITS,
     CLOCK,
     CONTROLLER_EVENTS,
@@ -38,7 +39,6 @@ from koopman_ros.parameters.wire import (
     OPERATOR_ACTIONS,
     Wiring,
 )
-from koopman_ros.plugs import plug
 from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.managed import one_line
 from koopman_ros.ros.node import Owned

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.paths import model_path
 from koopman_ros.execution.training import (
     class_lines,
     constant_lines,
@@ -20,14 +22,12 @@ from koopman_ros.execution.training import (
     scalars,
     TrainingJob,
 )
-from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.model import LiftedModel, load
+from koopman_ros.parameters.signal_topics import preset, system_of, Wiring
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
-from koopman_ros.parameters.wire import preset, system_of, Wiring
-from koopman_ros.resources import model_path
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode, Owned
-from koopman_ros.wire import Place
 
 POLL_PERIOD = 0.1  # s between two looks at a training
 _LINE_PERIOD = 5.0  # s between plain lines of progress

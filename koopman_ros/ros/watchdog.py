@@ -8,8 +8,8 @@ import os
 import signal
 import threading
 
-from koopman_ros.plugs import contained
-from koopman_ros.startup import end_by_force, SIGNALS
+from koopman_ros.core.plugins import contained
+from koopman_ros.process_entry import end_by_force, SIGNALS
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
 # Looks in a row at which the executor has not come by: on a loaded machine it may be late by some.

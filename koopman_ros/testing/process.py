@@ -15,8 +15,8 @@ import socket
 import subprocess
 from types import TracebackType
 
-from koopman_ros import startup
-from koopman_ros.resources import config_directory, LOOPBACK_PROFILE
+from koopman_ros import process_entry
+from koopman_ros.core.paths import config_directory, LOOPBACK_PROFILE
 
 STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
 _ABORT_TIMEOUT = 1.0  # s from SIGABRT, at which Python prints where it is, to SIGKILL
@@ -46,9 +46,9 @@ class NodeProcess:
         self.told_to_end = False
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_as_argument(value)}')]
-        program = command or startup.command(
+        program = command or process_entry.command(
             f'koopman_ros.nodes.{name}', signal.SIGINT, interrupted=0)
-        waiting = contextlib.nullcontext() if command else startup.blocked_signals()
+        waiting = contextlib.nullcontext() if command else process_entry.blocked_signals()
         with open(log, 'wb') as output, waiting:
             # a session of its own: an interrupt of the terminal is passed on by us, in order
             self.process = subprocess.Popen(
@@ -135,7 +135,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     before = {number: signal.signal(number, lambda *_: pending.append(True))
-              for number in startup.SIGNALS}
+              for number in process_entry.SIGNALS}
     try:
         yield check
     finally:

@@ -12,8 +12,8 @@ from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.reasons import Code
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.status import Code
 from studies.faults.plants import LOCKSTEP, Plant, REACTOR
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import math
 import signal
 from typing import Any
 
+from koopman_ros.core.status import Code
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from koopman_ros.reasons import Code
-from koopman_ros.units import NANOSECONDS
 from studies.faults import interceptor, operators, processes, silence
 from studies.faults.case import Case
 from studies.faults.interceptor import delayed, frozen, lost, noise, Packet, stamped, twice, value

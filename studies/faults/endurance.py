@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.random import default_rng, Generator
 
-from koopman_ros.arrays import Array
-from koopman_ros.bags import summary
+from koopman_ros.core.arrays import Array
+from koopman_ros.records import summary
 from koopman_ros.testing import HarnessError
 from studies.faults import interceptor
 from studies.faults.case import Trace

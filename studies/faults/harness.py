@@ -19,10 +19,10 @@ from typing import Any, TypeVar
 
 from rclpy.publisher import Publisher
 
+from koopman_ros.core.message_fields import Place
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
-from koopman_ros.wire import Place
 from studies.faults.case import Case, Trace
 from studies.faults.interceptor import Alteration, Interceptor, message_of, remapped, unchanged
 from studies.faults.judge import judge

@@ -19,12 +19,12 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
-from koopman_ros.assembler import Assembler
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.signals import by_topic
-from koopman_ros.units import NANOSECONDS
-from koopman_ros.wire import Place
 from studies.faults.case import Command, Status, Trace
 from studies.faults.plants import Plant
 

@@ -14,8 +14,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from koopman_ros.replay.records import parse, RecordError
-from koopman_ros.replay.run import replay_records
+from koopman_ros.event_log.records import parse, RecordError
+from koopman_ros.event_log.run import replay_records
 from studies.faults.case import Case, Trace
 
 LONGEST_GAP = 3.0  # samples between two commands, for which a larger step is allowed

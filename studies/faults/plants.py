@@ -11,14 +11,14 @@ from functools import cached_property
 import math
 from typing import Any
 
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import unit_label
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
 from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.parameters.signal_topics import preset, Wiring
 from koopman_ros.parameters.table import ParameterTable
-from koopman_ros.parameters.wire import preset, Wiring
-from koopman_ros.resources import model_path
-from koopman_ros.units import unit_label
 
 LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
 # While a controller is dead, the plant goes on at so many samples a second.

@@ -17,8 +17,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.bags import read_messages
-from koopman_ros.resources import model_path
+from koopman_ros.core.paths import model_path
+from koopman_ros.records import read_messages
 from studies.faults.harness import FaultHarness, SkipError
 from studies.faults.plants import LOCKSTEP
 

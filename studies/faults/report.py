@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from koopman_ros import reports
+from koopman_ros.core import plots
 from studies.faults.case import Trace
 from studies.faults.plants import PLANTS
 
@@ -34,13 +34,13 @@ def write(folder: Path, results: Mapping[str, dict[str, Any]],
     :return: whether every case that could be tried was survived, and every endurance run.
     """
     figures: dict[str, Any] = {
-        'machine': reports.machine(), 'cases': len(results),
+        'machine': plots.machine(), 'cases': len(results),
         'survived': sum(result['survived'] for result in results.values()),
         'skipped': sum('skipped' in result for result in results.values()),
         'results': results, **(runs or {})}
-    reports.write_figures(folder / 'summary.json', figures)
+    plots.write_figures(folder / 'summary.json', figures)
     drawn = _draw(traces or {}, folder / 'cases.png')
-    reports.write_page(folder / 'report.md', 'Fault campaign', [
+    plots.write_page(folder / 'report.md', 'Fault campaign', [
         *_sections(figures), *(['![Some of the cases](cases.png)'] if drawn else [])])
     return figures['survived'] + figures['skipped'] == len(results) and all(
         run['survived'] for run in (runs or {}).values())
@@ -71,7 +71,7 @@ def _sections(figures: dict[str, Any]) -> Iterator[str]:
            'the fault, the commands follow from the records to the bit, and no process failed.')
     on = [plant for plant in PLANTS.values()
           if plant.name in {result['plant'] for result in results.values()}]
-    yield reports.table(
+    yield plots.table(
         ('plant', 'back within', 'in at most [s]', 'lost from', 'fastest command'),
         ((plant.name, f'{plant.band:g} {plant.unit}', f'{plant.recovery:g}',
           f'{plant.highest:g} {plant.shown_units[0]}', f'{plant.rate:g} {plant.input_unit}/s')
@@ -80,13 +80,13 @@ def _sections(figures: dict[str, Any]) -> Iterator[str]:
         own = {name: result for name, result in results.items() if result['plant'] == plant.name}
         for group in dict.fromkeys(result['group'] for result in own.values()):
             yield f'## {plant.name}: {group}'
-            yield reports.table(_HEAD, (_row(name, result) for name, result in own.items()
+            yield plots.table(_HEAD, (_row(name, result) for name, result in own.items()
                                         if result['group'] == group), (2, 3, 4, 5))
     failed = [f'**{name}**: {"; ".join(result["reasons"])}' for name, result in results.items()
               if result.get('reasons')]
     if failed:
         yield '## Failures'
-        yield reports.bullets(failed)
+        yield plots.bullets(failed)
     for name, run in figures.items():
         if name.startswith('soak'):
             yield from _endurance_sections(name, run)
@@ -110,11 +110,11 @@ def _endurance_sections(name: str, run: dict[str, Any]) -> Iterator[str]:
            f'in {run["wall_seconds"]:.0f} s with {sum(run["events"].values())} events. The mean '
            f'error was {run["mean_error_K"]:.2f} K, the highest temperature '
            f'{run["hottest_degC"]:.1f} °C.')
-    yield reports.bullets(run['reasons'])
+    yield plots.bullets(run['reasons'])
     for title, counts in (('messages', run['answers']), ('recorded', run['recorded']),
                           ('event', dict(sorted(run['events'].items())))):
-        yield reports.table((title, 'times'), counts.items(), (1,))
-    yield reports.table(
+        yield plots.table((title, 'times'), counts.items(), (1,))
+    yield plots.table(
         ('process', 'memory at first [MB]', 'at last [MB]', 'growth when warm [MB]'),
         ((name, *seen.values()) for name, seen in run['memory_MB'].items()), (1, 2, 3))
 
@@ -124,7 +124,7 @@ def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
     shown = {name: trace for name in TELLING if (trace := traces.get(name)) is not None
              and trace.commands and math.isfinite(trace.end)}
     if shown:
-        with reports.drawing(path, 2, len(shown), size=(3.2 * len(shown), 5.2),
+        with plots.drawing(path, 2, len(shown), size=(3.2 * len(shown), 5.2),
                              sharex='col') as (_, panels):
             for upper, lower, name in zip(panels, panels[len(shown):], shown, strict=False):
                 _draw_case(upper, lower, shown[name])
@@ -146,7 +146,7 @@ def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
                color='black', linewidth=1.0, label='set-point')
     lower.plot([command.seconds for command in trace.commands],
                [command.values[0] for command in trace.commands], label='command')
-    reports.draw_limits(lower, on.range(on.inputs[0]), 'limits')
+    plots.draw_limits(lower, on.range(on.inputs[0]), 'limits')
     for axes, name, unit in zip((upper, lower), (state, on.inputs[0]), on.shown_units,
                                 strict=True):
         axes.set_ylabel(f'{name} [{unit}]')

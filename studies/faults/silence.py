@@ -15,9 +15,9 @@ from lifecycle_msgs.srv import ChangeState
 import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
-from koopman_ros.units import NANOSECONDS
 from studies.faults import interceptor
 from studies.faults.case import Trace
 from studies.faults.harness import FaultHarness

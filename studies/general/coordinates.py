@@ -11,12 +11,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import averaged, recentred
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Samples, split_by_episode
 from koopman_ros.learning import NoUsefulLift, rollout_rmse, train
 from koopman_ros.learning.lift.metrics import drift_error
-from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
-from koopman_ros.plant_data import Samples, split_by_episode
+from koopman_ros.model import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plants import describe
 from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import LEARNERS, RECIPES

@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from koopman_ros.core.datasets import Plant, Samples, split_by_episode
 from koopman_ros.learning import Edmd, Growth, NeuralDrift, NoUsefulLift, train
 from koopman_ros.learning.lift.multistart import Recipe
-from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
-from koopman_ros.plant_data import Plant, Samples, split_by_episode
+from koopman_ros.model import Box, LiftedModel, PolynomialObservables
 
 
 @dataclass(frozen=True)

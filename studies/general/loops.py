@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import Feedback, feedback, Form, Target, Weights
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.evaluation.optimal_cost import optimum, Task
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.solvers import solve_riccati
+from koopman_ros.model import LiftedModel
 from studies.campaign import Metrics
 from studies.general.systems import CASES, Regulation
 

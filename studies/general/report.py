@@ -8,7 +8,7 @@ from pathlib import Path
 import statistics
 from typing import Any, TypeAlias
 
-from koopman_ros.reports import drawing, legend, Picture, table
+from koopman_ros.core.plots import drawing, legend, Picture, table
 from studies import report
 from studies.general.coordinates import BEYOND, FEW, NOISE, PLACE
 from studies.general.loops import HELD_TO, OPTIMA, STARTS

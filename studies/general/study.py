@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from koopman_ros.core.datasets import Samples
 from koopman_ros.learning import fit, rollout_rmse
-from koopman_ros.lifting.model_file import MAX_COORDINATES
-from koopman_ros.plant_data import Samples
+from koopman_ros.model.model_file import MAX_COORDINATES
 from koopman_ros.plants import describe
 from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import Learned, LEARNERS

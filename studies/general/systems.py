@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import Weights
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Samples
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning import Linearisation
-from koopman_ros.lifting import Box, LiftedModel
-from koopman_ros.plant_data import Samples
+from koopman_ros.model import Box, LiftedModel
 from koopman_ros.plants import (
     box_episodes,
     ControlAffineSystem,
@@ -23,7 +24,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
     two_state_reactor,
 )
-from koopman_ros.solvers import solve_riccati
 from studies.shipped_models import library_system, LIFTS
 
 # Of half the box: nearer than that to the nominal state, a secant is the slope.

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend, LIMIT, Picture
 from koopman_ros.evaluation import ClosedLoop
 from koopman_ros.learning import roll_out
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import RandomStepDesign
-from koopman_ros.reports import drawing, DRAWN_RANGE, legend, LIMIT, Picture
 from studies.campaign import Campaign
 from studies.paper import reactor, scalar, two_state
 

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import Coordinates, LiftedModel, PolynomialObservables, Provenance
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import solve_riccati
+from koopman_ros.model import Coordinates, LiftedModel, PolynomialObservables, Provenance
 from koopman_ros.plants import ControlAffineSystem, equilibrium_input
-from koopman_ros.solvers import solve_riccati
 
 _Q = np.diag([1.0, 1.0, 0.0])
 _B = np.array([[0.0], [1.0], [0.0]])

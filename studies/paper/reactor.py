@@ -8,9 +8,9 @@ from scipy.integrate import solve_ivp
 
 from koopman_ros import learning
 from koopman_ros.control import steady_state_target, Weights
+from koopman_ros.core.datasets import Samples
 from koopman_ros.evaluation import ClosedLoop, run_closed_loop
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Samples
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import (
     box_episodes,
     describe,

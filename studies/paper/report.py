@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from koopman_ros.reports import Picture, table
+from koopman_ros.core.plots import Picture, table
 from studies import report
 from studies.report import at, figures_table, rows_table, share, spread
 

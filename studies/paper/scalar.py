@@ -5,8 +5,8 @@
 
 import numpy as np
 
+from koopman_ros.core.datasets import Samples
 from koopman_ros.learning import fit, Growth, train
-from koopman_ros.plant_data import Samples
 from koopman_ros.plants import describe, scalar_example
 from studies.campaign import Metrics, Models
 

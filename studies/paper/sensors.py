@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from koopman_ros import experiment as experiments
 from koopman_ros import plants
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.control import experiment as experiments
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.learning import (
     decide,
@@ -22,8 +23,7 @@ from koopman_ros.learning import (
     Trained,
 )
 from koopman_ros.learning.identification import DriftModel, Identified, identify
-from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
-from koopman_ros.plant_data import Episode
+from koopman_ros.model import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import ControlAffineSystem, describe, RandomStepDesign
 from studies.campaign import Metrics, Models
 from studies.paper.reactor import SETPOINT, SYSTEM

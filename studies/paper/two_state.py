@@ -11,11 +11,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from koopman_ros import learning
-from koopman_ros.arrays import Array
 from koopman_ros.control import averaged, Feedback, recentred, Target, Weights
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Samples
 from koopman_ros.evaluation import ClosedLoop, run_closed_loop
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Samples
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign, two_state_example
 from studies.campaign import Metrics, Models
 from studies.paper.optimal_control import (

@@ -6,7 +6,7 @@
 from collections.abc import Callable
 import sys
 
-from koopman_ros.reports import machine, write_figures
+from koopman_ros.core.plots import machine, write_figures
 from studies import report
 from studies.campaign import read_options
 from studies.partly_measured.cases import CASES

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import InputLimits, Tuning
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.mpc import MPCParameters
 from koopman_ros.control.steady_state import partial_target
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation.optimal_cost import Task
-from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.model import LiftedModel, load
 from koopman_ros.plants import ControlAffineSystem, steady_state
-from koopman_ros.resources import model_path
-from koopman_ros.signals import Outputs
-from koopman_ros.solvers import solve_riccati
 from studies.shipped_models import library_system
 from studies.true_model import TrueModel
 

@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 
 import control
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, State
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import solve_riccati
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation.simulate import after_a_second
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.solvers import solve_riccati
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.model import LiftedModel
 from studies.partly_measured.cases import PartialCase
 
 MARGIN = 0.3  # half widths of the training box by which the laws may leave that

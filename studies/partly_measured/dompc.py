@@ -14,8 +14,8 @@ import warnings
 import casadi
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
+from koopman_ros.core.arrays import Array
 from koopman_ros.estimation import Estimate, ExtendedKalmanFilter
 from studies.equations import EQUATIONS
 from studies.partly_measured.cases import PartialCase

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.reports import draw_limits, drawing, legend, Picture, table
+from koopman_ros.core.plots import draw_limits, drawing, legend, Picture, table
 from studies.partly_measured.cases import PartialCase
 from studies.partly_measured.study import ComparedFigures, ComparedRun
 

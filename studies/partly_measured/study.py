@@ -9,10 +9,10 @@ from time import process_time_ns
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation.optimal_cost import cost_along, Course
 from koopman_ros.plants import Process
-from koopman_ros.units import NANOSECONDS
 from studies.equations import EQUATIONS
 from studies.least import least_course
 from studies.partly_measured.cases import PartialCase

@@ -8,8 +8,8 @@ import sys
 import time
 
 from koopman_ros import __version__
+from koopman_ros.core.plots import write_figures
 from koopman_ros.execution import backend_of
-from koopman_ros.reports import write_figures
 from studies.campaign import read_options
 from studies.robustness.report import write_report
 from studies.robustness.study import study

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from koopman_ros import control, evaluation, plants
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import SECONDS_PER_MINUTE
 from koopman_ros.evaluation import Simulation
-from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.resources import model_path
-from koopman_ros.units import SECONDS_PER_MINUTE
 
 REACTOR = plants.one_state_reactor()
 START = float(REACTOR.nominal_state[0])

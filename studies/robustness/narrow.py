@@ -12,7 +12,7 @@ from koopman_ros import control, evaluation
 from koopman_ros.control import Controller
 from koopman_ros.evaluation import at, Simulation
 from koopman_ros.learning import Growth, Linearisation, train
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign
 from studies.campaign import Metrics
 from studies.paper import two_state

@@ -11,10 +11,10 @@ from typing import Any
 from matplotlib.axes import Axes
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend, Picture, table
+from koopman_ros.core.status import level_words
 from koopman_ros.evaluation import Simulation
-from koopman_ros.reasons import level_words
-from koopman_ros.reports import drawing, DRAWN_RANGE, legend, Picture, table
 from studies import report
 from studies.paper import two_state
 from studies.robustness import disturbances, narrow

@@ -12,13 +12,13 @@ from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
 import control
-from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Report, SAFE, State, Supervisor
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, Loop
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
-from koopman_ros.solvers import runge_kutta_step
-from koopman_ros.units import NANOSECONDS
 from studies.campaign import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import at_setpoint, COOLANT, COOLANT_RANGE, PERIOD, REACTOR

@@ -15,10 +15,10 @@ import pytest
 from scipy.linalg import expm
 
 from koopman_ros.control import Arrival, Controller, InputLimits, Mode, SensorLimits, State, Tuning
-from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
-from koopman_ros.reasons import Code
-from koopman_ros.replay.records import decoded
-from koopman_ros.signals import Outputs
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import Code
+from koopman_ros.event_log.records import decoded
+from koopman_ros.model import LiftedModel, linearised_model, Provenance
 from support.closed_loops import content, controller, EPOCH, SECOND
 from support.random_lifts import coordinates, random_lift
 

@@ -22,17 +22,17 @@ from koopman_ros.control.events import (
 )
 from koopman_ros.control.laws import LawResult, Linear
 from koopman_ros.control.recovery import SafeStateRecovery
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.status import Code
 from koopman_ros.estimation import (
     DisturbanceObserver,
     Estimate,
     ExtendedKalmanFilter,
     UnscentedKalmanFilter,
 )
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.parameters.wire import preset
-from koopman_ros.reasons import Code
-from koopman_ros.resources import model_path
+from koopman_ros.parameters.signal_topics import preset
 from support.closed_loops import SECOND
 
 SYSTEMS = ('reactor', 'two_state', 'quadruple_tank', 'pendulum')

@@ -11,8 +11,8 @@ import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, State, Tuning
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
-from koopman_ros.reasons import Code
-from koopman_ros.units import NANOSECONDS as SECOND
+from koopman_ros.core.status import Code
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 
 NOW = 1_785_000_000 * SECOND

@@ -12,13 +12,13 @@ from scipy.linalg import solve_continuous_are
 from koopman_ros.control import Tuning
 from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
 from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.core.status import Code
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
-from koopman_ros.lifting import Coordinates, linearised_model, NetworkObservables, Provenance
+from koopman_ros.model import Coordinates, linearised_model, NetworkObservables, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
-from koopman_ros.reasons import Code
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 from studies.paper.optimal_control import exact_two_state_model, scalar_optimal_cost
 from support.closed_loops import (
     COOLANT,

@@ -15,16 +15,16 @@ from scipy.optimize import lsq_linear
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
 from koopman_ros.control.events import Outcome
 from koopman_ros.control.steady_state import reachable_target
+from koopman_ros.core.status import Code, Words
+from koopman_ros.core.units import Displays
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, run_closed_loop, simulate
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
-from koopman_ros.lifting.observables import PolynomialObservables
+from koopman_ros.event_log.records import event_of, fields_of, Record
+from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.model.observables import PolynomialObservables
 from koopman_ros.plants import Actuator, Process
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
-from koopman_ros.reasons import Code, Words
-from koopman_ros.replay.records import event_of, fields_of, Record
-from koopman_ros.units import Displays
-from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import EPOCH
 
 LEVELS, FLOWS = ('h1', 'h2', 'h3'), ('q1', 'q2')

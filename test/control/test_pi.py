@@ -16,11 +16,11 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.laws.pi import PIParameters
+from koopman_ros.core.status import Code
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.evaluation import at, simulate
-from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
+from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
-from koopman_ros.reasons import Code
-from koopman_ros.units import NANOSECONDS as SECOND
 from studies.general.systems import SADDLE
 
 GAIN, TIME = 2.0, 20.0

@@ -26,13 +26,13 @@ from koopman_ros.control.events import (
     SetpointRequest,
     Silence,
 )
-from koopman_ros.lifting import LiftedModel, load_with_digest
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.status import Code
+from koopman_ros.event_log import records
+from koopman_ros.event_log.loop import replay
+from koopman_ros.model import LiftedModel, load_with_digest
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.reasons import Code
-from koopman_ros.replay import records
-from koopman_ros.replay.loop import replay
-from koopman_ros.resources import model_path
 from support.closed_loops import content, EPOCH, SECOND
 
 WILD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1.7e308, 0.0, -0.0, 5e-324]

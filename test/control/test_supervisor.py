@@ -12,10 +12,10 @@ from scipy.optimize import brentq
 from koopman_ros.control import Controller, InputLimits, State, Supervisor, Tuning
 from koopman_ros.control.recovery import rest_under, SafeStateRecovery
 from koopman_ros.control.supervisor import FallbackOrder, Requested
+from koopman_ros.core.status import Code, reason
 from koopman_ros.evaluation import exchange
-from koopman_ros.lifting import Coordinates, linearised_model, Provenance
+from koopman_ros.model import Coordinates, linearised_model, Provenance
 from koopman_ros.parameters.model_checks import rests_outside
-from koopman_ros.reasons import Code, reason
 from studies.robustness.disturbances import CHANGED
 from studies.robustness.loop import changed_reactor
 from support.closed_loops import (

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from koopman_ros.control.usable import unusable
-from koopman_ros.lifting import Coordinates, LiftedModel, load, ModelFileError, save
+from koopman_ros.core.paths import model_path
+from koopman_ros.model import Coordinates, LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.resources import model_path
 
 SHIPPED = load(model_path('reactor_nz4'))
 # places of the lower end, the nominal value and the upper end, in K

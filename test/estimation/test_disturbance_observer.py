@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import SensorLimits, Silence, State
+from koopman_ros.core.signals import Outputs
 from koopman_ros.estimation import (
     check,
     equivalent_bias,
@@ -17,7 +18,6 @@ from koopman_ros.estimation import (
 )
 from koopman_ros.evaluation import perfect
 from koopman_ros.plants import Actuator, two_state_reactor
-from koopman_ros.signals import Outputs
 from studies.robustness.disturbances import CHANGED
 from studies.robustness.loop import changed_reactor
 from support.closed_loops import (

@@ -11,7 +11,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
 
-from koopman_ros.arrays import Array
 from koopman_ros.control import (
     Controller,
     Initialisation,
@@ -21,6 +20,8 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.laws.pi import PIParameters
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
 from koopman_ros.estimation import (
     Estimate,
     Estimator,
@@ -29,10 +30,9 @@ from koopman_ros.estimation import (
 )
 from koopman_ros.estimation.kalman_filters import uncertainty
 from koopman_ros.evaluation import at, exchange, Loop, simulate
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
-from koopman_ros.signals import Outputs
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel
 from support.random_lifts import coordinates, random_lift

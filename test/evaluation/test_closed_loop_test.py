@@ -15,10 +15,12 @@ from scipy.integrate import quad
 from koopman_ros.control import Controller, InputLimits, State, Tuning
 from koopman_ros.control.laws import Law, LawResult, Linear
 from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.core.status import Code
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation.closed_loop_plots import draw_loops, plot_law_check
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck
-from koopman_ros.lifting import (
+from koopman_ros.model import (
     Coordinates,
     LiftedModel,
     linearised_model,
@@ -27,8 +29,6 @@ from koopman_ros.lifting import (
     TrainingStates,
     TriedLoops,
 )
-from koopman_ros.reasons import Code
-from koopman_ros.units import NANOSECONDS
 
 STATE = Coordinates(('level',), ('m',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
 INPUT = Coordinates(('flow',), ('m/s',), np.zeros(1), np.ones(1), np.full(1, -3.0),

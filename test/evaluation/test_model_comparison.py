@@ -12,12 +12,12 @@ from scipy.signal import cont2discrete
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.core.signals import Outputs
 from koopman_ros.evaluation import model_comparison
 from koopman_ros.evaluation.model_comparison import Comparison, Recent, Windows
 from koopman_ros.evaluation.simulate import at, simulate
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
-from koopman_ros.signals import Outputs
 from support.closed_loops import controller, REACTOR, SECOND, shipped, START
 
 ACCEPTED, REJECTED = MeasurementReport(Arrival.ACCEPTED), MeasurementReport(Arrival.REJECTED)

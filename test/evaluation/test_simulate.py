@@ -14,8 +14,10 @@ from scipy.linalg import solve_continuous_are
 from koopman_ros.control import Controller, InputLimits, Mode, Tuning
 from koopman_ros.control.events import Initialisation, ManualCommand, ModeChange, SetpointRequest
 from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, Weights
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation.simulate import at, exchange, restart, run_closed_loop, simulate
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
     Actuator,
     ControlAffineSystem,
@@ -23,8 +25,6 @@ from koopman_ros.plants import (
     two_state_example,
     two_state_reactor,
 )
-from koopman_ros.signals import Outputs
-from koopman_ros.solvers import solve_riccati
 from studies.paper.optimal_control import exact_two_state_model
 from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
 from support.random_lifts import coordinates

@@ -15,10 +15,10 @@ import time
 
 import pytest
 
+from koopman_ros.core.paths import model_path
 from koopman_ros.execution import job as job_module
 from koopman_ros.execution import training
 from koopman_ros.execution.training import JobState, TrainingJob
-from koopman_ros.resources import model_path
 from support.nodes import TIMEOUT, wait_until_ended
 from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
 

@@ -12,6 +12,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import LawCheck
 from koopman_ros.learning import decide, learn_lift, Thresholds
 from koopman_ros.learning.acceptance import uncovered_setpoints
@@ -26,11 +28,9 @@ from koopman_ros.learning.identification import (
 )
 from koopman_ros.learning.identification.drift import steady_point
 from koopman_ros.learning.lift.metrics import lifted_rate
-from koopman_ros.lifting import linearised_model, load, ModelFileError, Provenance, save
+from koopman_ros.model import linearised_model, load, ModelFileError, Provenance, save
 from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.plant_data import Episode
 from koopman_ros.plants import two_state_reactor
-from koopman_ros.resources import model_path
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, NOISE, reactor

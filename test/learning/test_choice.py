@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+from koopman_ros.core.datasets import split_by_episode
 from koopman_ros.learning import fit, Growth, NoUsefulLift, train
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.metrics import ROUNDING
-from koopman_ros.plant_data import split_by_episode
 from support import small_plants
 from support.small_plants import BENT, bent_samples, bits, SMALL, UNFORCED, unforced_samples
 

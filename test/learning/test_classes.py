@@ -21,7 +21,7 @@ from koopman_ros.learning import (
     TrainingTask,
 )
 from koopman_ros.learning.identification import identify, Stopped
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.model_classes import BEST, CLASSES
 from support.known_plants import KnownPlant, methods
 from support.quick_retraining import page_of, quick_retraining

@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 
+from koopman_ros.core.datasets import averaged, Episode
 from koopman_ros.learning.downsampling import (
     CELLS,
     cells_of,
@@ -13,7 +14,6 @@ from koopman_ros.learning.downsampling import (
     RecordStatistics,
     Selection,
 )
-from koopman_ros.plant_data import averaged, Episode
 
 
 def episode(x: np.ndarray, u: np.ndarray | None = None, period: float = 1.0) -> Episode:

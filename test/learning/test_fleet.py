@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from koopman_ros.learning import retrain, retrain_fleet, TrainingTask
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from support.quick_retraining import quick_retraining
 from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
 

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from koopman_ros.core.datasets import split_by_episode
 from koopman_ros.evaluation.closed_loop_test import check_law
 from koopman_ros.learning import (
     compare,
@@ -23,8 +24,7 @@ from koopman_ros.learning import (
 )
 from koopman_ros.learning.lift.neural_drift import with_units_of
 from koopman_ros.learning.model_selection import plainest
-from koopman_ros.lifting import Box, load, save
-from koopman_ros.plant_data import split_by_episode
+from koopman_ros.model import Box, load, save
 from support.random_lifts import random_lift
 from support.small_plants import (
     BENT,

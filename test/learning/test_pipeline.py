@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopman_ros.bags import BagReadError
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.paths import model_path
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
-from koopman_ros.lifting import load, ModelFileError, save
-from koopman_ros.plant_data import Episode
-from koopman_ros.resources import model_path
+from koopman_ros.model import load, ModelFileError, save
+from koopman_ros.records import BagReadError
 from support.known_plants import box
 from support.quick_retraining import page_of, quick_retraining
 from support.random_lifts import random_lift

@@ -12,18 +12,18 @@ import warnings
 import numpy as np
 import pytest
 
-from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
+from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.execution.training import constant_lines, scalars
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.task import known
-from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
-from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
 from koopman_ros.plants.library.two_tanks import TwoTanks
-from koopman_ros.units import NANOSECONDS as SECOND
-from koopman_ros.wire import Place
+from koopman_ros.records import BagWriter, message_definition, RecordedInput, RecordedState
 from support.known_plants import methods
 from support.quick_retraining import page_of, quick_retraining
 from support.recorded_runs import NOISE, reactor

@@ -17,9 +17,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
 from trajectory_msgs.msg import JointTrajectory
 
+from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import load, save
-from koopman_ros.resources import model_path
+from koopman_ros.model import load, save
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, STATUS, STEADY, until_read

@@ -15,8 +15,8 @@ import pytest
 import rclpy
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.bags import summary
 from koopman_ros.demo import retraining_demo, setpoint_demo
+from koopman_ros.records import summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess, reserved_output
 

@@ -14,18 +14,18 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.bags import read_messages
+from koopman_ros.control.experiment import advance, begin, Phase
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import to_celsius, to_kelvin
 from koopman_ros.demo import reactor
-from koopman_ros.experiment import advance, begin, Phase
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.parameters.signal_topics import Signals
 from koopman_ros.parameters.trainer import trainer_table
-from koopman_ros.parameters.wire import Signals
-from koopman_ros.resources import model_path
+from koopman_ros.records import read_messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from koopman_ros.units import to_celsius, to_kelvin
 from support.nodes import seconds, temperature, value
 
 STATUS = 'trainer: experiment'

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
 from support.nodes import seconds
 from support.tanks import LEVELS, linear, PUMPS, TANKS
 

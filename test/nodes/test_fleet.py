@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.testing import Harness
 from support.recorded_runs import linear_run, write_bag
 

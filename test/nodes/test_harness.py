@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-from koopman_ros.bags import summary
+from koopman_ros.records import summary
 from koopman_ros.testing import Harness, HarnessError, isolated_domain, NodeProcess, process
 from support.nodes import TIMEOUT, wait_until_ended
 

@@ -14,8 +14,8 @@ from lifecycle_msgs.srv import ChangeState
 import pytest
 from sensor_msgs.msg import Temperature
 
+from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
-from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.controller_bench import STEADY

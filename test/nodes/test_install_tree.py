@@ -85,7 +85,7 @@ def test_everything_is_installed(installation: Installation) -> None:
     beside = {path.name for path in installation.package.parent.iterdir()}
     assert 'koopman_ros' in beside
     assert not {'studies', 'benchmarks', 'test', 'examples', 'support'} & beside
-    program = ('import koopman_ros; from koopman_ros.resources import config_directory; '
+    program = ('import koopman_ros; from koopman_ros.core.paths import config_directory; '
                'print(koopman_ros.__file__); print(config_directory())')
     ended = run(installation.command(str(installation.python), '-c', program))
     assert ended.stdout.split() == [str(installation.package / '__init__.py'),

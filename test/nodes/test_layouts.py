@@ -16,10 +16,10 @@ from sensor_msgs.msg import JointState
 from koopman_ros.control import Mode, Report
 from koopman_ros.control.laws import Plan
 from koopman_ros.control.state import EstimateReport
+from koopman_ros.core.paths import config_directory
 from koopman_ros.demo import reactor
 from koopman_ros.estimation import Innovation
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_messages import active_limits, internals
 

@@ -17,8 +17,8 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.bags import read_messages, summary
 from koopman_ros.demo import reactor
+from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.controller_bench import reproduced

@@ -17,7 +17,7 @@ LAWS = """
 from dataclasses import dataclass
 
 from koopman_ros.control.laws import Law, LawResult
-from koopman_ros.declaration import column, parameter
+from koopman_ros.core.declaration import column, parameter
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ import pytest
 from sensor_msgs.msg import Temperature
 import yaml
 
-from koopman_ros.bags import summary
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.nodes import controller, plant, trainer
+from koopman_ros.records import summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from koopman_ros.testing.process import NodeProcess

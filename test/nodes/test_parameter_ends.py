@@ -29,7 +29,7 @@ from koopman_ros.plants import simulation
 from koopman_ros.ros import topics
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode
-from koopman_ros.ros.programs import tables
+from koopman_ros.ros.node_descriptions import tables
 from koopman_ros.testing import isolated_domain
 from support.nodes import seconds, temperature, TIMEOUT
 

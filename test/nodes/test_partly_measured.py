@@ -11,14 +11,14 @@ import pytest
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 
-from koopman_ros.lifting import Coordinates, linearised_model, Provenance, save
+from koopman_ros.core.units import to_kelvin
+from koopman_ros.event_log.records import parse
+from koopman_ros.event_log.run import replay_records
+from koopman_ros.model import Coordinates, linearised_model, Provenance, save
 from koopman_ros.plants import steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
-from koopman_ros.replay.records import parse
-from koopman_ros.replay.run import replay_records
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from koopman_ros.units import to_kelvin
 from support.nodes import temperature, value
 
 FEED = 355.0  # K, 5 K more than the model knows

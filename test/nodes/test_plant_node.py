@@ -15,6 +15,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
+from koopman_ros.core.units import LAST_STAMP_SECONDS, seconds_text
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import plant as plant_module
 from koopman_ros.nodes.plant import PlantNode
@@ -23,7 +24,6 @@ from koopman_ros.plants import sensor_noise
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from koopman_ros.units import LAST_STAMP_SECONDS, seconds_text
 from support.nodes import seconds, temperature, value
 
 STATUS = 'plant: simulation'

@@ -21,18 +21,18 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 import yaml
 
-from koopman_ros import bags
+from koopman_ros import records
+from koopman_ros.core.paths import config_directory
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
 from koopman_ros.demo.loop import run_loop
+from koopman_ros.event_log.run import replayed_bag
 from koopman_ros.nodes import player
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.trainer import player_table, preset_wiring
-from koopman_ros.replay.run import replayed_bag
-from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
 from support.bag_samples import DEFAULT_QOS
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
@@ -115,10 +115,10 @@ BEST_EFFORT_QOS = DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT)
 def write_bag(path: Path, entries: Sequence[tuple[str, Temperature, float]],
               offered: Sequence[Qos] = ()) -> Path:
     """Write temperatures: (topic, message, seconds of receipt)."""
-    with bags.BagWriter(path) as writer:
+    with records.BagWriter(path) as writer:
         for topic, message, received in entries:
             writer.add_topic(
-                topic, bags.message_definition('sensor_msgs/msg/Temperature'), offered)
+                topic, records.message_definition('sensor_msgs/msg/Temperature'), offered)
             writer.write(topic, serialize_message(message), round(received * NANOSECONDS))
     return path
 
@@ -136,7 +136,7 @@ def stamps(messages: Sequence[Any]) -> list[int]:
 
 def test_lockstep_gives_bit_identical_commands(
         ros: Harness, recorded_loop: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    recorded = bags.read_series(recorded_loop, '/coolant_setpoint')
+    recorded = records.read_series(recorded_loop, '/coolant_setpoint')
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.start('controller', {'disturbance_bandwidth': 0.0})
     ros.meet('controller')
@@ -146,7 +146,7 @@ def test_lockstep_gives_bit_identical_commands(
     assert [command.temperature for command in commands] == recorded.values.tolist()
     # the coolant in force with each measurement, and one set-point
     inputs = {f'/{name}' for name in player_table().snapshot({}).topics}
-    counts = bags.summary(recorded_loop).counts
+    counts = records.summary(recorded_loop).counts
     assert f'played {sum(counts[topic] for topic in inputs & set(counts))} messages' in (
         capfd.readouterr().err)
 
@@ -182,7 +182,8 @@ def test_messages_are_played_byte_for_byte_with_the_shipped_parameter_file(
          str(config_directory() / 'player.yaml'), '-p', f'bag:={recorded_loop}',
          '-p', 'rate:=10000.0', '-p', 'topics:=[temperature]')
     ros.wait_until(lambda: len(heard) >= SAMPLES)
-    assert heard == [entry.data for entry in bags.read_messages(recorded_loop, ['/temperature'])]
+    read = records.read_messages(recorded_loop, ['/temperature'])
+    assert heard == [entry.data for entry in read]
 
 
 def test_measurements_come_at_their_times(ros: Harness, tmp_path: Path) -> None:

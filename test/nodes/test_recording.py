@@ -22,17 +22,17 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import Float64, String
 
-from koopman_ros.bags import BagMessage, read_messages, summary
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.nodes import trainer
 from koopman_ros.parameters.trainer import trainer_table
-from koopman_ros.resources import model_path
+from koopman_ros.records import BagMessage, read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.recording import free_name
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS as SECOND
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -24,16 +24,16 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.control import State
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
+from koopman_ros.event_log.records import MODEL, PARAMETERS
+from koopman_ros.model import LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters import model_checks
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.plants import Process
-from koopman_ros.replay.records import MODEL, PARAMETERS
-from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
 from support.closed_loops import REACTOR
 from support.controller_bench import PATIENT, reproduced, STATUS, STEADY, until_read
 from support.nodes import opened, temperature, value

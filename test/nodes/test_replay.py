@@ -20,18 +20,18 @@ import pytest
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
-from koopman_ros.bags import BagReadError
+from koopman_ros.core.paths import config_directory, model_path
+from koopman_ros.core.units import to_kelvin
 from koopman_ros.demo import reactor
+from koopman_ros.event_log.records import parse, Record, SNAPSHOT
+from koopman_ros.event_log.report import ReplayedBag, reproduced, verdict
+from koopman_ros.event_log.run import replayed_bag
+from koopman_ros.event_log.sources import read_records
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.controller import ReplayParameters
-from koopman_ros.replay.records import parse, Record, SNAPSHOT
-from koopman_ros.replay.report import ReplayedBag, reproduced, verdict
-from koopman_ros.replay.run import replayed_bag
-from koopman_ros.replay.sources import read_records
-from koopman_ros.resources import config_directory, model_path
+from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, isolated_domain
-from koopman_ros.units import to_kelvin
 from support.controller_bench import STEADY
 from support.nodes import complaint, run_here, seconds, temperature, value
 from support.recorded_runs import Recorded
@@ -228,7 +228,7 @@ def test_a_replay_on_several_threads_is_bit_identical(bag: Path, tmp_path: Path)
     threads = {f'{name}_NUM_THREADS': '4' for name in ('OMP', 'OPENBLAS', 'MKL')}
     with isolated_domain():
         job = subprocess.run(
-            [sys.executable, '-c', 'import sys; from koopman_ros.startup import replay; '
+            [sys.executable, '-c', 'import sys; from koopman_ros.process_entry import replay; '
              'sys.exit(replay())', '--ros-args', '-p', f'bags:=[{bag}]', '-p',
              f'output:={tmp_path}'], env={**os.environ, **threads}, capture_output=True, text=True,
             timeout=240, check=False)
@@ -360,7 +360,7 @@ def test_controller_in_a_namespace_is_replayed_by_its_own_records(tmp_path: Path
 
 def test_missing_matplotlib_is_told_in_one_line(
         monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.delitem(sys.modules, 'koopman_ros.replay.figure', raising=False)
+    monkeypatch.delitem(sys.modules, 'koopman_ros.event_log.figure', raising=False)
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
     assert run_here(replay, bags='[run.mcap]') == 1
     assert complaint(capfd).startswith(

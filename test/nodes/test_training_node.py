@@ -11,10 +11,10 @@ import sys
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 
-from koopman_ros.bags import summary
 from koopman_ros.demo.reactor import constant
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.nodes import trainer
+from koopman_ros.records import summary
 from koopman_ros.testing import Harness
 from support.nodes import children, complaint, ended, run_here, value
 from support.recorded_runs import driven, reactor, write_bag

@@ -13,7 +13,8 @@ import zlib
 
 import pytest
 
-from koopman_ros.lifting import load
+from koopman_ros.core.paths import model_path
+from koopman_ros.model import load
 from koopman_ros.panel.files import read_bounded
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, status_card, training_ranges
@@ -25,8 +26,7 @@ from koopman_ros.panel.training_report import (
     report_base,
 )
 from koopman_ros.parameters.panel import panel_signals, panel_table
-from koopman_ros.parameters.wire import Wiring
-from koopman_ros.resources import model_path
+from koopman_ros.parameters.signal_topics import Wiring
 
 MARKUP = '<script>alert(1)</script>'
 FIGURES = {

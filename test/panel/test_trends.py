@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.panel.trends import MAX_MARKS, Trends
 
 NAN = math.nan

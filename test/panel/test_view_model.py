@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.faceplates import pen
 from koopman_ros.panel.requests import (
@@ -35,8 +36,7 @@ from koopman_ros.panel.snapshot import (
 )
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
-from koopman_ros.parameters.wire import Signals
-from koopman_ros.units import display_unit, to_kelvin
+from koopman_ros.parameters.signal_topics import Signals
 
 REACTOR = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
 TANKS = Signals({'level_1': 'm', 'level_2': 'm'}, {'pump_1': 'V', 'pump_2': 'V'},

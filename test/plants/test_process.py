@@ -9,6 +9,8 @@ import math
 import numpy as np
 import pytest
 
+from koopman_ros.core.units import in_steps
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.plants import (
     Actuator,
     advance,
@@ -19,8 +21,6 @@ from koopman_ros.plants import (
     scalar_example,
     sensor_noise,
 )
-from koopman_ros.units import in_steps
-from koopman_ros.units import NANOSECONDS as SECOND
 
 SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant
 

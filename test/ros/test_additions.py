@@ -15,13 +15,13 @@ import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import BatteryState
 
-from koopman_ros import wire
-from koopman_ros.bags import BagWriter, message_definition, read_series
+from koopman_ros.core import message_fields
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.plants import Process
+from koopman_ros.records import BagWriter, message_definition, read_series
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
 
 PLANT = """
     import numpy as np
@@ -46,7 +46,7 @@ ROW = """
     TABLE = ParameterTable(Wider, groups={'constants': ()})
     """
 TYPE = """
-    from koopman_ros.wire import Carrier, CARRIERS
+    from koopman_ros.core.message_fields import Carrier, CARRIERS
 
     CARRIERS['sensor_msgs/msg/BatteryState'] = Carrier('voltage', 'V', 0.0, 1e3)
     """
@@ -60,7 +60,7 @@ def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixtu
     (tmp_path / f'{name}.py').write_text(textwrap.dedent(request.param))
     monkeypatch.syspath_prepend(tmp_path)
     # what it adds is gone with it
-    with mock.patch.dict(wire.CARRIERS):
+    with mock.patch.dict(message_fields.CARRIERS):
         yield importlib.import_module(name)
 
 
@@ -99,6 +99,6 @@ def test_a_message_type_is_learned_from(tmp_path: Path) -> None:
             writer.write('/cell', serialize_message(message), second * NANOSECONDS)
     series = read_series(tmp_path / 'run', '/cell')
     assert (series.values.tolist(), series.unit) == ([3.5, -1.0, 3.75], 'V')
-    where = wire.place('/cell', 'cell', 'mV', {'type': 'sensor_msgs/msg/BatteryState'})
-    assert where == wire.Place('/cell', 'sensor_msgs/msg/BatteryState', 'voltage', 'V')
+    where = message_fields.place('/cell', 'cell', 'mV', {'type': 'sensor_msgs/msg/BatteryState'})
+    assert where == message_fields.Place('/cell', 'sensor_msgs/msg/BatteryState', 'voltage', 'V')
     assert where.range == (0.0, 1e3)

@@ -14,11 +14,11 @@ from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
+from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
-from koopman_ros.units import LAST_STAMP_SECONDS
 from support.controller_bench import Bench, STATUS, STEADY, TABLE
 from support.nodes import seconds, temperature, value
 

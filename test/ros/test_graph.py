@@ -23,7 +23,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool
 
-from koopman_ros.bags import BagWriter, message_definition
+from koopman_ros.core.paths import config_directory
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.table import ConfigurationError
@@ -34,11 +34,11 @@ from koopman_ros.parameters.trainer import (
     preset_wiring,
     SETPOINT,
 )
-from koopman_ros.resources import config_directory
+from koopman_ros.records import BagWriter, message_definition
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.node import LoopNode
-from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS, programs
+from koopman_ros.ros.node_descriptions import OPERATOR, policy, Program, PROGRAMS, programs
 from koopman_ros.testing import Harness, isolated_domain
 from support.nodes import temperature, TIMEOUT
 

@@ -16,8 +16,9 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 import yaml
 
+from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import (
@@ -30,9 +31,8 @@ from koopman_ros.parameters.table import (
 )
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.plants import build, plant_class
-from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros.node import LoopNode, range_of
-from koopman_ros.ros.programs import main, POLICY_FILE, tables
+from koopman_ros.ros.node_descriptions import main, POLICY_FILE, tables
 from koopman_ros.testing import Harness
 
 TABLES = tables()

@@ -18,17 +18,18 @@ import pytest
 from rclpy.duration import Duration
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Mode, State
 from koopman_ros.control.laws import Plan
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
+from koopman_ros.model import LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters import model_checks
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.model_checks import load_suitable
+from koopman_ros.parameters.signal_topics import Signals, signals_of, Wiring
 from koopman_ros.parameters.trainer import trainer_table
-from koopman_ros.parameters.wire import Signals, signals_of, Wiring
-from koopman_ros.resources import model_path
+from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.controller_messages import active_limits, planned
 from koopman_ros.ros.controller_status import statuses
@@ -40,7 +41,6 @@ from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
 from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
 from support.nodes import temperature, TIMEOUT
 
 SIGNALS = signals_of(load(model_path(reactor.MODEL)))

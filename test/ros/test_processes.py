@@ -17,15 +17,15 @@ import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
 
-from koopman_ros.bags import summary
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.nodes import controller, plant, player, trainer
-from koopman_ros.resources import model_path
+from koopman_ros.records import summary
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.node_descriptions import tables
 from koopman_ros.ros.process import answer, open_to_the_network
-from koopman_ros.ros.programs import tables
 from koopman_ros.testing import Harness, NodeProcess
-from koopman_ros.units import NANOSECONDS
 from support.nodes import run_here, TIMEOUT
 
 TABLES = tables()

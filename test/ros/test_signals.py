@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState, Temperature
 
+from koopman_ros.core.message_fields import Place, place
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.testing import Harness
-from koopman_ros.units import NANOSECONDS
-from koopman_ros.wire import Place, place
 
 STAMP = stamp_message(7 * NANOSECONDS + 250)
 TWIST = {'type': 'geometry_msgs/msg/TwistStamped', 'field': 'twist.linear.x'}

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from koopman_ros.core.time_base import Advance
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.ros import timing
 from koopman_ros.ros.timing import Timing
-from koopman_ros.time_base import Advance
-from koopman_ros.units import NANOSECONDS as SECOND
 
 EPOCH = 1_785_000_000  # s
 WINDOW = 10.0  # s

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from koopman_ros.reasons import Code
-from koopman_ros.replay.records import parse
+from koopman_ros.core.status import Code
+from koopman_ros.event_log.records import parse
 from studies.faults import interceptor
 from studies.faults.__main__ import main
 from studies.faults.case import Case, Command, Status, Trace

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
 from koopman_ros.learning import fit, roll_out
-from koopman_ros.lifting import load
+from koopman_ros.model import load
 from koopman_ros.plants import (
     box_episodes,
     Process,
@@ -21,7 +22,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
     steady_state,
 )
-from koopman_ros.resources import model_path
 from studies import saddle
 from studies.paper import reactor
 from studies.paper.reactor import SETPOINT, SYSTEM, training_samples

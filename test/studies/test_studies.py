@@ -18,13 +18,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import Initialisation, SetpointRequest
+from koopman_ros.core.paths import model_path
 from koopman_ros.demo.loop import Row
 from koopman_ros.evaluation import at, simulate, Simulation
 from koopman_ros.evaluation.optimal_cost import optimum
 from koopman_ros.learning import Growth, Linearisation, NeuralDrift, rollout_rmse
-from koopman_ros.lifting import Box, load
+from koopman_ros.model import Box, load
 from koopman_ros.plants import describe, Process
-from koopman_ros.resources import model_path
 from koopman_ros.testing import HarnessError
 from studies import saddle, saddle_act, unstable
 from studies.campaign import Campaign, Experiment, Metrics, Models, run_campaign

@@ -20,7 +20,7 @@ from rosbags.interfaces import (
 import yaml
 import zstandard
 
-from koopman_ros.bags import BagWriter, MessageDefinition
+from koopman_ros.records import BagWriter, MessageDefinition
 
 TOPICS = {
     '/temperature': 'sensor_msgs/msg/Temperature',

@@ -13,16 +13,16 @@ import numpy as np
 from scipy.optimize import root
 
 from koopman_ros import control, evaluation, plants
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import Words
+from koopman_ros.core.units import Displays
+from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import DisturbanceObserver
-from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.event_log.records import encoded
+from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.reasons import Words
-from koopman_ros.replay.records import encoded
-from koopman_ros.signals import Outputs
 from koopman_ros.tuning import Tuning
-from koopman_ros.units import Displays
-from koopman_ros.units import NANOSECONDS as SECOND
 
 Law = Callable[..., control.Feedback]
 

@@ -14,15 +14,15 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import to_celsius
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import load
+from koopman_ros.event_log.records import parse, Record
+from koopman_ros.event_log.run import replay_records
+from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
-from koopman_ros.replay.records import parse, Record
-from koopman_ros.replay.run import replay_records
-from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from koopman_ros.units import to_celsius
 from support.nodes import seconds, temperature, TIMEOUT, value
 
 STATUS = 'controller: control'

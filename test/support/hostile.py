@@ -12,7 +12,7 @@ from koopman_ros.panel.snapshot import CONTROLLER, ERROR, TRAINER
 from koopman_ros.panel.training_report import Comparison, Learning, Report
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
-from koopman_ros.parameters.wire import Signals
+from koopman_ros.parameters.signal_topics import Signals
 
 NOW = 1_790_000_000.0  # s of Unix time
 CODE = 'window.CAUGHT=1'

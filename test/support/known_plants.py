@@ -9,6 +9,7 @@ import math
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from koopman_ros.core.datasets import Episode, Plant
 from koopman_ros.learning.identification import (
     DriftModel,
     IdentificationMethod,
@@ -16,8 +17,7 @@ from koopman_ros.learning.identification import (
     WeakForm,
     WeakFormParameters,
 )
-from koopman_ros.lifting import Box, Coordinates
-from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.model import Box, Coordinates
 from support.disturbance import disturbed
 
 

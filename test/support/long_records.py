@@ -10,15 +10,15 @@ import struct
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_MINUTE
 from koopman_ros.learning import TrainingTask
 from koopman_ros.learning.identification import Drift
 from koopman_ros.learning.record import Source
 from koopman_ros.plants.library.reactor import OneStateReactor
-from koopman_ros.solvers import runge_kutta_step
-from koopman_ros.units import NANOSECONDS, SECONDS_PER_MINUTE
-from koopman_ros.wire import Place
+from koopman_ros.records import BagWriter, message_definition, RecordedInput, RecordedState
 
 TYPE, FIELD = 'geometry_msgs/msg/PointStamped', 'point.x'  # a number with a stamp, of any unit
 SAMPLES = 4000  # of a bag, one a second

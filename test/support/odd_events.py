@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from koopman_ros.control import State
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.model import LiftedModel
 
 
 def odd_event(model: LiftedModel, rng: np.random.Generator, last: State, seconds: float

@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
+from koopman_ros.model import Coordinates, LiftedModel, NetworkObservables, Provenance
 
 
 def coordinates(prefix: str, n: int) -> Coordinates:

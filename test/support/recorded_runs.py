@@ -13,17 +13,17 @@ import warnings
 import numpy as np
 
 from koopman_ros import plants
-from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
 from koopman_ros.control import Controller, State
 from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
-from koopman_ros.lifting import LiftedModel, load_with_digest
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.message_fields import place
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import NANOSECONDS as SECOND
+from koopman_ros.core.units import to_celsius
+from koopman_ros.event_log import records
+from koopman_ros.model import LiftedModel, load_with_digest
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.plant_data import Episode
-from koopman_ros.replay import records
-from koopman_ros.resources import model_path
-from koopman_ros.units import NANOSECONDS as SECOND
-from koopman_ros.units import to_celsius
-from koopman_ros.wire import place
+from koopman_ros.records import BagWriter, message_definition, RecordedInput, RecordedState
 from support.disturbance import disturbed
 
 NOISE = 0.1  # K

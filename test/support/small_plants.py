@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from koopman_ros.core.datasets import Plant, Samples
 from koopman_ros.learning import Growth
-from koopman_ros.plant_data import Plant, Samples
 from koopman_ros.plants import two_state_example
 
 # dx/dt = -x - 0.3 x^2 + 2 u, in deviations from 3 m and 0.5 m/s

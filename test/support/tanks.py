@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from koopman_ros.lifting import Coordinates, linearised_model, Provenance, save
+from koopman_ros.model import Coordinates, linearised_model, Provenance, save
 from koopman_ros.plants.library.two_tanks import TwoTanks
 
 TANKS = TwoTanks().system()

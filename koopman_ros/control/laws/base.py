@@ -14,11 +14,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array, frozen
-from koopman_ros.declaration import NoParameters
+from koopman_ros.core.arrays import Array, frozen
+from koopman_ros.core.declaration import NoParameters
+from koopman_ros.core.status import Reason
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Reason
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 
@@ -168,7 +168,7 @@ class Law(ABC):
     It is tuned by the parameter ``Proportional.gain``.
     """
 
-    #: frozen dataclass of its own parameters, see :mod:`koopman_ros.declaration`
+    #: frozen dataclass of its own parameters, see :mod:`koopman_ros.core.declaration`
     Parameters: ClassVar[type[Any]] = NoParameters
     #: whether it tracks the set-point without the model's steady state
     model_free: ClassVar[bool] = False

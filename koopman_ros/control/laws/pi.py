@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
-from koopman_ros.declaration import column, UNBOUNDED
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import column, UNBOUNDED
+from koopman_ros.core.status import Code, Reason, reason
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.linalg import expm
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import (
     Law,
     LawResult,
@@ -21,10 +20,11 @@ from koopman_ros.control.laws.base import (
     Target,
     Weights,
 )
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.core.status import Code, reason
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Code, reason
-from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 # Largest mismatch of a closed lift: those of plants that have one come to 2e-7 or less, others to

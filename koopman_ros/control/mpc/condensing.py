@@ -16,7 +16,7 @@ from numba import njit, types
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import brentq
 
-from koopman_ros.arrays import Array, frozen
+from koopman_ros.core.arrays import Array, frozen
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
 from koopman_ros.control.laws.riccati import StateDependentRiccati
-from koopman_ros.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
+from koopman_ros.core.plugins import contained
+from koopman_ros.core.status import Code, Reason, reason
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plugs import contained
-from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 if TYPE_CHECKING:

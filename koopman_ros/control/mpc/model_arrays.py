@@ -6,7 +6,7 @@
 import numpy as np
 
 from koopman_ros.control.mpc.condensing import ModelArrays
-from koopman_ros.lifting import LiftedModel, NetworkObservables, PolynomialObservables
+from koopman_ros.model import LiftedModel, NetworkObservables, PolynomialObservables
 
 
 def model_arrays(model: LiftedModel) -> ModelArrays:

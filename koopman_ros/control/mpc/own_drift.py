@@ -5,8 +5,8 @@
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.core.arrays import Array
+from koopman_ros.model import LiftedModel
 
 
 def has_own_drift(model: LiftedModel) -> bool:

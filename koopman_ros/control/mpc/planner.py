@@ -13,17 +13,22 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
 from koopman_ros.control.mpc import own_drift
 from koopman_ros.control.mpc.condensing import condense, drift, roll_out
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.mpc.model_arrays import model_arrays
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import (
+    RiccatiSolution,
+    RiccatiStatus,
+    runge_kutta_step,
+    solve_riccati,
+)
+from koopman_ros.core.status import Code, Reason, reason
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 _MAX_INTERVALS, _MIN_INTERVALS = 30, 3

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from koopman_ros.arrays import Array, brief
-from koopman_ros.declaration import NoParameters
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.declaration import NoParameters
 from koopman_ros.learning.identification.drift import DriftModel
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Episode
+from koopman_ros.model import Box
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class IdentificationMethod(ABC):
     :param parameters: of the class `Parameters`, by default its defaults.
     """
 
-    #: a frozen dataclass of the method's own parameters, see :mod:`koopman_ros.declaration`
+    #: a frozen dataclass of the method's own parameters, see :mod:`koopman_ros.core.declaration`
     Parameters: ClassVar[type[Any]] = NoParameters
 
     def __init__(self, parameters: Any = None) -> None:

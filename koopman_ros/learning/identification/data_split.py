@@ -12,13 +12,13 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.core.datasets import Array, cut, Episode, Plant
 from koopman_ros.learning.identification.drift import Drift, DriftModel, longest_step, Segments
 from koopman_ros.learning.identification.identify import Identified, Score, segments_of, split
 from koopman_ros.learning.identification.innovations_form import Predictor, Run
 from koopman_ros.learning.identification.output_error import output_error
 from koopman_ros.learning.identification.total_variation import noise_level
 from koopman_ros.learning.identification.weak_form import regress
-from koopman_ros.plant_data import Array, cut, Episode, Plant
 
 _GROWTH = 2.0  # exponent by which roll-outs that judge an unstable plant may grow
 _SHORTEST = 20  # samples of a segment, whatever grows

@@ -15,11 +15,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import brief
-from koopman_ros.lifting import Box, InputTerms, PolynomialObservables
-from koopman_ros.lifting.observables import Monomials
-from koopman_ros.plant_data import Array, Episode, Plant
-from koopman_ros.solvers import runge_kutta_step
+from koopman_ros.core.arrays import brief
+from koopman_ros.core.datasets import Array, Episode, Plant
+from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.model import Box, InputTerms, PolynomialObservables
+from koopman_ros.model.observables import Monomials
 
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
 Rate = Callable[[Array, Array], Array]

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array, brief
+from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.datasets import Plant
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.learning.identification.drift import Drift
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Plant
+from koopman_ros.model import Box
 from koopman_ros.plants import build, ControlAffineSystem, Sought
-from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 # Of an angle, by which the equations are differentiated by a constant: rounding and curvature both
 # leave about ten digits.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from koopman_ros.plant_data import Array, Episode, Plant
+from koopman_ros.core.datasets import Array, Episode, Plant
 
 # Samples over which inputs are averaged: the noise of a measured input moves no plant, and hides
 # that two inputs move together.

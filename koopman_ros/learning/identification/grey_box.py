@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from koopman_ros.core.datasets import Array, Episode, Plant
+from koopman_ros.core.solvers import RiccatiStatus, solve_riccati
 from koopman_ros.learning.identification.data_split import Record
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.learning.identification.identify import (
@@ -26,10 +28,8 @@ from koopman_ros.learning.identification.identify import (
 )
 from koopman_ros.learning.identification.innovations_form import Predictor
 from koopman_ros.learning.identification.output_error import innovations_form, Refined
-from koopman_ros.lifting import Coordinates
-from koopman_ros.plant_data import Array, Episode, Plant
+from koopman_ros.model import Coordinates
 from koopman_ros.plants import Sought, sought_of
-from koopman_ros.solvers import RiccatiStatus, solve_riccati
 
 # How far disturbances, as filters assume them, move a state from sample to sample, over the noise
 # of the measurements, in deviations.

@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import brief
+from koopman_ros.core.arrays import brief
+from koopman_ros.core.datasets import Array, cut, Episode, Plant
+from koopman_ros.core.plugins import contained, plug_class, short_name
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
@@ -29,9 +31,7 @@ from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.output_error import output_error
 from koopman_ros.learning.identification.total_variation import noise_level
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Array, cut, Episode, Plant
-from koopman_ros.plugs import contained, plug_class, short_name
+from koopman_ros.model import Box
 
 DEGREES = (1, 2, 3, 4, 5, 6)
 # Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes

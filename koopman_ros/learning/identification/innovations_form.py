@@ -11,11 +11,11 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.identification.weak_form import regress
-from koopman_ros.plant_data import Episode
-from koopman_ros.solvers import runge_kutta_step
 
 SETTLING = 40  # samples after which a filter has found the state
 # Of the search for the start of an episode: how far hidden states are tried, steps, differences.

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
+from koopman_ros.core.datasets import Array
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.lift.levenberg_marquardt import (
     minimise,
     normal_equations,
     NormalEquations,
 )
-from koopman_ros.plant_data import Array
-from koopman_ros.solvers import runge_kutta_step
 
 _MAX_ITERATIONS = 40
 

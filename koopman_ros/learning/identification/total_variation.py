@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import solveh_banded
 
+from koopman_ros.core.datasets import Array, Episode
 from koopman_ros.learning.identification.base import (
     DriftEstimate,
     DriftProblem,
@@ -15,8 +16,7 @@ from koopman_ros.learning.identification.base import (
 )
 from koopman_ros.learning.identification.drift import Drift, DriftModel
 from koopman_ros.learning.identification.weak_form import regress
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Array, Episode
+from koopman_ros.model import Box
 
 # Steps towards the weight, and samples that an episode needs.
 _SWEEPS = 30

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from koopman_ros.core.datasets import Array, Episode, Plant
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.data_split import Record
 from koopman_ros.learning.identification.drift import DriftModel
@@ -30,8 +31,7 @@ from koopman_ros.learning.identification.innovations_form import (
     standardised,
 )
 from koopman_ros.learning.identification.output_error import innovations_form, Weights
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Array, Episode, Plant
+from koopman_ros.model import Box
 
 HIGHEST_DEGREE = 3
 UNIT = '1'  # of a state that is not measured: any other scale would do as well

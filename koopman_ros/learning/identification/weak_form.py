@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
+from koopman_ros.core.datasets import Array, Episode
 from koopman_ros.identification_methods import WeakFormParameters
 from koopman_ros.learning.identification.base import (
     DriftEstimate,
@@ -15,8 +16,7 @@ from koopman_ros.learning.identification.base import (
     IdentificationMethod,
 )
 from koopman_ros.learning.identification.drift import DriftModel
-from koopman_ros.lifting import Box, InputTerms
-from koopman_ros.plant_data import Array, Episode
+from koopman_ros.model import Box, InputTerms
 
 # Exponent of the test functions (1 - s^2)^p, which are zero at the first and at the last sample.
 _POWER = 3

@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
+from koopman_ros.core.datasets import Array, Plant, Samples
 from koopman_ros.learning.identification.drift import DriftModel, steady_point
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.residuals import deviations
-from koopman_ros.lifting import Box, Coordinates
-from koopman_ros.plant_data import Array, Plant, Samples
+from koopman_ros.model import Box, Coordinates
 
 # Times and derivatives contradict each other beyond this factor, by so many steps at least.
 _FACTOR = 2.0

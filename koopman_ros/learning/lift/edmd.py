@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros import __version__
+from koopman_ros.core.datasets import Array, Plant, Samples
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.residuals import deviations
-from koopman_ros.lifting import (
+from koopman_ros.model import (
     Box,
     LiftedModel,
     linearised_model,
     PolynomialObservables,
     Provenance,
 )
-from koopman_ros.plant_data import Array, Plant, Samples
 
 
 @dataclass(frozen=True)

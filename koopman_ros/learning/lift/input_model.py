@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from koopman_ros.arrays import Array
-from koopman_ros.lifting import Box, InputTerms
-from koopman_ros.plant_data import Plant
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Plant
+from koopman_ros.model import Box, InputTerms
 
 # A function B(x) is replaced by a polynomial of at most this degree, whose root mean square error
 # over the samples may be at most this share of it; one so small is rounding.

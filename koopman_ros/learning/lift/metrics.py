@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
-from koopman_ros.arrays import brief
+from koopman_ros.core.arrays import brief
+from koopman_ros.core.datasets import Array, Samples
 from koopman_ros.evaluation.closed_loop_test import Rate
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Array, Samples
+from koopman_ros.model import LiftedModel
 
 # Beyond it S is singular to working precision, and rw is noise.
 _MAX_COND = 1e13

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from koopman_ros.core.datasets import Samples
 from koopman_ros.learning.lift.incremental import linear_drift, Monitor, TrainedLift, xavier
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.learning.lift.residuals import CHUNK, ScaledSamples
-from koopman_ros.lifting import LiftedModel, NetworkObservables
-from koopman_ros.plant_data import Samples
+from koopman_ros.model import LiftedModel, NetworkObservables
 
 # Directions of the features smaller than this beside the largest are left out of a fit: their
 # weights would be as large as the inverse. Which share is best depends on the data.

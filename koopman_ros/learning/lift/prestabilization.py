@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from koopman_ros.core.datasets import Array
+from koopman_ros.core.solvers import RiccatiStatus, solve_riccati
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.lifting import NetworkObservables
-from koopman_ros.plant_data import Array
-from koopman_ros.solvers import RiccatiStatus, solve_riccati
+from koopman_ros.model import NetworkObservables
 
 # Ratio of the smallest to the largest variance of a singular covariance. Rounding decides whether
 # a Cholesky factorisation fails there.

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from koopman_ros.core.datasets import Array, Samples
 from koopman_ros.learning.lift.levenberg_marquardt import NormalEquations
 from koopman_ros.learning.lift.moment_sums import feature_count, MomentSums
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Array, Samples
+from koopman_ros.model import Box
 
 # Numbers in a chunk of the residual Jacobian: 2 MiB, the cache of a core.
 CHUNK = 1 << 18

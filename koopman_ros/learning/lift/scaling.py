@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from koopman_ros.core.datasets import Array, Plant, Samples
 from koopman_ros.learning.lift.incremental import Growth, TrainedLift
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.prestabilization import Frame
 from koopman_ros.learning.lift.residuals import deviations, ScaledSamples
-from koopman_ros.lifting import Box, Coordinates, LiftedModel, NetworkObservables
-from koopman_ros.plant_data import Array, Plant, Samples
+from koopman_ros.model import Box, Coordinates, LiftedModel, NetworkObservables
 
 
 @dataclass(frozen=True)

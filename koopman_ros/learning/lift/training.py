@@ -13,7 +13,8 @@ import math
 import numpy as np
 
 from koopman_ros import __version__
-from koopman_ros.arrays import brief
+from koopman_ros.core.arrays import brief
+from koopman_ros.core.datasets import Plant, Samples, split_by_episode
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
@@ -24,8 +25,7 @@ from koopman_ros.learning.lift.metrics import evaluate, Figures, Fit, fit, lifte
 from koopman_ros.learning.lift.multistart import Recipe, run_starts, Tracker, Watch
 from koopman_ros.learning.lift.neural_drift import SMALLEST, with_readout
 from koopman_ros.learning.lift.scaling import Scaling
-from koopman_ros.lifting import Box, LiftedModel, Provenance, TrainingStates
-from koopman_ros.plant_data import Plant, Samples, split_by_episode
+from koopman_ros.model import Box, LiftedModel, Provenance, TrainingStates
 
 # Polynomials on which a law is tried.
 _HIGHEST_DEGREE = 5

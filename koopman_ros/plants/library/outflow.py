@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 
 GRAVITY = 9.81  # m/s^2
 # An empty tank stays empty; integrating into the kink of the root undershoots by far less, in m.

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.arrays import along_last, Array
+from koopman_ros.core.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ControlAffineSystem
 

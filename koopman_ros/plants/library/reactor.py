@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from koopman_ros.arrays import along_last, Array
+from koopman_ros.core.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem, EquilibriumError
 

@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.core.arrays import Array
 from koopman_ros.plants.system import ControlAffineSystem
 
 

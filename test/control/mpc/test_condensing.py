@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from koopman_ros.control.mpc import own_drift
 from koopman_ros.control.mpc.condensing import condense, drift, roll_out
 from koopman_ros.control.mpc.model_arrays import model_arrays
-from koopman_ros.lifting import InputTerms, LiftedModel, PolynomialObservables
+from koopman_ros.model import InputTerms, LiftedModel, PolynomialObservables
 from support.random_lifts import random_lift
 
 RNG = np.random.default_rng(0)

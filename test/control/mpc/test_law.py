@@ -21,15 +21,15 @@ from koopman_ros.control.laws.base import LawResult, steady_state_target
 from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.state import State
+from koopman_ros.core.paths import model_path
+from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.status import Code
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.evaluation.simulate import at, simulate, Simulation
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, load, Provenance
+from koopman_ros.event_log.records import decoded, encoded
+from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance
 from koopman_ros.plants import ControlAffineSystem, plant_class, Process, steady_state
-from koopman_ros.reasons import Code
-from koopman_ros.replay.records import decoded, encoded
-from koopman_ros.resources import model_path
-from koopman_ros.solvers import runge_kutta_step
 
 PERIOD = 0.1  # s
 Q = np.array([1.0, 0.1])

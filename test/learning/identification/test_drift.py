@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 
+from koopman_ros.core.datasets import cut, Episode
 from koopman_ros.learning.identification import (
     box_of,
     DriftModel,
@@ -15,7 +16,6 @@ from koopman_ros.learning.identification import (
     Segments,
 )
 from koopman_ros.learning.identification.weak_form import regress
-from koopman_ros.plant_data import cut, Episode
 from koopman_ros.plants import one_state_reactor, simulate, two_state_example
 from support.known_plants import box, CUBIC, PAIR
 

@@ -15,6 +15,8 @@ from scipy.integrate import quad
 from scipy.stats import chi2
 import torch
 
+from koopman_ros.core.datasets import cut, Episode
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import (
     box_of,
     DriftModel,
@@ -29,8 +31,6 @@ from koopman_ros.learning.identification.output_error import _Filter, _Problem, 
 from koopman_ros.learning.identification.total_variation import smoothed
 from koopman_ros.learning.identification.weak_form import _input_integral
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
-from koopman_ros.plant_data import cut, Episode
-from koopman_ros.solvers import runge_kutta_step
 from support.known_plants import box, CUBIC, PAIR
 
 NOISE = 0.02

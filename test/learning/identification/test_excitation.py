@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from koopman_ros.core.datasets import Episode, Plant
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.identification.excitation import check_inputs
-from koopman_ros.plant_data import Episode, Plant
 
 NONE = np.full(4, np.nan)
 SEEDS = range(4)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import estimate_parameters, EstimateStatus, Stopped
 from koopman_ros.learning.identification.equations import Equations
-from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import (
     constant,
     Constants,
@@ -24,7 +25,6 @@ from koopman_ros.plants import (
 )
 from koopman_ros.plants.library.reactor import FedReactor, TwoStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
-from koopman_ros.solvers import runge_kutta_step
 
 
 @dataclass(frozen=True)

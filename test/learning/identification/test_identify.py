@@ -9,12 +9,12 @@ import sys
 import numpy as np
 import pytest
 
+from koopman_ros.core.datasets import cut
 from koopman_ros.learning.identification import (
     identify,
     methods_of,
     Stopped,
 )
-from koopman_ros.plant_data import cut
 from support.known_plants import CUBIC, methods, PAIR
 
 NOISE = 0.02

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
+from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import identify_unmeasured, Stopped
-from koopman_ros.plant_data import Episode, Plant
-from koopman_ros.solvers import runge_kutta_step
 
 PLANT = Plant('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
               np.zeros(1), None)

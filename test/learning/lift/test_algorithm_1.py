@@ -10,12 +10,12 @@ import pytest
 from scipy.stats import kstest
 import torch
 
+from koopman_ros.core.datasets import Plant, Samples
 from koopman_ros.learning import Algorithm1, Edmd, fit, Linearisation
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, normal_equations
 from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Plant, Samples
+from koopman_ros.model import Box
 from support.small_plants import bent_samples, TWO_STATE, two_state_samples
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from koopman_ros.core.datasets import Plant, Samples
 from koopman_ros.learning import train
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Plant, Samples
+from koopman_ros.model import Box
 from support.small_plants import BENT, bent_samples, SMALL, TWO_STATE, two_state_samples
 
 # dx/dt = -2 (x - 3) + u - 0.5

@@ -11,6 +11,7 @@ import pytest
 
 from koopman_ros.control import averaged, recentred, steady_state_target, Weights
 from koopman_ros.control.steady_state import partial_target, resting_state
+from koopman_ros.core.datasets import Samples
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.evaluation import run_closed_loop
@@ -20,9 +21,8 @@ from koopman_ros.learning import Edmd, fit, Growth, NeuralDrift, roll_out, train
 from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.lifting import Box, load, save
+from koopman_ros.model import Box, load, save
 from koopman_ros.parameters.trainer import trainer_table
-from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
     advance,
     box_episodes,

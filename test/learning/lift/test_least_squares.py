@@ -14,7 +14,7 @@ import torch
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, MinimumStatus, normal_equations
 from koopman_ros.learning.lift.network import Layout, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
-from koopman_ros.lifting import NetworkObservables
+from koopman_ros.model import NetworkObservables
 
 COUNT = 11
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
 
+from koopman_ros.core.datasets import Samples
 from koopman_ros.learning import (
     evaluate,
     Figures,
@@ -17,14 +18,13 @@ from koopman_ros.learning import (
     roll_out,
     rollout_rmse,
 )
-from koopman_ros.lifting import (
+from koopman_ros.model import (
     Coordinates,
     LiftedModel,
     linearised_model,
     NetworkObservables,
     Provenance,
 )
-from koopman_ros.plant_data import Samples
 from support.random_lifts import coordinates, random_lift
 
 JACOBIAN = np.array([[-1.0, 4.0], [-2.0, -0.5]])

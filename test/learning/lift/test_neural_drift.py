@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from koopman_ros.core.datasets import Samples, split_by_episode
 from koopman_ros.learning import fit, Growth, NeuralDrift, NoUsefulLift, train
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.neural_drift import DriftProblem, with_readout
 from koopman_ros.learning.lift.residuals import ScaledSamples
-from koopman_ros.plant_data import Samples, split_by_episode
 from support.random_lifts import random_lift
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 from support.tensors import assert_close

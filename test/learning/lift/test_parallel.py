@@ -20,7 +20,7 @@ from koopman_ros.evaluation.closed_loop_test import check_law
 from koopman_ros.learning import train
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.record import read_record
-from koopman_ros.lifting import Coordinates, linearised_model, Provenance
+from koopman_ros.model import Coordinates, linearised_model, Provenance
 from support.known_plants import CUBIC, methods, PAIR
 from support.long_records import bags_of, source
 from support.places import places

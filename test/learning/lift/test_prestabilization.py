@@ -10,12 +10,12 @@ import pytest
 
 from koopman_ros.control import feedback, Form, Weights
 from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.core.datasets import Plant, Samples
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning import Growth, train
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.prestabilization import Frame
-from koopman_ros.lifting import NetworkObservables
-from koopman_ros.plant_data import Plant, Samples
-from koopman_ros.solvers import solve_riccati
+from koopman_ros.model import NetworkObservables
 
 # dx/dt = x + 0.3 x^2 + 2 u in deviations from 3 m and 0.5 m/s
 GROWING = Plant('growing', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),

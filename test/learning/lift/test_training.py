@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from koopman_ros.core.datasets import Plant, Samples, split_by_episode
 from koopman_ros.learning import Edmd, evaluate, fit, Growth, train
 from koopman_ros.learning.lift import training
 from koopman_ros.learning.lift.incremental import least_squares
@@ -16,8 +17,7 @@ from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.learning.lift.network import Pass
 from koopman_ros.learning.lift.residuals import ScaledSamples
-from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Plant, Samples, split_by_episode
+from koopman_ros.model import Box
 from koopman_ros.plants import scalar_example
 from support import small_plants
 from support.disturbance import disturbed_data

@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Declaration of parameters as fields of a frozen dataclass.
+
+One field gives name, type, default, unit, range and description: nodes declare it, check it and
+write it into YAML (:mod:`koopman_ros.parameters.table`), Python code sets it as a keyword.
+
+A control law of one's own declares its own parameters likewise::
+
+    @dataclass(frozen=True)
+    class Gains:
+        gain: Array = column('controlled', 1.0, 'Proportional gain.')
+        limit: float = parameter(10.0, 'Largest change per sample.', 's', 0.0, 100.0)
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+import math
+from typing import Any, TypeVar
+
+import numpy as np
+
+from koopman_ros.core.arrays import Array
+
+__all__ = ['UNBOUNDED', 'Column', 'NoParameters', 'column', 'for_signals', 'group', 'nested',
+           'of_other_states', 'parameter', 'per_signal', 'plugin_parameters', 'signal_value',
+           'value_column']
+
+T = TypeVar('T')
+
+#: Stands for no bound, in any unit.
+UNBOUNDED = 1e9
+# Numbers in YAML that stand for no bound, and the infinity that is meant.
+ANY, NO_LOWER, NO_UPPER = (0.0, math.inf), (-UNBOUNDED, -math.inf), (UNBOUNDED, math.inf)
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """The parameters of a plug-in that has none of its own."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a field declared by :func:`column` holds."""
+
+    signals: str  #: of which signals
+    name: str  #: in YAML; empty for that of the field
+    default: float  #: of each, as in YAML
+    none: tuple[float, float] | None  #: number in YAML for no bound, and the infinity it means
+
+
+def parameter(default: Any, description: str, unit: str = '', minimum: float = -math.inf,
+              maximum: float = math.inf, **details: Any) -> Any:
+    """
+    Declare a number, a text, a boolean or a tuple of texts.
+
+    :param description: one sentence.
+    :param details: further attributes of a
+        :class:`~koopman_ros.parameters.table.Specification`.
+    """
+    return field(default=default, metadata={
+        'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
+        **details})
+
+
+def signal_value(default: float, description: str, **details: Any) -> Any:
+    """Declare a value of a signal, in the unit in which people read it, that may be any."""
+    return parameter(default, description, '{shown}', -UNBOUNDED, UNBOUNDED, **details)
+
+
+def column(signals: str, default: float, description: str, unit: str = '{unit}',
+           minimum: float = 0.0, maximum: float = UNBOUNDED, *, name: str = '',
+           none: tuple[float, float] | None = None, **details: Any) -> Any:
+    """
+    Declare an array with one number for each of some signals, as ``<signal>.<name>`` in YAML.
+
+    :param signals: ``'states'`` (n_x,), ``'measured'`` (n_y,), ``'controlled'`` (n_c,) or
+        ``'inputs'`` (n_u,).
+    :param default: of each, as in YAML.
+    :param unit: ``{unit}`` stands for that of a difference of the signal; ``{shown}`` says that
+        the number is a value of the signal, which is converted to the unit of the model.
+    :param name: in YAML, where that is not the name of the field.
+    :param none: number in YAML that stands for no bound, and the infinity that is meant.
+    """
+    in_code = none[1] if none is not None and none[0] == default else default
+    return field(default=in_code, metadata={
+        'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
+        'column': Column(signals, name, default, none), **details})
+
+
+def value_column(signals: str, default: float, description: str, **details: Any) -> Any:
+    """Declare an array of values of some signals, each in the unit in which people read it."""
+    return column(signals, default, description, '{shown}', -UNBOUNDED, UNBOUNDED, **details)
+
+
+def per_signal(kind: type[Any], signals: str = '') -> Any:
+    """
+    Declare a field with one `kind`, a parameter dataclass, for each of some signals.
+
+    ``{unit}`` in its units stands for that of a difference of the signal, ``{shown}`` for that of
+    its values, as people read them.
+
+    :param signals: as of :func:`column`; the name of the field by default.
+    """
+    return field(default_factory=dict, metadata={'per_signal': kind, 'signals': signals})
+
+
+def group() -> Any:
+    """Declare a field with numbers by name, whose rows ``field.name`` the table is given."""
+    return field(default_factory=dict, metadata={'group': True})
+
+
+def nested(kind: type[Any]) -> Any:
+    """Declare a field with another parameter dataclass, whose rows stand beside the others."""
+    return field(default_factory=kind, metadata={'nested': kind})
+
+
+def plugin_parameters() -> Any:
+    """Declare a field with parameter dataclasses by plug-in, with the rows ``plug-in.name``."""
+    return field(default_factory=dict, metadata={'plugins': True})
+
+
+def for_signals(parameters: T, signals: Mapping[str, Sequence[str]]) -> T:
+    """
+    Return parameters in which each column holds one number for each of its signals.
+
+    A single number, as a default, holds for all of them.
+
+    :param signals: names by the first argument of :func:`column`.
+    :raises ValueError: for a column of another size, with NaN, or out of its range.
+    """
+    changes: dict[str, Any] = {}
+    for item in fields(parameters):  # type: ignore[arg-type]
+        value, of = getattr(parameters, item.name), item.metadata.get('column')
+        if 'nested' in item.metadata and is_dataclass(value):
+            changes[item.name] = for_signals(value, signals)
+        elif of is not None:
+            changes[item.name] = _one_each(item.name, value, signals[of.signals], item.metadata)
+        elif isinstance(value, float):
+            _check_range(item.name, np.array(value), item.metadata)
+    return replace(parameters, **changes)  # type: ignore[type-var]
+
+
+def of_other_states(parameters: T, before: Sequence[str], now: Sequence[str]) -> T:
+    """
+    Return parameters for the states of another model; one that it did not have has the default.
+
+    :param before: names of the states that they are for.
+    :param now: names of the states that they are to be for.
+    """
+    changes: dict[str, Any] = {}
+    for item in fields(parameters):  # type: ignore[arg-type]
+        of = item.metadata.get('column')
+        if of is not None and of.signals == 'states':
+            known = dict(zip(before, getattr(parameters, item.name).tolist(), strict=True))
+            changes[item.name] = np.array([known.get(name, item.default) for name in now])
+        elif 'plugins' in item.metadata:
+            changes[item.name] = {name: of_other_states(own, before, now) for name, own in getattr(
+                parameters, item.name).items()}
+    return replace(parameters, **changes)  # type: ignore[type-var]
+
+
+def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[str, Any]
+              ) -> Array:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'{name} must be numbers, got {value!r}') from error
+    if array.ndim == 0:
+        array = np.full(len(signals), array)
+    if array.shape != (len(signals),):
+        raise ValueError(f'incompatible {name}: expected one number for each of '
+                         f'{", ".join(signals)}, got {array.tolist()}')
+    _check_range(name, array, metadata)
+    array = array.copy()
+    array.setflags(write=False)
+    return array
+
+
+def _check_range(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
+    low, high, of = metadata['minimum'], metadata['maximum'], metadata.get('column')
+    # in code 0 stands for itself, not for no bound
+    opened = metadata.get('open_minimum', False) or (of is not None and of.none == ANY)
+    # of a value of a signal the range is in the unit that people read
+    fits = ~np.isnan(value) if metadata['unit'] == '{shown}' else (
+        (value > low if opened else value >= low) & (value <= high))
+    if of is not None and of.none is not None:
+        fits |= value == of.none[1]
+    if not np.all(fits):
+        raise ValueError(f'{name} must be {"above" if opened else "at least"} {low:g} and at most '
+                         f'{high:g}, got {value.tolist()}')

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Signals: one number for each by name, and what is measured of the state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from koopman_ros.core.arrays import Array, frozen
+
+
+def numbers(name: str, value: ArrayLike, signals: Sequence[str]) -> Array:
+    """Return one number for each of some signals (n,) as an array; ValueError for another size."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (len(signals),):
+        raise _wrong_size(name, array, signals)
+    return array
+
+
+def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
+    """
+    Check that an array (n,) holds one number for each of (n,) signals; nothing broadcasts.
+
+    :raises ValueError: when the sizes differ, or a number is NaN.
+    """
+    if not isinstance(value, np.ndarray) or value.shape != (len(signals),):
+        raise _wrong_size(name, value, signals)
+    if np.isnan(value).any():
+        raise ValueError(f'{name} must be numbers, got {value.tolist()}')
+
+
+def _wrong_size(name: str, value: ArrayLike, signals: Sequence[str]) -> ValueError:
+    return ValueError(f'incompatible {name}: expected one number for each of '
+                      f'{", ".join(signals)}, got {np.asarray(value).tolist()}')
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What is measured of the state: y = C x, in the units of the signals."""
+
+    names: tuple[str, ...]  #: (n_y,) of the measured signals
+    units: tuple[str, ...]  #: (n_y,) their units
+    C: Array  #: (n_y, n_x) in those units per state unit
+
+    def __post_init__(self) -> None:
+        C = np.array(self.C, dtype=np.float64)
+        if len(self.units) != len(self.names) or C.ndim != 2 or len(C) != len(self.names):
+            raise ValueError(f'incompatible outputs: {len(self.names)} names, {len(self.units)} '
+                             f'units, C of shape {C.shape}')
+        object.__setattr__(self, 'C', frozen(C, 'C', C.shape))
+
+    @cached_property
+    def all_states(self) -> bool:
+        """Whether every state is measured by itself."""
+        return self.C.shape[0] == self.C.shape[1] and bool((np.eye(len(self.C)) == self.C).all())
+
+    @cached_property
+    def determine_state(self) -> bool:
+        """Whether they leave nothing of the state open."""
+        return self.C.shape[0] == self.C.shape[1] and (
+            np.linalg.matrix_rank(self.C) == len(self.C))
+
+    @cached_property
+    def _inverse(self) -> Array:
+        inverse = np.linalg.inv if self.determine_state else np.linalg.pinv
+        return np.asarray(inverse(self.C), dtype=np.float64)
+
+    def of(self, x: Array) -> Array:
+        """Return the outputs (n_y,) of a state (n_x,) or of a difference of states."""
+        return x if self.all_states else self.C.dot(x)
+
+    def state(self, y: Array, guess: Array) -> Array:
+        """
+        Return the state, (n_x,), of outputs (n_y,).
+
+        :param guess: (n_x,) what they leave open is as there.
+        """
+        if self.all_states:
+            return y
+        if self.determine_state:
+            return self._inverse.dot(y)
+        found: Array = guess + self._inverse.dot(y - self.C.dot(guess))
+        return found

@@ -1,0 +1,235 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Riccati equations of the continuous and of the sampled regulator, and Runge-Kutta steps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+import math
+
+import numpy as np
+from scipy.linalg.lapack import dgees
+
+from koopman_ros.core.arrays import Array
+
+__all__ = ['RiccatiSolution', 'RiccatiStatus', 'over_interval', 'runge_kutta_step',
+           'solve_riccati']
+
+# A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
+# root of the rounding error: modes within that of the axis cannot be told from undamped ones.
+_AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
+# Nor modes of a sampled plant within the rounding of its transition, where samples as far apart as
+# a period leave nothing else.
+_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
+# Terms of the power series of the exponential of a matrix of norm 1/2.
+_TERMS = 15
+
+
+class RiccatiStatus(Enum):
+    """Whether a solution may be used."""
+
+    SOLVED = 'solved'
+    # there is no stable subspace of full size: (A, B) is not stabilisable, or a mode on the
+    # imaginary axis is not weighted
+    NOT_STABILISABLE = 'riccati_not_stabilisable'
+    # the residual is too large to trust the gain: (A, B) is nearly not stabilisable
+    INACCURATE = 'riccati_inaccurate'
+    # likewise, seen by the gain
+    GAIN_TOO_LARGE = 'riccati_gain_too_large'
+
+
+@dataclass(frozen=True)
+class RiccatiSolution:
+    """
+    Solution of a Riccati equation with its gain.
+
+    In continuous time A'P + PA - P B R^-1 B' P + Q = 0 and K = R^-1 B' P; of the sampled regulator
+    see :func:`solve_riccati`.
+    """
+
+    P: Array  #: (n, n) symmetric; zeros when there is no stable subspace to take it from
+    K: Array  #: (m, n); zeros likewise
+    residual: float  #: Frobenius norm of the equation's left side over the sum of its terms' norms
+    gain: float  #: spectral norm of K
+    status: RiccatiStatus  #: whether K may be used
+
+
+# values so large that something overflows end in a residual or a gain that is refused
+@np.errstate(all='ignore')
+def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0.0,
+                  max_residual: float = 1e-8, max_gain: float = 1e6) -> RiccatiSolution:
+    """
+    Solve the Riccati equation of the infinite-horizon regulator of dx/dt = A x + B u.
+
+    With an interval it is that of the sampled regulator: the input is held between samples so far
+    apart, and the cost is still the integral of x'Q x + u'R u. Then it is a discrete equation,
+    P = Phi'P Phi + Q_d - K'(R_d + Gamma'P Gamma) K, K = (R_d + Gamma'P Gamma)^-1 (Gamma'P Phi +
+    N_d'), with the plant and the weights over an interval (C. F. Van Loan, IEEE Trans. Automat.
+    Contr. 23 (1978)). Its gain tends to the continuous one as the interval goes to 0.
+
+    A returned status other than SOLVED means that K must not be used: near the border of
+    stabilisability the Schur method yields a P with enormous gains and eigenvalues that look
+    fine, which only the residual and the size of the gain reveal.
+
+    :param A: (n, n), and B (n, m).
+    :param Q: (n, n) symmetric, positive semidefinite, not zero.
+    :param R: (m, m) symmetric, positive definite.
+    :param interval: in the unit of time of A; 0 for continuous time.
+    :param max_residual: largest relative residual taken as solved.
+    :param max_gain: largest spectral norm of K taken as solved.
+    """
+    try:
+        if not np.any(Q):
+            raise np.linalg.LinAlgError('no state is weighted')
+        P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
+            A, B, Q, R)
+        gain = float(np.linalg.norm(K, 2)) if min(K.shape) > 1 else _size(K)
+    except (ArithmeticError, ValueError):
+        # a singular matrix, no stable subspace, or numbers that are not finite
+        return RiccatiSolution(np.zeros_like(A), np.zeros_like(B.T), math.inf, math.inf,
+                               RiccatiStatus.NOT_STABILISABLE)
+    if not residual <= max_residual:
+        status = RiccatiStatus.INACCURATE
+    elif not gain <= max_gain:
+        status = RiccatiStatus.GAIN_TOO_LARGE
+    else:
+        status = RiccatiStatus.SOLVED
+    return RiccatiSolution(P, K, residual, gain, status)
+
+
+def _continuous(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array, float]:
+    """Return P, K and the residual, by A. J. Laub, IEEE Trans. Automat. Contr. 24 (1979)."""
+    R_inverse_Bt = np.linalg.solve(R, B.T)
+    G = B @ R_inverse_Bt
+    scale = _scale(Q, G)
+    P = scale * _stable_graph(_hamiltonian(A, scale * G, Q / scale))
+    PA, PGP = P @ A, P @ G @ P
+    # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
+    size = _size(Q) + 2.0 * _size(PA) + _size(PGP)
+    return P, R_inverse_Bt @ P, _size(PA + PA.T - PGP + Q) / size
+
+
+def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
+             ) -> tuple[Array, Array, float]:
+    """
+    Return the same of the sampled regulator.
+
+    The Cayley transform (S + I)^-1 (S - I) of the symplectic pencil is a Hamiltonian matrix with
+    the same stable subspace. It inverts no transition matrix, so that modes may decay as fast as
+    they like within an interval.
+    """
+    n = len(A)
+    D, W = over_interval(A, B, Q, R, interval)
+    step, push = D[:n, :n], D[:n, n:]
+    Q_d, N, R_d = W[:n, :n], W[:n, n:], W[n:, n:]
+    # what the cross term makes of input and weight
+    by_R = np.linalg.solve(R_d, np.concatenate((push.T, N.T), axis=1))
+    rest, G, Q_rest = step - push @ by_R[:, n:], push @ by_R[:, :n], Q_d - N @ by_R[:, n:]
+    scale = _scale(Q_rest, G)
+    less = _hamiltonian(rest, scale * G, Q_rest / scale)
+    more = less.copy()
+    more[:, n:] *= -1.0
+    more += 2.0 * np.eye(2 * n)
+    size = (_size(A) + _size(B)) * interval
+    H = np.asarray(np.linalg.solve(more, less), dtype=np.float64)
+    P = scale * _stable_graph(H, _ROUNDING * min(size, 1.0))
+    P_step, P_push = P @ step, P @ push
+    right = N.T + push.T @ P_step + P_push.T
+    K = np.asarray(np.linalg.solve(R_d + push.T @ P_push, right), dtype=np.float64)
+    # the equation less P on both sides, whose terms shrink with the interval
+    square, feedback = step.T @ P_step, right.T @ K
+    terms = _size(Q_d) + 2.0 * _size(P_step) + _size(square) + _size(feedback)
+    return P, K, _size(P_step + P_step.T + square + Q_d - feedback) / terms
+
+
+def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
+                  ) -> tuple[Array, Array]:
+    """
+    Integrate state, held input and cost over an interval.
+
+    By the power series of the exponential of [-F', W; 0, F], F = [A, B; 0, 0] (Van Loan), over a
+    part of the interval, which is then doubled.
+
+    :return: with y = (x, u), the D (n + m, n + m) of y(interval) = (I + D) y(0), which keeps its
+        digits where the interval is short, and W of the cost y(0)'W y(0).
+    :raises numpy.linalg.LinAlgError: where they are not finite.
+    """
+    n, m = B.shape
+    N = n + m
+    M = np.zeros((2 * N, 2 * N))
+    M[N:N + n, N:N + n], M[N:N + n, N + n:] = A, B
+    M[:N, :N] = -M[N:, N:].T
+    size = _size(M) * interval
+    M[:n, N:N + n], M[n:N, N + n:] = Q, R
+    weight = _size(M[:N, N:])
+    if not (math.isfinite(size) and weight > 0.0):
+        raise np.linalg.LinAlgError('plant or weights are not finite')
+    # of the size of F, or of 1 where that is 0
+    weight *= interval / (size or interval)
+    M[:N, N:] /= weight
+    # to a norm of 1/2 at most
+    doublings = max(0, math.frexp(size)[1] + 2)
+    M *= math.ldexp(interval, -doublings)
+    total = power = M
+    for k in range(2, _TERMS):
+        power = power.dot(M) / k
+        total = total + power
+    D, W = total[N:, N:], total[:N, N:]
+    W = 0.5 * weight * (W + D.T.dot(W))
+    W = W + W.T
+    for _ in range(doublings):
+        DW = D.T.dot(W)
+        W = 2.0 * W + DW + DW.T + DW.dot(D)
+        D = 2.0 * D + D.dot(D)
+    return D, W
+
+
+def _decays(real: float, imaginary: float) -> bool:
+    return real < 0.0
+
+
+def _scale(Q: Array, G: Array) -> float:
+    """Return by how much to divide P for order one, so that no block dominates the Hamiltonian."""
+    size_Q, size_G = _size(Q), _size(G)
+    return math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
+
+
+def _hamiltonian(A: Array, G: Array, Q: Array) -> Array:
+    n = len(A)
+    H = np.empty((2 * n, 2 * n))
+    H[:n, :n], H[:n, n:], H[n:, :n], H[n:, n:] = A, -G, -Q, -A.T
+    return H
+
+
+def _stable_graph(H: Array, least: float = 0.0) -> Array:
+    """
+    Return the P whose graph is the stable subspace of a Hamiltonian matrix.
+
+    :param least: distance of its modes from the imaginary axis.
+    :raises numpy.linalg.LinAlgError: where that subspace has not full size.
+    """
+    n, size = len(H) // 2, _size(H)
+    if not math.isfinite(size):
+        raise np.linalg.LinAlgError('the Hamiltonian is not finite')
+    # as scipy.linalg.schur, which takes three times as long for so few numbers
+    _, stable, real, _, vectors, _, info = dgees(_decays, H, sort_t=1)
+    if info != 0 or stable != n or not (real[:n] < -max(least, _AXIS_MARGIN * size)).all():
+        raise np.linalg.LinAlgError('there is no stable subspace of full size')
+    P = np.asarray(np.linalg.solve(vectors[:n, :n].T, vectors[n:, :n].T), dtype=np.float64)
+    return 0.5 * (P + P.T)
+
+
+def _size(matrix: Array) -> float:
+    """Return the Frobenius norm."""
+    flat = matrix.ravel()
+    return math.sqrt(flat.dot(flat))
+
+
+def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:
+    """Step dx/dt = rate(x) by h, which broadcasts with x, by the Runge-Kutta method of order 4."""
+    k1 = rate(x)
+    k2 = rate(x + 0.5 * h * k1)
+    k3 = rate(x + 0.5 * h * k2)
+    k4 = rate(x + h * k3)
+    return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)

@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recorded and replayed commands side by side, in numbers and as a report."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.plots import write_figures, write_page
+from koopman_ros.event_log.loop import Replay
+from koopman_ros.model import Coordinates
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How commands differ from the recorded ones."""
+
+    #: (n, n_u) command minus recorded command in input units; NaN where there is none to be
+    #: compared
+    difference: Array
+    identical: int  #: number of commands that are bit-identical
+    tolerance: float  #: in input units
+
+    @property
+    def compared(self) -> int:
+        """The number of commands that are compared."""
+        return int(np.count_nonzero(np.isfinite(self.difference).all(axis=1)))
+
+    @property
+    def beyond(self) -> NDArray[np.bool_]:
+        """(n,) where the difference exceeds the tolerance."""
+        return np.any(np.abs(self.difference) > self.tolerance, axis=1)
+
+    @property
+    def worst(self) -> int | None:
+        """The place of the largest difference, or None when nothing differs."""
+        if not np.nanmax(np.abs(self.difference), initial=0.0) > 0.0:
+            return None
+        return int(np.nanargmax(np.abs(self.difference))) // self.difference.shape[1]
+
+
+@dataclass
+class ReplayedBag:
+    """A bag with what was made of it."""
+
+    path: str  #: of the bag
+    complete: bool  #: whether its recorder closed it
+    found: Replay  #: what came of the replay
+    tolerance: float  #: difference in input units from which on a command is counted
+    new_range: Coordinates | None = None  #: of the new model's training, or None without one
+
+    stamps_ns: NDArray[np.int64] = field(init=False)  #: (n,) stamps of the commands
+    measured: Array = field(init=False)  #: (n, n_y) measured; NaN in silence
+    setpoint: Array = field(init=False)  #: (n, n_c) tracked; NaN for none
+    recorded: Array = field(init=False)  #: (n, n_u) commanded then
+    #: (n, n_u) commanded by the replay; NaN where it knows no state
+    commands: Array = field(init=False)
+    #: (n, n_u) commanded by the new model; NaN where it knows no state
+    new_commands: Array = field(init=False)
+    check: Comparison = field(init=False)  #: the replay beside the record
+    #: the new model beside the record, or None without one
+    new: Comparison | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        samples = self.found.samples
+        self.stamps_ns = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
+        self.measured = _rows([sample.measured for sample in samples])
+        self.setpoint = _rows([sample.setpoint for sample in samples])
+        self.recorded = _rows([sample.recorded for sample in samples])
+        self.commands = _rows([sample.replayed for sample in samples], self.recorded)
+        self.new_commands = _rows([sample.alternative for sample in samples], self.recorded)
+        self.check = self._compared(self.commands)
+        self.new = None if self.new_range is None else self._compared(self.new_commands)
+
+    @property
+    def seconds(self) -> Array:
+        """(n,) stamps since the first one in s."""
+        return (self.stamps_ns - self.stamps_ns[0]) / 1e9
+
+    @property
+    def measurements(self) -> int:
+        """The number of measurements answered."""
+        return sum(sample.measured is not None for sample in self.found.samples)
+
+    @property
+    def outside(self) -> int:
+        """At how many commands the new model would have refused the tracked set-point."""
+        controller = self.found.controller
+        if self.new_range is None or controller is None:
+            return 0
+        # by their places, for the new model may have names of its own
+        names = controller.model.states.names
+        kept = [names.index(name) for name in controller.controlled.names]
+        return int(np.count_nonzero(((self.setpoint < self.new_range.lower[kept])
+                                     | (self.setpoint > self.new_range.upper[kept])).any(axis=1)))
+
+    def _compared(self, commands: Array) -> Comparison:
+        """Compare commands (n, n_u) with those recorded."""
+        same = (commands.view(np.uint64) == self.recorded.view(np.uint64)).all(axis=1)
+        return Comparison(commands - self.recorded, int(np.count_nonzero(same)), self.tolerance)
+
+
+def _rows(values: list[Array | None], like: Array | None = None) -> Array:
+    """Return (n, m) with NaN for None; m from the first one there is, or as another array has."""
+    width = next((len(value) for value in values if value is not None),
+                 1 if like is None else like.shape[1])
+    return np.array([np.full(width, np.nan) if value is None else value for value in values],
+                    dtype=np.float64).reshape(len(values), width)
+
+
+def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new_model: str
+                 ) -> None:
+    """Write report.md and summary.json; `new_model` is the new model's name, or empty."""
+    write_figures(folder / 'summary.json', {
+        'new_model': new_model or None, 'tolerance': bags[0].tolerance,
+        'reproduced': all(reproduced(bag) for bag in bags),
+        'bags': [_figures(bag) for bag in bags]})
+    sections = [_about(new_model)]
+    for bag, picture in zip(bags, pictures, strict=True):
+        sections += [f'## {bag.path}', '\n'.join(_section(bag)), f'![commands]({picture})']
+    write_page(folder / 'report.md', 'Replay', sections, ('numpy', 'scipy'))
+
+
+def reproduced(bag: ReplayedBag) -> bool:
+    """Tell whether the recorded commands are those of the replay, within the tolerance."""
+    return bag.check.compared > 0 and not bag.check.beyond.any()
+
+
+def verdict(bag: ReplayedBag) -> str:
+    """Say in one sentence how the replay did."""
+    check = bag.check
+    if not check.compared:
+        return ('nothing is compared: the records hold no command' if not bag.found.samples else
+                'nothing is compared: no snapshot of the controller comes before a command')
+    if check.identical == check.compared:
+        return f'all {check.compared} recorded commands are reproduced bit for bit'
+    beyond = int(np.count_nonzero(check.beyond))
+    return (f'{check.identical} of {check.compared} recorded commands are reproduced bit for bit, '
+            f'{beyond} differ by more than {check.tolerance:g}; {_worst(bag, check)}')
+
+
+def _worst(bag: ReplayedBag, comparison: Comparison) -> str:
+    worst = comparison.worst
+    if worst is None:
+        return 'none differs'
+    return (f'the largest difference is {_largest(comparison.difference[worst]):+.3g}, at '
+            f'{bag.seconds[worst]:.3f} s (stamp {bag.stamps_ns[worst] / 1e9:.3f} s)')
+
+
+def _largest(difference: np.ndarray) -> float:
+    return float(difference[np.nanargmax(np.abs(difference))])
+
+
+def _about(new_model: str) -> str:
+    text = ('What the controller recorded of itself went through the control step again, with the '
+            'models and the parameters that the records name. Times count from the first command '
+            'of a bag.')
+    if new_model:
+        text += (f'\n\nThe commands of `{new_model}` answer the same recorded measurements under '
+                 'the set-points that were tracked, with the recorded parameters but for those '
+                 'given. They are compared with what was commanded then, one by one: not a closed '
+                 'loop, in which the measurements themselves would have become others.')
+    return text
+
+
+def _section(bag: ReplayedBag) -> list[str]:
+    found = bag.found
+    minutes = float(np.ptp(bag.seconds)) / 60.0 if found.samples else 0.0
+    lines = [f'- {bag.measurements} measurements over {minutes:.2f} min.',
+             f'- Recorded commands: {verdict(bag)}.',
+             f'- Models: {", ".join(found.models) or "unknown"}.']
+    if bag.new is not None:
+        beyond = int(np.count_nonzero(bag.new.beyond))
+        lines.append(f'- New model: {beyond} of {bag.new.compared} commands differ from the '
+                     f'recorded ones by more than {bag.tolerance:g}; {_worst(bag, bag.new)}.')
+    for count, words in (
+            (bag.outside, 'times the tracked set-point is outside the range that the new model '
+                          'was trained for, which would have refused it'),
+            (len(found.samples) - bag.check.compared, 'commands are not compared, because no '
+                                                      'snapshot of the controller precedes them'),
+            (found.runs - 1, 'times the controller was started again, or another one recorded'),
+            (found.refused, 'requests are refused'),
+            (len(found.samples) - bag.measurements, 'commands were given because no measurement '
+                                                    'came')):
+        if count > 0:
+            lines.append(f'- {count} {words}.')
+    lines += [f'- Records {lost.first} to {lost.last} of run {lost.run} are missing.'
+              for lost in found.lost]
+    if not bag.complete:
+        lines.append('- The bag was not closed or is damaged: this is the part that is whole.')
+    return lines
+
+
+def _figures(bag: ReplayedBag) -> dict[str, Any]:
+    found = bag.found
+    figures: dict[str, Any] = {
+        'bag': bag.path, 'measurements': bag.measurements, 'reproduced': reproduced(bag),
+        'recorded_model': _comparison(bag, bag.check),
+        'not_compared': len(found.samples) - bag.check.compared,
+        'commands_in_silence': len(found.samples) - bag.measurements,
+        'refused_requests': found.refused,
+        'began_before_bag': found.begins_late > 0,
+        'lost_records': [[lost.run, lost.first, lost.last] for lost in found.lost],
+        'runs': found.runs, 'models': found.models, 'complete': bag.complete,
+    }
+    if bag.new is not None:
+        figures['new_model'] = _comparison(bag, bag.new)
+    return figures
+
+
+def _comparison(bag: ReplayedBag, comparison: Comparison) -> dict[str, Any]:
+    worst = comparison.worst
+    return {
+        'compared': comparison.compared, 'identical': comparison.identical,
+        'beyond_tolerance': int(np.count_nonzero(comparison.beyond)),
+        'largest_difference': 0.0 if worst is None else _largest(comparison.difference[worst]),
+        'largest_at_s': None if worst is None else float(bag.seconds[worst]),
+        'largest_at_stamp_ns': None if worst is None else int(bag.stamps_ns[worst]),
+    }

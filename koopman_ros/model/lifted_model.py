@@ -1,0 +1,393 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The learned model at run time: dx/dt = f(x) + B(x) u with its derivatives, in NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
+
+from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.datasets import Plant
+from koopman_ros.core.units import check_time_unit, SECONDS_PER_TIME_UNIT
+from koopman_ros.model.coordinates import Coordinates
+from koopman_ros.model.input_matrix import InputTerms
+from koopman_ros.model.observables import NetworkObservables, Observables
+from koopman_ros.model.training_data import TrainingStates, TriedLoops
+from koopman_ros.model_classes import (
+    FREE_LIFT,
+    IDENTITY_LIFT,
+    LINEAR,
+    NEURAL_DRIFT,
+    POLYNOMIAL,
+)
+
+_SAMPLES = 256  # random states of a box whose training states are not known
+# Of Gauss and Legendre on [0, 1].
+NODES, WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """
+    Origin of a model, its held-out figures and its acceptance.
+
+    :raises ValueError: for a refusal without a reason, or reasons without a verdict.
+    """
+
+    plant: str  #: name of the plant it was learned from
+    seed: int | None = None  #: seed of the training run, or None for a model that was not trained
+    data_digest: str = ''  #: SHA-256 of the training samples, in hexadecimal
+    #: held-out figures: ``rw``, ``rx`` and ``cond`` without unit, ``rollout_rmse`` in state units;
+    #: from measured data also ``noise`` in state units and ``coverage``, the visited share of the
+    #: training box
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    package_version: str = ''  #: version of koopman_ros that made it
+    method: str = ''  #: how derivatives were found; empty where they were given
+    #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
+    model_class: str = ''
+    accepted: bool | None = None  #: verdict of the acceptance test; None for a model never judged
+    reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
+
+    def __post_init__(self) -> None:
+        if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
+                self.accepted is not None):
+            raise ValueError(f'accepted = {self.accepted} does not fit the reasons '
+                             f'{list(self.reasons)}')
+
+    @property
+    def acceptance(self) -> str:
+        """The verdict in words, with the reasons."""
+        verdict = {True: 'accepted', False: 'refused', None: 'never judged'}[self.accepted]
+        return f'{verdict} ({"; ".join(self.reasons)})' if self.reasons else verdict
+
+
+@dataclass(frozen=True)
+class LiftedModel:
+    """
+    A lift z = N(x) with dz/dt = A z + J_N(x) B(x) u (paper, equation for control-affine systems).
+
+    B is constant without `input_terms`.
+
+    With a pre-feedback K the lift is one of the plant under it, f(x) + B K x, for which there is
+    an A where the plant alone is unstable: dz/dt = A z - J_N(x) B K x + J_N(x) B(x) u. Inputs and
+    drift stay those of the plant.
+
+    All methods work in scaled deviations from the nominal point (see :class:`Coordinates`),
+    with time in `time_unit`. With a network without hidden units it is a linearisation.
+
+    :raises ValueError: naming the array that does not fit and both shapes.
+    """
+
+    observables: Observables  #: the lift N, with N(0) = 0
+    A: Array  #: (n_z, n_z) in 1/time unit
+    B: Array  #: (n_x, n_u) in scaled coordinates, at the nominal point
+    states: Coordinates  #: the states' names, units, scaling and training box
+    inputs: Coordinates  #: the inputs' names, units, scaling and training box
+    time_unit: str  #: ``'s'`` or ``'min'``
+    provenance: Provenance  #: origin, held-out figures and acceptance
+    #: states of the training data within their box; None when they are not known
+    training_states: TrainingStates | None = None
+    #: (n_x, n_phi) weights of the features phi in the drift, in 1/time unit; None where the drift
+    #: follows from the rate of z
+    readout: Array | None = None
+    input_terms: InputTerms | None = None  #: the state-dependent part of B(x); None for none
+    #: (n_u, n_x) gain K of the pre-feedback that A holds under, in scaled coordinates, or None
+    pre_feedback: Array | None = None
+    #: closed loops of the model's law; None where they are not known, or none failed
+    tried_loops: TriedLoops | None = None
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        n_x, n_u, n_z = self.n_x, self.n_u, self.observables.n_z
+        check_time_unit(self.time_unit)
+        if self.observables.n_x != n_x:
+            raise ValueError(f'incompatible observables: expected {n_x} states, got '
+                             f'{self.observables.n_x}')
+        for name, shape in (('A', (n_z, n_z)), ('B', (n_x, n_u)), ('pre_feedback', (n_u, n_x)),
+                            ('readout', (n_x, self.observables.features.n_z))):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, frozen(value, name, shape))
+        if self.input_terms is not None and (
+                self.input_terms.coefficients.shape[1:] != self.B.shape):
+            raise ValueError(f'incompatible input terms: expected {("any", *self.B.shape)}, got '
+                             f'{self.input_terms.coefficients.shape}')
+        for name, width in (
+                ('training_states', self.training_states and self.training_states.n_x),
+                ('tried_loops', self.tried_loops and self.tried_loops.n_x)):
+            if width is not None and width != n_x:
+                raise ValueError(f'incompatible {name}: expected {n_x} states, got {width}')
+
+    @cached_property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @cached_property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @cached_property
+    def n_z(self) -> int:
+        """Number of lifted coordinates."""
+        return self.A.shape[0]
+
+    @cached_property
+    def identity(self) -> bool:
+        """Whether z starts with the state."""
+        return self.observables.identity
+
+    @cached_property
+    def kind(self) -> str:
+        """Its class for people, of a lift with the number of coordinates."""
+        lift, name = self.observables, self.provenance.model_class
+        if not name:
+            name = (POLYNOMIAL if not isinstance(lift, NetworkObservables) else
+                    LINEAR if not len(lift.W) else
+                    FREE_LIFT if not lift.identity else
+                    NEURAL_DRIFT if self.readout is not None and self.n_z == self.n_x else
+                    IDENTITY_LIFT)
+        return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
+
+    @property
+    def plant(self) -> Plant:
+        """The names, units and nominal point of its plant, without B."""
+        return Plant(self.provenance.plant, self.states.names, self.states.units,
+                     self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
+                     self.inputs.center, None, self.input_matrix_degree)
+
+    @cached_property
+    def seconds_per_time_unit(self) -> float:
+        """Length of the model's time unit in seconds."""
+        return SECONDS_PER_TIME_UNIT[self.time_unit]
+
+    @cached_property
+    def eigenvalues(self) -> NDArray[np.complex128]:
+        """Eigenvalues (n_z,) of A in 1/time unit, slowest (largest real part) first."""
+        values = np.linalg.eigvals(self.A).astype(np.complex128)
+        return values[np.argsort(-values.real)]
+
+    @cached_property
+    def fastest_rate(self) -> float:
+        """Largest size of an eigenvalue of A in 1/time unit."""
+        return float(np.max(np.abs(self.eigenvalues)))
+
+    @cached_property
+    def is_hurwitz(self) -> bool:
+        """Whether every mode of A decays."""
+        return bool(np.all(self.eigenvalues.real < 0.0))
+
+    @cached_property
+    def adds_unstable_modes(self) -> bool:
+        """
+        Whether A has more modes that do not decay than the linearised model.
+
+        Both under the pre-feedback, if there is one.
+        """
+        slope = self.linearised.A + self.pre_feedback_slope
+        grow = [int(np.sum(eigenvalues.real >= 0.0))
+                for eigenvalues in (self.eigenvalues, np.linalg.eigvals(slope))]
+        return grow[0] > grow[1]
+
+    @cached_property
+    def mismatch(self) -> float:
+        """
+        Error of A z as the rate J_N f of z under the model's drift f: 0 for a closed lift.
+
+        Under the pre-feedback, if there is one. As the training figure ``rw`` a mean square
+        without unit, over the training states or random ones of the box; 0 also for a lift at
+        rest everywhere.
+        """
+        if self.training_states is not None:
+            x = self.training_states.states
+        else:
+            box = self.states
+            x = box.to_deviation(np.random.default_rng(0).uniform(
+                box.lower, box.upper, (_SAMPLES, self.n_x)))
+        z, J = self.lift_and_jacobian(x)
+        rate = (J @ (self.drift(x) + self.pre_feedback_rate(x))[..., None])[..., 0]
+        rest = rate - z @ self.A.T
+        whitening = np.linalg.pinv(z.T @ z)
+        size = float(np.sum(rate @ whitening * rate))
+        return float(np.sum(rest @ whitening * rest)) / size if size > 0.0 else 0.0
+
+    @property
+    def input_matrix_degree(self) -> int:
+        """Degree of the polynomial B(x); 0 where it is constant."""
+        return 0 if self.input_terms is None else self.input_terms.degree
+
+    @cached_property
+    def _nominal_inverse(self) -> Array:
+        return frozen(np.linalg.pinv(self.B), 'inverse of B', (self.n_u, self.n_x))
+
+    def input_inverse(self, x: Array | None = None) -> Array:
+        """Return the pseudo-inverse (n_u, n_x) of B(x) at a state (n_x,), or the nominal one."""
+        if x is None or self.input_terms is None:
+            return self._nominal_inverse
+        return np.asarray(np.linalg.pinv(self.input_matrix(x)), dtype=np.float64)
+
+    def input_matrix(self, x: Array) -> Array:
+        """Evaluate B(x): (..., n_x) -> (..., n_x, n_u); one (n_x, n_u) where it is constant."""
+        return self.B if self.input_terms is None else self.B + self.input_terms.matrix(x)
+
+    def forcing(self, x: Array, u: Array) -> Array:
+        """Evaluate B(x) u, the rate due to inputs: (..., n_x), (..., n_u) -> (..., n_x)."""
+        return (self.input_matrix(x) @ u[..., None])[..., 0]
+
+    def forcing_jacobian(self, x: Array, u: Array) -> Array:
+        """Evaluate d(B(x) u)/dx, (..., n_x), (..., n_u) -> (..., n_x, n_x); 0 for a constant B."""
+        if self.input_terms is None:
+            return np.zeros((self.n_x, self.n_x))
+        return self.input_terms.jacobian(x, u)
+
+    def rate_under(self, u: Array, w: Array | float = 0.0) -> Callable[[Array], Array]:
+        """
+        Return the rate of the state under a held input, x -> f(x) + B(x) u + w.
+
+        :param u: (..., n_u) scaled deviations.
+        :param w: (..., n_x) disturbance.
+        """
+        return lambda x: self.drift(x) + self.forcing(x, u) + w
+
+    @cached_property
+    def linearised(self) -> LiftedModel:
+        """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B(0) u."""
+        slope = self.drift_jacobian(np.zeros(self.n_x))
+        return replace(self, observables=NetworkObservables.linear(self.n_x), A=slope,
+                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
+
+    def lost_at(self, x: Array, x_ref: Array) -> bool:
+        """
+        Tell whether the law failed in the tested loop nearest to a state and a set-point.
+
+        Both (n_x,) in scaled deviations; see :attr:`tried_loops`.
+        """
+        return self.tried_loops is not None and self.tried_loops.lost_at(
+            x, x_ref, self.states.half_widths)
+
+    def distance(self, x: Array) -> float:
+        """Return the distance of a state (n_x,), in state units, as :meth:`distances`."""
+        x = self.states.to_deviation(self.states.array('state', x))
+        return float(self.distances(x[None])[0])
+
+    def distances(self, x: Array) -> Array:
+        """
+        Return the distances of states from the training data.
+
+        :param x: (N, n_x) in scaled deviations.
+        :return: (N,) in half widths of the training box: the larger of the distance from the box
+            and, where they are known, from the training states; infinity for a state that is not
+            finite.
+        """
+        half, (lower, upper) = self.states.half_widths, self.states.corners
+        outside = np.max(np.maximum(np.maximum(lower - x, x - upper) / half, 0.0), axis=1)
+        if self.training_states is not None:
+            outside = np.maximum(outside, self.training_states.distance(x, half))
+        return np.where(np.isfinite(x).all(axis=1), outside, np.inf)
+
+    def lift(self, x: Array) -> Array:
+        """Evaluate z = N(x): (..., n_x) -> (..., n_z); ValueError for another size."""
+        return self.observables.lift(self.states.array('state', x))
+
+    def jacobian(self, x: Array) -> Array:
+        """Evaluate J_N(x) = dN/dx: (..., n_x) -> (..., n_z, n_x)."""
+        return self.lift_and_jacobian(x)[1]
+
+    def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Evaluate N(x) and J_N(x) at once."""
+        return self.observables.lift_and_jacobian(self.states.array('state', x))
+
+    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
+                         ) -> tuple[Array, Array, Array, Array]:
+        """Evaluate N(x), J_N(x) and their secants; see :meth:`Observables.lift_and_secants`."""
+        return self.observables.lift_and_secants(x, x_ref, w)
+
+    def _onto_states(self, J: Array) -> Array:
+        """Return the pseudo-inverse of J_N(x): (..., n_z, n_x) -> (..., n_x, n_z)."""
+        if self.identity and J.shape[-1] == 1:
+            # one state: a tenth of the time of a singular value decomposition
+            inverse: Array = (J / np.sum(J * J, axis=-2, keepdims=True)).swapaxes(-1, -2)
+            return inverse
+        return np.asarray(np.linalg.pinv(J), dtype=np.float64)
+
+    def onto_states(self, J: Array, rate: Array) -> Array:
+        """
+        Return the rate of the state, by J_N(x)^+, for a rate of z.
+
+        :param J: (n_z, n_x) at the state x.
+        :param rate: (n_z,) or (n_z, k).
+        """
+        return self._onto_states(J) @ rate
+
+    def drift(self, x: Array) -> Array:
+        """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
+        x = self.states.array('state', x)
+        if self.readout is not None:
+            return self.observables.features.lift(x) @ self.readout.T
+        z, J = self.observables.lift_and_jacobian(x)
+        f = (self._onto_states(J) @ (z @ self.A.T)[..., None])[..., 0]
+        return f - self.pre_feedback_rate(x)
+
+    @cached_property
+    def pre_feedback_slope(self) -> Array:
+        """B K (n_x, n_x); zeros where there is no pre-feedback."""
+        shape = (self.n_x, self.n_x)
+        slope = np.zeros(shape) if self.pre_feedback is None else self.B @ self.pre_feedback
+        return frozen(slope, 'slope of the pre-feedback', shape)
+
+    def pre_feedback_rate(self, x: Array) -> Array:
+        """Evaluate B K x, the part of A z that is due to the pre-feedback: (..., n_x) -> same."""
+        return x @ self.pre_feedback_slope.T
+
+    def drift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Evaluate the drift and its Jacobian exactly: (..., n_x) -> same, (..., n_x, n_x)."""
+        if self.readout is not None:
+            features, slope = self.observables.features.lift_and_jacobian(x)
+            return features @ self.readout.T, self.readout @ slope
+        z, J, bend = self.observables.lift_and_derivatives(x)
+        inverse, rate = self._onto_states(J), (z @ self.A.T)[..., None]
+        f = inverse @ rate
+        # the derivative of J'J f = J'A z by each state, with J of full rank
+        rest = (bend * (rate - J @ f)[..., None]).sum(axis=-3)
+        slope = inverse @ (self.A @ J - (bend @ f[..., None, :, :])[..., 0]
+                           + inverse.swapaxes(-1, -2) @ rest)
+        return f[..., 0] - self.pre_feedback_rate(x), slope - self.pre_feedback_slope
+
+    def drift_jacobian(self, x: Array) -> Array:
+        """Evaluate df/dx of the drift exactly: (..., n_x) -> (..., n_x, n_x)."""
+        return self.drift_and_jacobian(x)[1]
+
+    def averaged_drift_jacobian(self, x: Array, x_ref: Array) -> Array:
+        """
+        Average df/dx along the segment from x_ref to x, both (n_x,).
+
+        :return: A (n_x, n_x) with f(x) - f(x_ref) = A (x - x_ref): exact for a read-out, by the
+            secants of its features, otherwise close, by Gauss-Legendre quadrature.
+        """
+        if self.readout is not None:
+            return self.readout @ self.observables.features.lift_and_secants(x, x_ref, x)[2]
+        along = self.drift_jacobian(x_ref + NODES[:, None] * (x - x_ref))
+        return np.tensordot(WEIGHTS, along, 1)
+
+
+def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coordinates,
+                     time_unit: str, provenance: Provenance) -> LiftedModel:
+    """
+    Build the linear model dx/dt = (df/dx)(x - x_0) + B (u - u_0) as a lift with N(x) = x.
+
+    :param jacobian: (n_x, n_x) df/dx at the nominal point, the centers, in units.
+    :param B: (n_x, n_u) input matrix, in units.
+    """
+    n_x = len(states)
+    A = np.asarray(jacobian) * states.scale / states.scale[:, None]
+    scaled_B = np.asarray(B) * inputs.scale / states.scale[:, None]
+    return LiftedModel(NetworkObservables.linear(n_x), A, scaled_B, states, inputs, time_unit,
+                       provenance)

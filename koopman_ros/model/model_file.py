@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The model file: arrays and a JSON description in the safetensors format, no code."""
+
+from dataclasses import asdict, fields
+import hashlib
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+import safetensors.numpy
+
+from koopman_ros.core.paths import write_atomically
+from koopman_ros.core.units import check_unit
+from koopman_ros.model.coordinates import Coordinates
+from koopman_ros.model.input_matrix import InputTerms
+from koopman_ros.model.lifted_model import LiftedModel, Provenance
+from koopman_ros.model.observables import NetworkObservables, PolynomialObservables
+from koopman_ros.model.training_data import TrainingStates, TriedLoops
+from koopman_ros.model_classes import CLASSES
+
+FORMAT_VERSION = 1
+# One entry, since the library writes several in an order that changes from process to process.
+_KEY = 'koopman_ros.model'
+_MAX_BYTES = 1 << 22
+
+# Riccati equations of n_z coordinates cost n_z^3: 32 take some milliseconds on a processor of
+# 2020, four times what training from bags allows; 50 take ten times as long, as BLAS divides
+# them among threads, which wait for each other on a busy machine.
+MAX_COORDINATES = 32
+_MAX_STATES = 32  # and inputs; as many as coordinates
+_MAX_DEGREE = 32  # of monomials; beyond some ten, little of them is left in numbers
+_MAX_NAME = 100  # characters; a SHA-256 in hexadecimal has 64
+_MAX_SENTENCE = 4000
+_MAX_SEED = 1 << 128  # numpy's own seeds have up to 128 bits
+_MAX_ENTRIES = 100  # metrics, or reasons
+_MAX_REASON = 300  # characters of a refusal, which may quote the file
+
+Tensors = dict[str, NDArray[Any]]
+
+
+class ModelFileError(ValueError):
+    """A model file cannot be used; the message has the reason and the remedy."""
+
+
+def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
+    """
+    Write a model; a reader sees the old file or the new one, never a part.
+
+    :raises OSError: when the folder cannot be written.
+    :raises TypeError: for another lift than of a network or of monomials.
+    :raises ValueError: when :func:`load` would refuse the file.
+    """
+    check(model)
+    about, tensors = _description(model), _tensors(model)
+    metadata = json.dumps({'format_version': FORMAT_VERSION, 'model': about,
+                           'sha256': _checksum(about, tensors)}, sort_keys=True, allow_nan=False)
+    write_atomically(Path(path), safetensors.numpy.save(tensors, metadata={_KEY: metadata}))
+
+
+def load(path: str | os.PathLike[str]) -> LiftedModel:
+    """Read and check a model; raise ModelFileError with the reason and the remedy."""
+    return load_with_digest(path)[0]
+
+
+def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
+    """Read a model as :func:`load`, with the SHA-256 of its file."""
+    path = Path(path)
+    content = _read(path)
+    try:
+        model = _parsed(content)
+        check(model)
+    # whatever a hostile file makes the library, JSON or a constructor raise
+    except Exception as error:
+        reason = (f'it is not a safetensors file: {error}' if isinstance(error, SafetensorError)
+                  else f'{error} is missing' if isinstance(error, KeyError) else str(error))
+        if not reason.isprintable():
+            reason = ascii(reason)
+        if len(reason) > _MAX_REASON:
+            reason = reason[:_MAX_REASON] + '...'
+        raise ModelFileError(f'{path} is not a usable model file: {reason}; restore it from a '
+                             'backup, or train the model again') from error
+    return model, hashlib.sha256(content).hexdigest()
+
+
+def check(model: LiftedModel) -> None:
+    """
+    Check that a model can be controlled with, and that its texts fit logs and messages.
+
+    :raises TypeError: for a name, unit or note of its origin that is no text.
+    :raises ValueError: naming the size and its limit, or the text and its error.
+    """
+    lift, origin = model.observables, model.provenance
+    if not isinstance(lift, NetworkObservables | PolynomialObservables):
+        raise TypeError('only lifts of networks and of monomials can be saved, got '
+                        f'{type(lift).__name__}')
+    degree = lift.degree if isinstance(lift, PolynomialObservables) else 0
+    for name, size, limit in (
+            ('n_z', model.n_z, MAX_COORDINATES), ('n_x', model.n_x, _MAX_STATES),
+            ('n_u', model.n_u, _MAX_STATES), ('the degree', degree, _MAX_DEGREE),
+            ('the degree of the input matrix', model.input_matrix_degree, _MAX_DEGREE),
+            ('the number of metrics', len(origin.metrics), _MAX_ENTRIES),
+            ('the number of reasons', len(origin.reasons), _MAX_ENTRIES)):
+        if size > limit:
+            raise ValueError(f'{name} is {size}, at most {limit} can be controlled with')
+    for signals in (model.states, model.inputs):
+        for name, unit in zip(signals.names, signals.units, strict=True):
+            _check_text('the name of a signal', name)
+            _check_text(f'the unit of {name}', unit)
+            check_unit(unit)
+    for name in ('plant', 'data_digest', 'package_version', 'method'):
+        _check_text(name, getattr(origin, name), _MAX_SENTENCE if name == 'method' else _MAX_NAME)
+    for reason in origin.reasons:
+        _check_text('a reason', reason, _MAX_SENTENCE)
+    for name, value in origin.metrics.items():
+        _check_text('the name of a metric', name)
+        if not math.isfinite(value):
+            raise ValueError(f'the metric {name} is {value}, not finite')
+    if origin.seed is not None and not (
+            type(origin.seed) is int and 0 <= origin.seed < _MAX_SEED):
+        raise ValueError('the seed must be an integer of at least 0 and below 2^128')
+    if origin.model_class not in ('', *CLASSES):
+        raise ValueError(f'model_class must be one of {", ".join(CLASSES)}, got '
+                         f'{origin.model_class!r}')
+
+
+def _check_text(what: str, text: object, longest: int = _MAX_NAME) -> None:
+    if not isinstance(text, str):
+        raise TypeError(f'{what} must be a text, got {text!r}')
+    if len(text) > longest:
+        raise ValueError(f'{what} has {len(text)} characters, at most {longest} may be')
+    if not text.isprintable():
+        raise ValueError(f'{what} = {text!a} holds characters that cannot be shown')
+
+
+def _description(model: LiftedModel) -> dict[str, Any]:
+    """Return all of a model that is not an array of weights, as JSON."""
+    about: dict[str, Any] = {
+        'inputs': _signals(model.inputs), 'provenance': asdict(model.provenance),
+        'states': _signals(model.states), 'time_unit': model.time_unit}
+    if isinstance(model.observables, NetworkObservables):
+        about['identity'] = model.observables.identity
+    if model.training_states is not None:
+        about['fill_distance'] = model.training_states.fill_distance
+    return about
+
+
+def _signals(signals: Coordinates) -> dict[str, list[Any]]:
+    return {one.name: np.asarray(getattr(signals, one.name)).tolist() for one in fields(signals)}
+
+
+def _tensors(model: LiftedModel) -> Tensors:
+    """Return the arrays of a model by name."""
+    lift, tried, terms = model.observables, model.tried_loops, model.input_terms
+    if isinstance(lift, NetworkObservables):
+        found: dict[str, NDArray[Any] | None] = {'W': lift.W, 'b': lift.b, 'V': lift.V}
+    else:
+        assert isinstance(lift, PolynomialObservables)
+        found = {'exponents': lift.exponents}
+    found |= {
+        'A': model.A, 'B': model.B, 'readout': model.readout, 'pre_feedback': model.pre_feedback,
+        'input_terms': None if terms is None else terms.coefficients,
+        'training_states': None if model.training_states is None else (
+            model.training_states.states)}
+    if tried is not None:
+        found |= {f'tried_loops.{one.name}': getattr(tried, one.name) for one in fields(tried)}
+    return {name: np.ascontiguousarray(value) for name, value in found.items()
+            if value is not None}
+
+
+def _checksum(about: dict[str, Any], tensors: Tensors) -> str:
+    """Return the SHA-256 of all that a model consists of, in hexadecimal."""
+    sha = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name in sorted(tensors):
+        sha.update(f'{name}{tensors[name].dtype.str}{tensors[name].shape}'.encode())
+        sha.update(tensors[name].tobytes())
+    return sha.hexdigest()
+
+
+def _read(path: Path) -> bytes:
+    """Return the content of a regular file of a fair size."""
+    try:
+        # reading a pipe or a device may never end
+        if path.exists() and not path.is_file():
+            raise ModelFileError(f'cannot read the model file {path}: it is not a regular file')
+        with open(path, 'rb') as file:
+            content = file.read(_MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ModelFileError(
+            f'no model file at {path}: check the path, or train a model') from None
+    except OSError as error:
+        raise ModelFileError(f'cannot read the model file {path}: {error.strerror}') from error
+    if len(content) > _MAX_BYTES:
+        raise ModelFileError(f'{path} is not a usable model file: it has more than {_MAX_BYTES} '
+                             'bytes, far more than any model; check the path')
+    return content
+
+
+def _parsed(content: bytes) -> LiftedModel:
+    """Return the model of a file; raise whatever its content makes the parts raise."""
+    tensors: Tensors = safetensors.numpy.load(content)
+    # the library has checked the header, and gives its metadata for paths alone
+    header = json.loads(content[8:8 + int.from_bytes(content[:8], 'little')])
+    if _KEY not in header.get('__metadata__', {}):
+        raise ValueError('it is a safetensors file of something else')
+    metadata = json.loads(header['__metadata__'][_KEY])
+    if (version := metadata['format_version']) != FORMAT_VERSION:
+        raise ValueError(f'it has format version {version!r}, this package reads '
+                         f'{FORMAT_VERSION}')
+    about = metadata['model']
+    if metadata['sha256'] != _checksum(about, tensors):
+        raise ValueError('its checksum is wrong, so it was damaged or edited')
+    for name, array in tensors.items():
+        expected = {'exponents': np.int64, 'tried_loops.lost': np.bool_}.get(name, np.float64)
+        if array.dtype != expected:
+            raise ValueError(f'the array {name!r} has type {array.dtype}, expected {expected}')
+    return _model(about, tensors)
+
+
+def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
+    """Build a model of its description and arrays."""
+    lift = (PolynomialObservables(tensors.pop('exponents')) if 'exponents' in tensors else
+            NetworkObservables(tensors.pop('W'), tensors.pop('b'), tensors.pop('V'),
+                               identity=_of_type(bool, about, 'identity')))
+    terms, known = tensors.pop('input_terms', None), tensors.pop('training_states', None)
+    tried = None if 'tried_loops.starts' not in tensors else TriedLoops(
+        *(tensors.pop(f'tried_loops.{one.name}') for one in fields(TriedLoops)))
+    origin = dict(about['provenance'])
+    origin['metrics'] = {name: float(value) for name, value in origin['metrics'].items()}
+    origin['reasons'] = tuple(_of_type(list, origin, 'reasons'))
+    if origin['accepted'] is not None:
+        _of_type(bool, origin, 'accepted')
+    model = LiftedModel(
+        lift, tensors.pop('A'), tensors.pop('B'), _coordinates(about['states']),
+        _coordinates(about['inputs']), about['time_unit'], Provenance(**origin),
+        training_states=None if known is None else TrainingStates(
+            known, _of_type(float, about, 'fill_distance')),
+        readout=tensors.pop('readout', None),
+        input_terms=None if terms is None else InputTerms(terms),
+        pre_feedback=tensors.pop('pre_feedback', None),
+        tried_loops=tried)
+    if tensors:
+        raise ValueError(f'it holds unknown arrays: {", ".join(sorted(tensors))}')
+    return model
+
+
+def _coordinates(about: dict[str, Any]) -> Coordinates:
+    names, units, *values = (_of_type(list, about, one.name) for one in fields(Coordinates))
+    return Coordinates(tuple(names), tuple(units), *(
+        np.array(value, dtype=np.float64) for value in values))
+
+
+def _of_type(kind: type, about: dict[str, Any], name: str) -> Any:
+    if not isinstance(about[name], kind):
+        raise TypeError(f'{name} must be a {kind.__name__}, got {about[name]!r}')
+    return about[name]

@@ -1,0 +1,341 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Where the signals of a plant are on the wire, by parameter; topics that are no signal's."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+import functools
+from functools import cached_property
+from pathlib import Path
+import re
+from types import MappingProxyType
+from typing import Any
+
+from koopman_ros.core.declaration import parameter
+from koopman_ros.core.message_fields import Place, place, SIGNAL_NAME, stem
+from koopman_ros.core.paths import config_directory
+from koopman_ros.core.status import Words
+from koopman_ros.core.units import check_unit, conversion, Display, Displays
+from koopman_ros.model import LiftedModel
+from koopman_ros.parameters.table import ConfigurationError
+
+CONTROLLER_STATE = 'controller_state'
+CONTROLLER_EVENTS = 'controller_events'
+CONTROLLER_PLAN = 'controller_plan'
+ACTIVE_LIMITS = 'active_limits'
+OPERATOR_ACTIONS = 'operator_actions'
+DIAGNOSTICS = '/diagnostics'
+CLOCK = '/clock'
+
+#: what is controlled where nothing else is said
+DEFAULT_SYSTEM = 'reactor'
+
+LONGEST_FRAME_ID = 256  # characters that are passed on
+
+# The places of signals: of states, then of inputs.
+KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual')
+PLANT_KINDS = ('measured', 'applied', 'commands')
+SIGNALS = ('states_measured', 'inputs_commanded', 'controlled')  # parameters that name them
+
+_PRESETS = 'plants'  # folder of the parameter files of the plants that are shipped
+_NAMED = re.compile(r'([A-Za-z_]\w*)\s*\[(.+)\]')
+
+
+def _topic(description: str) -> Any:
+    return parameter('', description, read_only=True)
+
+
+@dataclass(frozen=True)
+class MeasuredPlace:
+    """Where a signal is measured."""
+
+    topic: str = _topic('topic of its measurements; of an input, of what really acts')
+    type: str = _topic('type of their messages as package/msg/Name; empty for the usual one of '
+                       'its unit')
+    field: str = _topic('where in them the number is, e.g. temperature, twist.linear.x, data[2] '
+                        'or position[shaft]; empty for the usual one of the type')
+    unit: str = _topic('unit of that number; empty for the usual one of the type')
+
+
+@dataclass(frozen=True)
+class StatePlaces(MeasuredPlace):
+    """Where a measured state is; its set-points and prediction have the same type and field."""
+
+    setpoint_topic: str = _topic('where its set-point is asked for, where it is controlled')
+    active_setpoint_topic: str = _topic('where the set-point that is tracked is published')
+    predicted_topic: str = _topic('where it is published what was expected of the measurement')
+
+
+@dataclass(frozen=True)
+class CommandedPlaces(MeasuredPlace):
+    """Where an input is measured, and where it is commanded."""
+
+    command_topic: str = _topic('topic of its commands')
+    command_type: str = _topic('type of the commands; empty for that of the measurements')
+    command_field: str = _topic('where in them the number is; empty for the usual one of the type')
+    command_unit: str = _topic('unit of that number; empty for the usual one of the type')
+
+
+@dataclass(frozen=True)
+class InputPlaces(CommandedPlaces):
+    """The same with an operator."""
+
+    manual_topic: str = _topic('where an operator commands it in manual mode')
+
+
+@dataclass(frozen=True)
+class Signals:
+    """
+    The signals of a plant: names and units.
+
+    :raises ConfigurationError: for controlled signals that are no states, or too many.
+    """
+
+    states: Mapping[str, str]  #: units of the measured states, by name
+    inputs: Mapping[str, str]  #: units of the inputs, by name
+    controlled: tuple[str, ...] = ()  #: names of the states that have a set-point
+    #: units of all states of the model, in its order; empty where all are measured
+    model_states: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def every(self) -> Mapping[str, str]:
+        """Units of all states, by name, in the order of the model."""
+        return self.model_states or self.states
+
+    @property
+    def estimated(self) -> dict[str, str]:
+        """Units of the states that are not measured, by name."""
+        return {name: unit for name, unit in self.every.items() if name not in self.states}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of all, by name."""
+        return {**self.states, **self.inputs}
+
+    def __post_init__(self) -> None:
+        for name in (*self.states, *self.inputs):
+            if not SIGNAL_NAME.fullmatch(name):
+                raise ConfigurationError(
+                    f'{name!r} is a signal, which topics and parameters are named after: use '
+                    'letters, digits and _, beginning with a letter')
+        wrong = [name for name in self.controlled if name not in self.states]
+        if wrong or len(set(self.controlled)) < len(self.controlled):
+            raise ConfigurationError(
+                f'controlled = {list(self.controlled)} must name different ones of the measured '
+                f'signals {", ".join(self.states)}')
+
+    def __str__(self) -> str:
+        """Write states and inputs with units."""
+        return ' and '.join(
+            f'{kind} ' + ', '.join(f'{name} [{unit}]' for name, unit in of.items())
+            for kind, of in (('states', self.states), ('inputs', self.inputs)))
+
+    def defaults(self) -> dict[str, str]:
+        """Return the topics of all places, by parameter."""
+        alone = len(self.controlled) == 1
+        topics: dict[str, str] = {}
+        for name in self.states:
+            of = '' if alone else f'{name}/'
+            controlled = name in self.controlled
+            topics |= {f'{name}.topic': name, f'{name}.predicted_topic': f'predicted_{name}',
+                       f'{name}.setpoint_topic': f'{of}setpoint' if controlled else '',
+                       f'{name}.active_setpoint_topic': (
+                           f'{of}active_setpoint' if controlled else '')}
+        for name, unit in self.inputs.items():
+            command = f'{stem(name, unit)}_setpoint'
+            topics |= {f'{name}.topic': name, f'{name}.command_topic': command,
+                       f'{name}.manual_topic': f'manual_{command}'}
+        return topics
+
+
+def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
+               measured: Collection[str] = ()) -> Signals:
+    """
+    Return the signals of a model.
+
+    :param controlled: names of states; all that are measured by default.
+    :param measured: names of states, in any order; all by default.
+    """
+    every, inputs = (dict(zip(of.names, of.units, strict=True))
+                     for of in (model.states, model.inputs))
+    # in the order of the states, as the control step wants them
+    states = {name: unit for name, unit in every.items() if name in (measured or every)}
+    named = tuple(filter(None, controlled))
+    own = tuple(name for name in states if name in named)
+    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
+                   {} if len(states) == len(every) else every)
+
+
+def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
+    """Return the words for some signals; `shown` are those not written as they usually are."""
+    return Words(Displays(signals.units, {'K': Display('K', 'degC', '.2f'), **shown}))
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """
+    The places of all signals.
+
+    :raises ConfigurationError: for a field that is no path in a message, or a missing topic.
+    """
+
+    signals: Signals
+    states: Mapping[str, Any]  #: places of a node's states, by name
+    inputs: Mapping[str, Any]  #: places of its inputs, by name
+    kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
+
+    @cached_property
+    def measured(self) -> dict[str, Place]:
+        """Where the states are measured."""
+        return {name: self._state(name, said.topic) for name, said in self.states.items()}
+
+    @cached_property
+    def predicted(self) -> dict[str, Place]:
+        """Where it is said what was expected of them."""
+        return {name: self._state(name, said.predicted_topic)
+                for name, said in self.states.items()}
+
+    @cached_property
+    def setpoints(self) -> dict[str, Place]:
+        """Where the set-points of the controlled states are asked for."""
+        return {name: self._state(name, self.states[name].setpoint_topic)
+                for name in self.signals.controlled}
+
+    @cached_property
+    def active_setpoints(self) -> dict[str, Place]:
+        """Where it is said what is tracked."""
+        return {name: self._state(name, self.states[name].active_setpoint_topic)
+                for name in self.signals.controlled}
+
+    @cached_property
+    def commands(self) -> dict[str, Place]:
+        """Where the inputs are commanded."""
+        return {name: self._command(name, said.command_topic)
+                for name, said in self.inputs.items()}
+
+    @cached_property
+    def manual(self) -> dict[str, Place]:
+        """Where an operator commands them."""
+        return {name: self._command(name, said.manual_topic) for name, said in self.inputs.items()}
+
+    @cached_property
+    def applied(self) -> dict[str, Place]:
+        """Where it is measured what acts."""
+        return {name: _at(name, said.topic, self.signals.inputs[name], said)
+                for name, said in self.inputs.items()}
+
+    def check(self) -> str:
+        """Say what is wrong with them, or return an empty string."""
+        try:
+            for kind in self.kinds:
+                places = getattr(self, kind)
+                if missing := [name for name, found in places.items() if not found.topic]:
+                    return f'{missing[0]} has no topic: name one'
+            heard = {found.topic: name for name, found in self.measured.items()}
+            for name, found in self.commands.items():
+                if found.topic in heard:
+                    return (f'{name} is commanded on {found.topic!r}, where {heard[found.topic]} '
+                            'is measured: name another topic for one of them')
+        except ValueError as error:
+            return str(error)
+        return ''
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """All of them, each once."""
+        return tuple(dict.fromkeys(
+            found.topic for kind in self.kinds for found in getattr(self, kind).values()))
+
+    def _state(self, name: str, topic: str) -> Place:
+        return _at(name, topic, self.signals.states[name], self.states[name])
+
+    def _command(self, name: str, topic: str) -> Place:
+        said = self.inputs[name]
+        same = not said.command_type or said.command_type == said.type
+        return _place(topic, name, self.signals.inputs[name], {
+            'type': said.command_type or said.type,
+            'field': said.command_field or (said.field if same else ''),
+            'unit': said.command_unit or (said.unit if same else '')})
+
+
+def _at(name: str, topic: str, unit: str, said: MeasuredPlace) -> Place:
+    return _place(topic, name, unit, {
+        'type': said.type, 'field': said.field, 'unit': said.unit})
+
+
+def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Place:
+    try:
+        found = place(topic, name, unit, given)
+        conversion(found.unit, unit)
+    except ValueError as error:
+        raise ConfigurationError(f'{name}: {error}') from error
+    return found
+
+
+def named_units(described: Collection[str]) -> dict[str, str]:
+    """Return units by name of signals described as ``name [unit]``; ConfigurationError if not."""
+    found = {}
+    for text in described:
+        match = _NAMED.fullmatch(text.strip())
+        if match is None or match[1] in found:
+            raise ConfigurationError(f'{text!r} must be a name and a unit, each name once, e.g. '
+                                     "'level [m]'")
+        try:
+            check_unit(match[2])
+        except ValueError as error:
+            raise ConfigurationError(f'{text!r}: {error}') from error
+        found[match[1]] = match[2]
+    return found
+
+
+def system_of(given: Mapping[str, Any]) -> str:
+    """Return the system that parameters name, or the default."""
+    return str(given.get('system', DEFAULT_SYSTEM))
+
+
+def shipped() -> list[str]:
+    """Return the names of the plants that have a parameter file."""
+    return sorted(file.stem for file in (config_directory() / _PRESETS).glob('*.yaml'))
+
+
+def preset(system: str, node: str) -> dict[str, Any]:
+    """
+    Return the defaults of a node, by parameter, from the file of a plant that is shipped.
+
+    A plant without a file has none.
+    """
+    path = config_directory() / _PRESETS / f'{system}.yaml'
+    if not system.isidentifier() or not path.is_file():
+        return {}
+    content = _content(path)
+    values: dict[str, Any] = {}
+    for section in ('/**', node):
+        _flatten('', content.get(section, {}).get('ros__parameters', {}), values)
+    return values
+
+
+@functools.cache
+def _content(path: Path) -> dict[str, Any]:
+    # in here: only at the start
+    import yaml
+
+    # by libyaml, which is in its wheels and in packages of distributions, ten times as fast
+    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+    return dict(yaml.load(path.read_text(), loader))
+
+
+def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            _flatten(f'{prefix}{key}.', value, into)
+        else:
+            into[f'{prefix}{key}'] = tuple(value) if isinstance(value, list) else value
+
+
+def refusal(names: Collection[str]) -> str:
+    """Say why a list of names cannot be that of topics, or return an empty string."""
+    return '' if names and all(names) else (
+        f'topics = {list(names)} must hold at least one name and no empty one')

@@ -1,0 +1,24 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bags in the layout of rosbag2 (MCAP), written and read on any machine with Python, no ROS."""
+
+from koopman_ros.records.decoding import BagMessage
+from koopman_ros.records.episodes import loop_episodes, stream_episodes
+from koopman_ros.records.import_spec import Account, RecordedInput, RecordedState
+from koopman_ros.records.mcap_file import BagReadError
+from koopman_ros.records.message_definitions import (
+    message_definition,
+    MessageDefinition,
+    MessageDefinitionError,
+)
+from koopman_ros.records.reader import BagSummary, in_log_order, read_messages, summary
+from koopman_ros.records.series import read_series, Series
+from koopman_ros.records.writer import BagWriter
+
+__all__ = [
+    'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter', 'MessageDefinition',
+    'MessageDefinitionError', 'RecordedInput', 'RecordedState', 'Series', 'in_log_order',
+    'loop_episodes', 'message_definition', 'read_messages', 'read_series', 'stream_episodes',
+    'summary',
+]

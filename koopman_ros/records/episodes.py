@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A loop's measurements with the input that acted on them, cut from bags into episodes."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+import math
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.message_fields import Place
+from koopman_ros.core.units import Conversion, conversion, NANOSECONDS
+from koopman_ros.records import applied_inputs, segments
+from koopman_ros.records.align import align_by_timestamp, named, Samples
+from koopman_ros.records.applied_inputs import Applied
+from koopman_ros.records.decoding import BagMessage
+from koopman_ros.records.import_spec import (
+    Account,
+    EpisodeBreaks,
+    places_of,
+    RecordedInput,
+    RecordedState,
+)
+from koopman_ros.records.mcap_file import BagReadError
+from koopman_ros.records.reader import BagSummary, read_messages, summary
+from koopman_ros.records.segments import Clock, NO_STAMP, Segment, Times
+from koopman_ros.records.series import check_places, spikes_and_jumps, stamped_number
+
+# A gap is longer than this many usual periods.
+_GAP_PERIODS = 3.5
+_SHORTEST = 10
+_CHECKED = 1000  # messages between two looks for a complete portion
+# The plant's time, where it is simulated, and how far receipts may differ from it.
+_CLOCK, _CLOCK_TYPE = '/clock', 'rosgraph_msgs/msg/Clock'
+_SAME_PACE = 0.02
+_SAME_PACE_SECONDS = 1.0
+
+
+def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
+                  inputs: Sequence[RecordedInput], *, tolerance_ns: int = 0,
+                  least_jumps: Sequence[float] | None = None) -> tuple[list[Episode], Account]:
+    """
+    Return all episodes of some bags, see :func:`stream_episodes`, and what was made of the bags.
+
+    :raises BagReadError: as it does.
+    """
+    account = Account()
+    return list(stream_episodes(bags, states, inputs, account, tolerance_ns=tolerance_ns,
+                                least_jumps=least_jumps)), account
+
+
+def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
+                    inputs: Sequence[RecordedInput], account: Account, *, tolerance_ns: int = 0,
+                    least_jumps: Sequence[float] | None = None) -> Iterator[Episode]:
+    """
+    Yield the episodes of some bags: times in s since the first measurement of each.
+
+    Nothing is resampled: measurements keep their stamps. Where there are several states, the
+    nearest stamps of the others are put to each stamp of the one that is measured least; types
+    without a stamp count at receipt.
+
+    An input that was measured throughout an episode is linear between its measurements. Where it
+    was not, or where it is no more than its command within the range that it reaches, it is held
+    from the time on at which it was commanded. A command that answers a measurement carries its
+    stamp; where the stamps are those of the wall clock, it acts later by the time between the two
+    receipts. A command without a stamp acts when it is received.
+
+    Episodes end at gaps, where time is set back, and where a state jumps to another level as
+    after a reset. Spikes of a single sample are dropped, and so are measurements before the first
+    input, since nobody knows what acted on them. A bag that was not closed or is damaged is read
+    as far as it goes. The account tells all that.
+
+    Memory does not grow with the bags: of a long record some ten thousand measurements are
+    put together at a time, at whose ends an episode ends, too.
+
+    :param account: is added to as the episodes come.
+    :param tolerance_ns: how far stamps of one sample of several states may lie apart.
+    :param least_jumps: smallest change of each state, in its unit, that may be a spike or a jump;
+        by default the record alone tells.
+    :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there,
+        and for states without stamps whose receipts run at another pace than /clock in the bag.
+    """
+    for bag in distinct(bags, account):
+        loop = _Loop(os.fspath(bag), states, inputs, account, tolerance_ns,
+                     least_jumps or [0.0] * len(states))
+        for segment in loop.segments():
+            for episode in loop.episodes(segment):
+                account.used += len(states) * len(episode)
+                yield episode
+        account.notes += [*loop.breaks.notes(loop.bag), *loop.notes]
+    account.dropped = +account.dropped
+
+
+def distinct(bags: Sequence[str | os.PathLike[str]], account: Account
+             ) -> Iterator[str | os.PathLike[str]]:
+    """Yield each bag once, however it is named."""
+    read: set[str] = set()
+    for bag in bags:
+        if (path := os.path.realpath(bag)) in read:
+            account.notes.append(f'{os.fspath(bag)} is named twice: read once')
+            continue
+        read.add(path)
+        yield bag
+
+
+@dataclass
+class _Loop:
+    """One bag with the signals of a loop."""
+
+    bag: str
+    states: Sequence[RecordedState]
+    inputs: Sequence[RecordedInput]
+    account: Account
+    tolerance_ns: int
+    least_jumps: Sequence[float]
+    breaks: EpisodeBreaks = field(default_factory=EpisodeBreaks)
+    notes: dict[str, None] = field(default_factory=dict)  #: each once, in their order
+
+    def __post_init__(self) -> None:
+        self.content: BagSummary = summary(self.bag)
+        self.inputs = [self._without_missing(signal) for signal in self.inputs]
+        #: conversions to the units of the signals, by place, those of the states first
+        self.scales: dict[Place, Conversion] = {}
+        self._ranges: dict[Place, tuple[float, float]] = {}
+        signals: list[RecordedState | RecordedInput] = [*self.states, *self.inputs]
+        for signal in signals:
+            for place in places_of(signal):
+                try:
+                    self.scales[place] = conversion(place.unit, signal.unit)
+                    self._ranges[place] = place.range
+                except ValueError as error:
+                    raise BagReadError(f'topic {place.topic!r} of bag {self.bag!r}: {error}; '
+                                       'name another topic') from error
+        check_places(self.bag, self.content, self.scales)
+
+    def _without_missing(self, signal: RecordedInput) -> RecordedInput:
+        """Return an input without the measured one if the bag lacks that."""
+        if signal.measured is None or signal.measured.topic in self.content.types:
+            return signal
+        self.account.notes.append(f'{self.bag} has no topic {signal.measured.topic!r}: '
+                                  f'{signal.name} is taken from its command')
+        return replace(signal, measured=None)
+
+    def segments(self) -> Iterator[Segment]:
+        """Yield the numbers between resets of time, long ones in portions."""
+        if not self.content.complete:
+            self.account.notes.append(f'{self.bag} was not closed or is damaged: read up to its '
+                                      'last complete record')
+        counts, n_x = self.content.counts, len({signal.place for signal in self.states})
+        places = list(self.scales)
+        topics: dict[str, list[tuple[int, Place, tuple[float, float]]]] = {}
+        for number, place in enumerate(places):
+            topics.setdefault(place.topic, []).append((number, place, self._ranges[place]))
+        size = segments.portion(max(counts[place.topic] for place in places[:n_x]))
+        segment, read = Segment(places, n_x), 0
+        for message in read_messages(self.bag, topics, recover=True):
+            read += 1
+            for number, place, limits in topics[message.topic]:
+                self.account.measurements += number < n_x
+                if (found := self._accepted(message, place, *limits)) is None:
+                    continue
+                stamp_ns, value = found
+                if back_ns := segment.set_back(number, stamp_ns):
+                    back = back_ns / NANOSECONDS
+                    self.breaks.add('set back', f'{back:.3f} s', back)
+                    yield self._checked(segment)
+                    segment = Segment(places, n_x)
+                segment.add(number, stamp_ns, message.log_time_ns, value)
+            while read % _CHECKED == 0 and segment.is_complete(size):
+                yield self._checked(segment)
+                segment = segment.following()
+        if left := sum(counts[topic] for topic in topics) - read:
+            self.account.notes.append(f'{self.bag} is damaged: {left} messages that it counts '
+                                      'could not be read')
+        yield self._checked(segment)
+
+    def _accepted(self, message: BagMessage, place: Place, lowest: float, highest: float
+                  ) -> tuple[int, float] | None:
+        """Return stamp [ns] and number at a place; None, counted, for no valid number."""
+        stamp_ns, value = stamped_number(self.bag, message, place)
+        if value is None:
+            self.account.dropped[f'without {place.field}'] += 1
+            return None
+        if not (lowest <= value <= highest and math.isfinite(value)):
+            self.account.dropped[f'outside {lowest:g} to {highest:g} {place.unit}'] += 1
+            return None
+        if stamp_ns is None:
+            self.notes[f'{self.bag}: messages of {place.topic} ({place.type}) have no stamp: '
+                       'their receipt counts'] = None
+            return NO_STAMP, value
+        return stamp_ns, value
+
+    def _checked(self, segment: Segment) -> Segment:
+        """Raise BagReadError where receipts count that run differently from /clock in the bag."""
+        if self.content.types.get(_CLOCK) != _CLOCK_TYPE or not segment.without_stamps():
+            return segment
+        times = np.fromiter((
+            (message.message.clock.sec + message.message.clock.nanosec / NANOSECONDS,
+             message.log_time_ns / NANOSECONDS)
+            for message in read_messages(self.bag, [_CLOCK], recover=True)), np.dtype((float, 2)))
+        steps = np.diff(times, axis=0)
+        # without those of a simulation that was started again
+        plant, receipt = np.sum(steps[np.all(steps >= 0.0, axis=1)], axis=0).tolist()
+        if abs(plant - receipt) > max(_SAME_PACE * receipt, _SAME_PACE_SECONDS):
+            raise BagReadError(
+                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and '
+                f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
+                "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
+                "--use-sim-time'), or use a type with a header")
+        return segment
+
+    def episodes(self, segment: Segment) -> Iterator[Episode]:
+        """Align one segment and cut it at its gaps and jumps."""
+        dropped, n_x = self.account.dropped, len(self.states)
+        clock = segment.clock()
+        samples = align_by_timestamp(segment, clock, self.states, self.tolerance_ns, dropped)
+        stamps, x = samples.stamps, samples.x
+        heard = all(any(len(segment.of(place)) or place in segment.applied
+                        for place in places_of(signal)) for signal in self.inputs)
+        if len(stamps) < _SHORTEST or not heard:
+            dropped['too short, or without any input'] += x.size
+            return
+        spike = self._leaps(x)[0]
+        odd = spike.any(axis=1)
+        for j in range(n_x):
+            dropped[self._named(j, 'spike of a single sample')] += int(np.sum(spike[:, j]))
+        dropped['beside a spike'] += n_x * int(np.sum(odd)) - int(np.sum(spike))
+        stamps, x = stamps[~odd], x[~odd]
+        period = float(np.median(np.diff(stamps)))
+        ends = self._ends(stamps, x, period)
+        recorded = [(self._commands(segment, signal, samples, clock, period),
+                     self._measured(segment, signal, clock)) for signal in self.inputs]
+        for rows in np.split(np.arange(len(stamps)), ends):
+            times = stamps[rows]
+            applied = [self._applied(signal.name, *both, times, period)
+                       for signal, both in zip(self.inputs, recorded, strict=True)]
+            known = times >= max(start for start, _ in map(applied_inputs.span, applied))
+            within = times <= min(end for _, end in map(applied_inputs.span, applied))
+            dropped['before the first input'] += n_x * int(np.sum(~known))
+            dropped['after the last input'] += n_x * int(np.sum(~within))
+            rows = rows[known & within]
+            if len(rows) < _SHORTEST:
+                dropped[f'in a segment of fewer than {_SHORTEST}'] += n_x * len(rows)
+                continue
+            yield self._episode(stamps[rows], x[rows], applied)
+
+    def _ends(self, stamps: Times, x: Array, period: float) -> NDArray[np.int64]:
+        """Return where episodes end, at gaps and jumps, and note these."""
+        jump = self._leaps(x)[1]
+        gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
+        ends = np.flatnonzero(gap | jump.any(axis=1))
+        for end in ends.tolist():
+            at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
+            if gap[end]:
+                seconds = (stamps[end] - stamps[end - 1]) / NANOSECONDS
+                self.breaks.add('gap', f'{seconds:.3f} s {at}', seconds)
+            else:
+                j = int(np.argmax(jump[end]))
+                level = self._named(j, f'{x[end, j]:.6g} {self.states[j].place.unit}')
+                self.breaks.add('jump', f'{level} {at}', float(x[end, j]))
+        return ends
+
+    def _episode(self, stamps: Times, x: Array, applied: Sequence[Applied]) -> Episode:
+        """Return measurements with their applied inputs, in the signals' units."""
+        origin = stamps[0]
+        changes = np.unique(np.concatenate([times for times, _, _ in applied]))
+        changes = changes[changes >= max(times[0] for times, _, _ in applied)]
+        u = np.column_stack([
+            np.interp(changes - origin, times - origin, values) if linear
+            else values[np.searchsorted(times, changes, side='right') - 1]
+            for times, values, linear in applied])
+        scaled = [self.scales[signal.place](x[:, j]) for j, signal in enumerate(self.states)]
+        linear = tuple(linear for _, _, linear in applied)
+        return Episode((stamps - origin) / NANOSECONDS, np.column_stack(scaled),
+                       (changes - origin) / NANOSECONDS, u,
+                       linear if any(linear) else ()).part(0, len(stamps))
+
+    def _named(self, j: int, what: str) -> str:
+        return named(self.states, self.states[j], what)
+
+    def _leaps(self, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return where each state (N, n_x) has a spike, and where it jumps."""
+        found = [spikes_and_jumps(x[:, j], least / self.scales[signal.place].factor)
+                 for j, (signal, least) in enumerate(
+                     zip(self.states, self.least_jumps, strict=True))]
+        spikes, jumps = zip(*found, strict=True)
+        return np.column_stack(spikes), np.column_stack(jumps)
+
+    def _commands(self, segment: Segment, signal: RecordedInput, samples: Samples, clock: Clock,
+                  period: float) -> tuple[Times, Array]:
+        """Return the times at which commands began to act, and these, in the signal's unit."""
+        times, values = applied_inputs.commanded(segment.of(signal.command), clock,
+                                                 samples.received, period)
+        if signal.command in segment.applied:
+            # of one time that of this portion counts
+            earlier = segment.applied[signal.command]
+            times, values = applied_inputs.last_per_timestamp(
+                np.concatenate((earlier[0], times)), np.concatenate((earlier[1], values)))
+        delay_ns = round(signal.delay * NANOSECONDS)
+        if segment.until_ns is not None:
+            end = segment.until_ns - delay_ns
+            first = max(0, int(np.searchsorted(times, end, side='right')) - 1)
+            segment.applied[signal.command] = times[first:], values[first:]
+        times, values = applied_inputs.changes(times, values)
+        return times + delay_ns, self.scales[signal.command](values)
+
+    def _measured(self, segment: Segment, signal: RecordedInput, clock: Clock
+                  ) -> tuple[Times, Array]:
+        """Return times and values of a measured input, in the signal's unit."""
+        if signal.measured is None:
+            return np.empty(0, dtype=np.int64), np.empty(0)
+        found = clock.on(segment.of(signal.measured), 0).first_of_each()
+        return found.stamp_ns, self.scales[signal.measured](found.values)
+
+    def _applied(self, name: str, commands: tuple[Times, Array], measured: tuple[Times, Array],
+                 stamps: Times, period: float) -> Applied:
+        """Return the applied input over the time of some measurements."""
+        usual = float(np.median(np.diff(measured[0]))) if len(measured[0]) > 1 else 0.0
+        reach = _GAP_PERIODS * max(period, usual)
+        near = (measured[0] >= stamps[0] - reach) & (measured[0] <= stamps[-1] + reach)
+        times, values = measured[0][near], measured[1][near]
+        if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
+                or np.max(np.diff(times)) > reach):
+            if len(measured[0]):
+                self._note(f'{name} was not measured throughout, and is taken from its command '
+                           'there')
+            return *applied_inputs.around(*commands, stamps), False
+        for held in (commands[1], np.clip(commands[1], values.min(), values.max())):
+            if applied_inputs.follows_command(commands[0], held, times, values):
+                return *applied_inputs.around(commands[0], held, stamps), False
+        self._note(f'{name} is taken as it was measured')
+        return times, values, True
+
+    def _note(self, words: str) -> None:
+        self.notes[f'{self.bag}: {words}'] = None

@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The signals to import from bags, and the account of an import."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from koopman_ros.core.message_fields import Place
+
+# The reason for the end of an episode, for the first and for the largest of several.
+_ENDS = {'set back': ('time was set back by {}', 'at most by {}'),
+         'gap': ('gap of {}', 'the longest of {}'),
+         'jump': ('jump to {}', 'the highest to {}')}
+
+
+@dataclass(frozen=True)
+class RecordedState:
+    """A measured state in bags."""
+
+    name: str  #: of the signal
+    unit: str  #: in the episodes
+    place: Place  #: where its measurements are
+
+
+@dataclass(frozen=True)
+class RecordedInput:
+    """An input in bags."""
+
+    name: str  #: of the signal
+    unit: str  #: in the episodes
+    command: Place  #: where it is commanded
+    measured: Place | None = None  #: where it is measured behind its actuator, if it is
+    delay: float = 0.0  #: dead time of the actuator, after which a command begins to act, in s
+
+
+@dataclass
+class Account:
+    """The result of an import in numbers and notes."""
+
+    measurements: int = 0  #: number of measurements read, of all states
+    used: int = 0  #: number of those in an episode
+    dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
+    notes: list[str] = field(default_factory=list)  #: anything else, in sentences
+
+    def add(self, other: 'Account') -> None:
+        """Take in that of other bags."""
+        self.measurements += other.measurements
+        self.used += other.used
+        self.dropped += other.dropped
+        self.notes += other.notes
+
+    def lines(self) -> list[str]:
+        """Return the account in words."""
+        return [f'{self.used} of {self.measurements} measurements used',
+                *(f'{count} dropped: {why}' for why, count in sorted(self.dropped.items())),
+                *self.notes]
+
+
+def places_of(signal: RecordedState | RecordedInput) -> list[Place]:
+    """Return the places of a signal."""
+    if isinstance(signal, RecordedState):
+        return [signal.place]
+    return [signal.command] if signal.measured is None else [signal.command, signal.measured]
+
+
+@dataclass
+class EpisodeBreaks:
+    """The ends of episodes in a bag by reason: how often, the first and the largest."""
+
+    _found: dict[str, tuple[int, str, str, float]] = field(default_factory=dict)
+
+    def add(self, kind: str, words: str, amount: float) -> None:
+        """Take one in, with its amount in words."""
+        count, first, largest, most = self._found.get(kind, (0, words, words, amount))
+        self._found[kind] = (count + 1, first, *((words, amount) if amount > most
+                                                 else (largest, most)))
+
+    def notes(self, bag: str) -> Iterator[str]:
+        """Yield one sentence for each kind, however often it happened."""
+        for kind, (words, most) in _ENDS.items():
+            if kind not in self._found:
+                continue
+            count, first, largest, _ = self._found[kind]
+            happened = f'{bag}: {words.format(first)}'
+            yield f'{happened}, a new episode begins' if count == 1 else (
+                f'{happened}, the first of {count}, {most.format(largest)}; a new episode begins '
+                'at each')

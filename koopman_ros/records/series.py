@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recorded signals: a number in each message of a topic, and where they jump."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.core.message_fields import CARRIERS, Place
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.records.decoding import BagMessage
+from koopman_ros.records.mcap_file import BagReadError, reason
+from koopman_ros.records.reader import BagSummary, read_messages, summary
+
+_MOST_NS = 2**63
+# Fewer samples do not tell what is usual.
+_ENOUGH = 50
+# A change is no motion when it is larger than so many times all but the largest changes, ...
+_TIMES_USUAL = 10.0
+_USUAL = 90.0  # percentile
+# ... and than this share of the range in which it mostly is.
+_SHARE_OF_RANGE = 0.2
+_MOSTLY = (1.0, 99.0)  # percentiles
+
+
+@dataclass(frozen=True)
+class Series:
+    """A signal as arrays of one length n, in the order of recording."""
+
+    stamp_ns: NDArray[np.int64]  #: (n,) the header's stamp [ns], of receipt where there is none
+    values: NDArray[np.float64]  #: (n,) the numbers
+    unit: str  #: of the numbers
+
+
+def read_series(path: str | os.PathLike[str], place: Place | str, *, recover: bool = False
+                ) -> Series:
+    """
+    Return a signal of a bag as arrays; `recover` is that of `read_messages`.
+
+    :param place: of the number, or the name of its topic where the type alone tells field and
+        unit, as a temperature does. Messages without the number are left out.
+    :raises BagReadError: as `read_messages` does, and for a topic that the bag does not hold or
+        that is of another type.
+    """
+    topic = place if isinstance(place, str) else place.topic
+    # first, for what it says of a bag that is none
+    messages = read_messages(path, [topic], recover=recover)
+    content = summary(path)
+    if isinstance(place, str):
+        place = _usual(path, content, place)
+    check_places(path, content, [place])
+    found = [(entry, stamped_number(path, entry, place)) for entry in messages]
+    numbers = [(entry.log_time_ns if stamp is None else stamp, value)
+               for entry, (stamp, value) in found if value is not None]
+    return Series(np.array([stamp for stamp, _ in numbers], dtype=np.int64),
+                  np.array([value for _, value in numbers], dtype=np.float64), place.unit)
+
+
+def _usual(path: str | os.PathLike[str], content: BagSummary, topic: str) -> Place:
+    """Return where the number is in messages of a topic whose type tells it."""
+    known = {name: row for name, row in CARRIERS.items() if row.unit}
+    kind = content.types.get(topic, next(iter(known)))
+    if kind not in known:
+        raise _other_type(path, topic, kind, ' or '.join(known))
+    return Place(topic, kind, known[kind].field, known[kind].unit)
+
+
+def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iterable[Place]
+                 ) -> None:
+    """Raise BagReadError for a topic that a bag does not hold, or that is of another type."""
+    for place in places:
+        if place.topic not in content.types:
+            known = ', '.join(sorted(content.types)) or 'no topic at all'
+            raise BagReadError(f'bag {os.fspath(path)!r} has no topic {place.topic!r}, it has '
+                               f'{known}: name the right topics, or record them')
+        if content.types[place.topic] != place.type:
+            raise _other_type(path, place.topic, content.types[place.topic], place.type)
+
+
+def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Place
+                   ) -> tuple[int | None, float | None]:
+    """
+    Return stamp [ns] and number of a message: None where its type has none, or an array lacks it.
+
+    :raises BagReadError: for a message of another type, or one that is laid out differently.
+    """
+    if entry.type_name != place.type:
+        raise _other_type(path, entry.topic, entry.type_name, place.type)
+    try:
+        header = getattr(entry.message, 'header', None)
+        stamp_ns = None if header is None else (
+            NANOSECONDS * header.stamp.sec + header.stamp.nanosec)
+        if stamp_ns is not None and not -_MOST_NS < stamp_ns < _MOST_NS:
+            raise OverflowError(f'a stamp of {stamp_ns} ns')
+        try:
+            return stamp_ns, place.get(entry.message)
+        except LookupError:
+            # an array may be shorter at times, or name other elements
+            if '[' not in place.field:
+                raise
+            return stamp_ns, None
+    except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
+        raise BagReadError(
+            f'topic {entry.topic!r} of bag {os.fspath(path)!r} calls itself {entry.type_name} and '
+            f'is laid out differently ({reason(error)}): read it with read_messages') from error
+
+
+def _other_type(path: str | os.PathLike[str], topic: str, found: str, wanted: str) -> BagReadError:
+    return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not {wanted}: '
+                        'name another topic, or its type')
+
+
+def spikes_and_jumps(values: NDArray[np.float64], least: float = 0.0
+                     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Find changes that no plant makes: samples that leap away and back, and jumps to another level.
+
+    :param values: (n,) in the order of their times.
+    :param least: no smaller change is one of them.
+    :return: whether each sample is a spike (n,), and whether the signal jumps to it (n,).
+    """
+    spike, jump = np.zeros(len(values), dtype=bool), np.zeros(len(values), dtype=bool)
+    if len(values) < _ENOUGH:
+        return spike, jump
+    change = np.diff(values)
+    low, high = np.percentile(values, _MOSTLY)
+    limit = max(_TIMES_USUAL * float(np.percentile(np.abs(change), _USUAL)),
+                _SHARE_OF_RANGE * float(high - low), least)
+    large = np.abs(change) > limit
+    spike[1:-1] = large[:-1] & large[1:] & (
+        np.signbit(change[:-1]) != np.signbit(change[1:]))
+    # two changes belong to each spike
+    jump[1:] = large & ~spike[1:] & ~spike[:-1]
+    return spike, jump

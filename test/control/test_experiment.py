@@ -1,0 +1,270 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The identification experiment without a plant: its steps, its limits, and every way it ends."""
+
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from koopman_ros.control import experiment
+from koopman_ros.control.experiment import (
+    advance,
+    begin,
+    end,
+    Experiment,
+    level,
+    Phase,
+    TrackingMonitor,
+)
+from koopman_ros.core.status import Words
+from koopman_ros.core.units import Displays
+from koopman_ros.core.units import NANOSECONDS as SECOND
+from support.closed_loops import say
+
+START = 1_785_000_000 * SECOND
+PLAN = Experiment(
+    duration=600.0, names=('coolant',), lower=np.array([282.0]), upper=np.array([300.0]),
+    rate=np.array([1.0]), home=np.array([292.0]), hold_shortest=20.0, hold_longest=50.0,
+    measured=('temperature',), measured_lower=np.array([305.0]), measured_upper=np.array([327.0]),
+    seed=3)
+INSIDE = np.array([315.0])  # K
+# a jacket and a valve, which takes 40 s from end to end; any pressure below 9e5 will do
+PAIR = replace(
+    PLAN, names=('coolant', 'valve'), lower=np.array([282.0, 0.1]), upper=np.array([300.0, 0.9]),
+    rate=np.array([1.0, 0.02]), home=np.array([292.0, 0.3]), hold_shortest=45.0, hold_longest=80.0,
+    measured=('temperature', 'pressure'), measured_lower=np.array([305.0, -math.inf]),
+    measured_upper=np.array([327.0, 9e5]))
+PAIR_INSIDE = np.array([315.0, 2e5])
+# a set-point under control, which was none of the levels before
+SETPOINT = replace(
+    PLAN, names=('temperature',), lower=np.array([316.0]), upper=np.array([324.0]),
+    rate=np.array([0.5]), home=np.array([314.0]), seed=7)
+
+
+def run(plan: Experiment = PLAN, seconds: int = 700, measured: np.ndarray = INSIDE
+        ) -> list[experiment.Progress]:
+    """Measure once a second, from the start on."""
+    history = [begin(plan, START)]
+    for k in range(1, seconds + 1):
+        history.append(advance(plan, history[-1], measured, START + k * SECOND))
+    return history
+
+
+def test_steps_cover_the_duration_within_their_limits() -> None:
+    plan = replace(PLAN, duration=3e5)
+    (ends, levels), = plan.steps
+    holds = np.diff(ends, prepend=0.0)
+    assert len(ends) == len(levels) > 8000
+    assert ends[-2] < plan.duration <= ends[-1]
+    assert 20.0 <= holds.min() < 20.1 < 49.9 < holds.max() <= 50.0
+    assert 282.0 <= levels.min() < 282.1 < 299.9 < levels.max() <= 300.0
+    # uniform: mean and standard deviation, within four standard errors
+    assert levels.mean() == pytest.approx(291.0, abs=4.0 * 5.2 / math.sqrt(len(levels)))
+    assert levels.std() == pytest.approx(18.0 / math.sqrt(12.0), rel=0.03)
+    assert holds.mean() == pytest.approx(35.0, abs=4.0 * 8.7 / math.sqrt(len(holds)))
+    assert abs(np.corrcoef(levels[1:], levels[:-1])[0, 1]) < 0.05
+    (ends, _), = replace(PLAN, hold_shortest=30.0, hold_longest=30.0).steps
+    np.testing.assert_allclose(ends, 30.0 * np.arange(1, 21))
+
+
+def test_steps_begin_at_the_present_values() -> None:
+    start = np.array([281.0, 0.75])
+    progress = begin(PAIR, START, start)
+    np.testing.assert_array_equal(progress.command, start)
+    for k in range(1, 60):
+        before, progress = progress, advance(PAIR, progress, PAIR_INSIDE, START + k * SECOND)
+        assert (abs(progress.command - before.command) <= PAIR.rate * (1.0 + 1e-9)).all()
+    assert progress.command[0] > 281.0
+
+
+def test_a_seed_gives_the_same_steps_and_another_seed_others() -> None:
+    again, other = replace(PLAN), replace(PLAN, seed=4)
+    np.testing.assert_array_equal(PLAN.steps, again.steps)
+    assert not np.array_equal(PLAN.steps[0][1][:5], other.steps[0][1][:5])
+    np.testing.assert_array_equal([progress.command for progress in run()],
+                                  [progress.command for progress in run(again)])
+
+
+def test_steps_of_a_single_input_stay_those_of_its_seed() -> None:
+    (ends, levels), = PLAN.steps
+    assert ends[:3].tolist() == [22.56947501430873, 49.67379021219172, 93.71202416838362]
+    assert levels[:3].tolist() == [283.63534884307666, 293.8890012137021, 298.76634938534437]
+
+
+def test_each_signal_has_steps_of_its_own_and_a_further_one_leaves_them() -> None:
+    plan = replace(PAIR, duration=2e5)
+    (ends, levels), (other_ends, other_levels) = plan.steps
+    alone, = replace(PLAN, duration=2e5, hold_shortest=45.0, hold_longest=80.0).steps
+    np.testing.assert_array_equal(alone, (ends, levels))
+    assert not np.isin(ends, other_ends).any()
+    assert 0.1 <= other_levels.min() < 0.101 < 0.899 < other_levels.max() <= 0.9
+    # further apart than the longest hold, so that each step counts once at most
+    times = np.arange(0.0, plan.duration, 100.0)
+    both = [values[np.searchsorted(until, times, side='right')]
+            for until, values in plan.steps]
+    # independent: within four standard errors
+    assert abs(np.corrcoef(both)[0, 1]) < 4.0 / math.sqrt(len(times))
+
+
+@pytest.mark.parametrize(('plan', 'measured'), [
+    (PLAN, INSIDE), (PAIR, PAIR_INSIDE), (SETPOINT, INSIDE)], ids=['input', 'inputs', 'setpoint'])
+def test_each_level_is_reached_along_its_rate_and_home_at_the_end(
+        plan: Experiment, measured: np.ndarray) -> None:
+    history = run(plan, measured=measured)
+    commands = np.array([progress.command for progress in history])
+    for j, (ends, levels) in enumerate(plan.steps):
+        # a whole range takes less time than the shortest hold
+        for reached, wanted in zip(ends[:-1], levels[:-1], strict=True):
+            before = history[math.ceil(reached) - 1]
+            assert before.command[j] == level(plan, before)[j] == wanted
+    np.testing.assert_array_equal(commands[0], plan.home)
+    assert np.all(commands >= np.minimum(plan.lower, plan.home))
+    assert np.all(commands <= plan.upper)
+    np.testing.assert_allclose(np.abs(np.diff(commands, axis=0)).max(axis=0), plan.rate,
+                               rtol=1e-9)
+    assert {progress.phase for progress in history[:600]} == {Phase.RUNNING}
+    assert {progress.phase for progress in history[600:]} == {Phase.FINISHED}
+    np.testing.assert_array_equal(commands[640:], np.tile(plan.home, (61, 1)))
+
+
+@pytest.mark.parametrize(('measured', 'words'), [
+    ((304.99, 2e5), 'the temperature 304.99 K is outside the bounds of the experiment, 305 K to '
+     '327 K'),
+    ((305.0, 9e5), None),
+    ((327.0, -1e9), None),
+    ((327.01, 2e5), 'the temperature 327.01 K is outside the bounds'),
+    ((315.0, 900001.0), 'the pressure 900001 Pa is outside the bounds of the experiment, -inf Pa '
+     'to 900000 Pa'),
+    ((math.nan, 2e5), 'the measured temperature is nan, not finite: check the sensor'),
+    ((315.0, -math.inf), 'the measured pressure is -inf, not finite'),
+])
+def test_a_bad_measurement_aborts_and_refuses_a_start(
+        measured: tuple[float, float], words: str | None) -> None:
+    y = np.array(measured)
+    write = Words(Displays({'temperature': 'K', 'pressure': 'Pa'}))
+    # a stamp heard before moves nothing, but what it carries counts
+    for time_ns in (START + SECOND, START):
+        after = advance(PAIR, begin(PAIR, START), y, time_ns)
+        assert (PAIR.refusal(y) is None) == (words is None)
+        assert after.phase is (Phase.RUNNING if words is None else Phase.ABORTED)
+        if words is not None:
+            assert words in write(PAIR.refusal(y))
+            assert words in write(after.reason)
+
+
+def test_a_measurement_of_another_number_of_signals_is_refused() -> None:
+    with pytest.raises(ValueError, match='shorter'):
+        PAIR.refusal(INSIDE)
+
+
+@pytest.mark.parametrize(('bad', 'last'), [((400.0, 2e5), (299.5, 0.4)),
+                                           ((315.0, 1e6), (291.0, 0.2))])
+def test_aborted_signals_return_each_at_its_rate(
+        bad: tuple[float, float], last: tuple[float, float]) -> None:
+    progress = replace(run(PAIR, 300, PAIR_INSIDE)[-1], command=np.array(last))
+    home, rate, start = PAIR.home, PAIR.rate, np.array(last)
+    for k in range(1, 20):
+        # back inside, they go home all the same
+        progress = advance(PAIR, progress, np.array(bad) if k == 1 else PAIR_INSIDE,
+                           START + (300 + k) * SECOND)
+        left = np.maximum(np.abs(start - home) - k * rate, 0.0)
+        np.testing.assert_allclose(progress.command, home + np.sign(start - home) * left,
+                                   rtol=0.0, atol=1e-12)
+    assert progress.phase is Phase.ABORTED
+
+
+def test_aborted_input_returns_along_the_rate_limit_and_stays() -> None:
+    progress = replace(run(seconds=300)[-1], command=np.array([299.5]))
+    commands = []
+    for k in range(301, 330):
+        # back inside, it goes on to the safe input all the same
+        progress = advance(PLAN, progress, INSIDE + 13.0 if k == 301 else INSIDE,
+                           START + k * SECOND)
+        commands.append(progress.command[0])
+    assert commands[:8] == [298.5, 297.5, 296.5, 295.5, 294.5, 293.5, 292.5, 292.0]
+    assert set(commands[8:]) == {292.0}
+    assert progress.phase is Phase.ABORTED
+
+
+def test_ended_input_returns_and_the_first_end_counts() -> None:
+    progress = end(run(seconds=300)[-1], Phase.ENDED)
+    progress = end(progress, Phase.ABORTED, 'too late')
+    assert (progress.phase, progress.reason) == (Phase.ENDED, None)
+    assert level(PLAN, progress) == 292.0
+    for k in range(301, 320):
+        progress = advance(PLAN, progress, np.array([400.0]), START + k * SECOND)
+    assert (progress.phase, progress.command) == (Phase.ENDED, 292.0)
+
+
+def test_input_returns_without_measurements() -> None:
+    progress = replace(run(seconds=300)[-1], command=np.array([285.0]))
+    progress = end(progress, Phase.ABORTED, 'silence')
+    for k in range(100):
+        progress = advance(PLAN, progress, None, START + 300 * SECOND + k * SECOND // 10)
+    assert progress.command == 292.0
+
+
+def test_a_stamp_that_is_not_later_moves_nothing_and_time_that_goes_back_aborts() -> None:
+    progress = run(PAIR, 10, PAIR_INSIDE)[-1]
+    for time_ns in (progress.time_ns, progress.time_ns - SECOND):
+        assert advance(PAIR, progress, PAIR_INSIDE, time_ns) is progress
+    progress = advance(PAIR, progress, PAIR_INSIDE, START)
+    assert progress.phase is Phase.ABORTED
+    assert 'went back' in say(progress.reason)
+    # time starts afresh for the way home
+    progress = advance(PAIR, replace(progress, command=np.array([299.0, 0.9])), PAIR_INSIDE,
+                       START + SECOND)
+    np.testing.assert_allclose(progress.command, [298.0, 0.88], rtol=1e-12)
+
+
+def test_a_gap_counts_as_twice_the_interval_before() -> None:
+    before = replace(run(PAIR, 10, PAIR_INSIDE)[-1], command=np.array([282.0, 0.1]),
+                     phase=Phase.FINISHED)
+    after = advance(PAIR, before, PAIR_INSIDE, before.time_ns + 60 * SECOND)
+    np.testing.assert_allclose(after.command, [284.0, 0.14], rtol=1e-12)
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    ({'lower': np.array([282.0, 0.9])}, 'valve: lower = 0.9 must be below upper = 0.9'),
+    ({'measured_upper': np.array([300.0, 9e5])},
+     'temperature: lower = 305.0 must be below upper = 300.0'),
+    ({'measured_upper': np.array([327.0, math.nan])}, 'measured_upper must be finite: entry .1.'),
+    ({'upper': np.array([300.0])}, r'incompatible upper: expected \(2,\), got \(1,\)'),
+    ({'measured': ('temperature',)}, r'incompatible measured_lower: expected \(1,\)'),
+    ({'home': np.array([292.0, math.inf])}, 'home must be finite: entry .1. is inf'),
+    ({'hold_longest': 10.0}, 'not above hold_longest = 10.0 s'),
+    ({'hold_shortest': 0.0}, 'hold_shortest = 0.0 s must be above 0'),
+    ({'duration': math.inf}, 'duration = inf s must be finite and above 0'),
+    ({'rate': np.array([1.0, 0.0])}, 'valve: rate = 0.0 must be above 0'),
+])
+def test_contradicting_limits_are_refused(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        replace(PAIR, **change)
+
+
+# What a controller commands, or which set-point it tracks, and what was asked for, in ranges of
+# three sizes; and how often it deviated.
+@pytest.mark.parametrize('span', [18.0, 1.8e-3, 1.8e6])
+@pytest.mark.parametrize(('heard', 'asked', 'deviations'), [
+    ([292.0, 292.0, 292.0], [292.0, 292.0, 292.0], 0),
+    ([292.01, 291.99, 292.01], [292.0, 292.0, 292.0], 0),  # within a thousandth of the range
+    ([292.1, 291.9, 292.1], [292.0, 292.0, 292.0], 2),
+    ([292.0, 292.1, 292.2], [300.0, 300.0, 300.0], 0),  # at a slower rate
+    ([292.0, 293.0, 294.0], [293.0, 294.0, 295.0], 0),  # a sample late
+    ([290.0] * 6, [292.0] * 6, 5),
+    ([295.0, 296.0, 297.0, 298.0, 299.0, 300.0], [292.0] * 6, 5),
+    ([290.0 + 1e-5 * k for k in range(6)], [292.0] * 6, 5),  # settles by itself
+])
+def test_controller_that_comes_nearer_follows(
+        heard: list[float], asked: list[float], deviations: int, span: float) -> None:
+    monitor, unit = TrackingMonitor(span), span / 18.0
+    for now, (command, wanted) in enumerate(zip(heard, asked, strict=True)):
+        monitor = monitor.after(command * unit, wanted * unit, float(now))
+    assert monitor.deviations == deviations
+    if deviations:
+        assert monitor.since == 1.0
+        assert monitor.after(292.0, 292.0, 9.0) == TrackingMonitor(span, 292.0, 0, 9.0)

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Numbers in messages: found and written by path."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from koopman_ros.core.message_fields import Place, place, stem
+from koopman_ros.parameters.signal_topics import named_units, Signals
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import trainer_signals, trainer_table
+
+
+def joints() -> SimpleNamespace:
+    return SimpleNamespace(name=['arm', 'level [m]'], position=[1.0, 2.0], velocity=[3.0, 4.0])
+
+
+@pytest.mark.parametrize(('field', 'value'), [
+    ('position[arm]', 1.0), ('velocity[1]', 4.0), ('position[level [m]]', 2.0)])
+def test_number_is_found_by_path(field, value):
+    assert Place('joints', 'sensor_msgs/msg/JointState', field, 'rad').get(joints()) == value
+
+
+def test_path_goes_down_into_a_message():
+    message = SimpleNamespace(twist=SimpleNamespace(linear=SimpleNamespace(x=0.5)))
+    found = Place('speed', 'geometry_msgs/msg/TwistStamped', 'twist.linear.x', 'm/s')
+    assert found.get(message) == 0.5
+    found.put(message, 0.25)
+    assert message.twist.linear.x == 0.25
+
+
+@pytest.mark.parametrize('field', ['position[leg]', 'effort[arm]', 'position[7]', 'name[0]'])
+def test_what_is_not_there_is_named(field):
+    with pytest.raises(LookupError, match=field.replace('[', r'\[')):
+        Place('joints', 'sensor_msgs/msg/JointState', field, 'rad').get(joints())
+
+
+@pytest.mark.parametrize('field', ['', '.x', 'x.', 'a b', 'data[', 'data[]', 'x..y', '3'])
+def test_field_that_is_no_path_is_refused(field):
+    with pytest.raises(ValueError, match='no path'):
+        Place('t', 'std_msgs/msg/Float64', field, '1')
+
+
+def test_arrays_and_names_grow_with_what_is_written():
+    message = SimpleNamespace(name=[], effort=[])
+    for name, value in (('left', 1.0), ('right', 2.0), ('left', 3.0)):
+        Place('motors', 'sensor_msgs/msg/JointState', f'effort[{name}]', 'N m').put(message, value)
+    assert (message.name, message.effort) == (['left', 'right'], [3.0, 2.0])
+    array = SimpleNamespace(data=[])
+    Place('out', 'std_msgs/msg/Float64MultiArray', 'data[1]', '1').put(array, 5.0)
+    assert array.data[1] == 5.0
+    assert len(array.data) == 2
+
+
+@pytest.mark.parametrize(('unit', 'given', 'expected'), [
+    ('K', {}, ('sensor_msgs/msg/Temperature', 'temperature', 'degC')),
+    ('Pa', {}, ('sensor_msgs/msg/FluidPressure', 'fluid_pressure', 'Pa')),
+    ('rad/s', {}, ('sensor_msgs/msg/JointState', 'velocity[s]', 'rad/s')),
+    ('m', {}, ('sensor_msgs/msg/JointState', 'position[s]', 'm')),
+    ('m', {'type': 'sensor_msgs/msg/Range'}, ('sensor_msgs/msg/Range', 'range', 'm')),
+    ('K', {'type': 'std_msgs/msg/Float64', 'unit': 'K'}, ('std_msgs/msg/Float64', 'data', 'K')),
+])
+def test_rest_of_a_place_follows_from_what_is_said(unit, given, expected):
+    found = place('s', 's', unit, given)
+    assert (found.topic, (found.type, found.field, found.unit)) == ('s', expected)
+
+
+def test_commands_are_named_after_what_is_commanded():
+    assert stem('coolant_temperature', 'K') == 'coolant'
+    assert stem('flow', 'm^3/s') == 'flow'
+
+
+def test_signals_have_names_of_topics_and_units_that_there_are():
+    with pytest.raises(ConfigurationError, match="'my level' is a signal, which topics"):
+        Signals({'my level': 'm'}, {})
+    with pytest.raises(ConfigurationError, match=r"'level \[Metre\]': there is no unit 'Metre'"):
+        named_units(['level [Metre]'])
+    assert named_units(['level [m]', 'flow [L/min]']) == {'level': 'm', 'flow': 'L/min'}
+
+
+def test_bounds_of_an_experiment_are_asked_for_by_name():
+    given = {'system': '', 'states_measured': ('level [m]', 'oven [K]'),
+             'inputs_commanded': ('flow [L/min]',), 'controlled': ('level',)}
+    table, signals = trainer_table(None, given), trainer_signals(None, given)
+    bounds = {'level.experiment_max': 2.0, 'oven.experiment_min': 20.0,
+              'oven.experiment_max': 90.0}
+    values = table.snapshot(bounds)
+    # a trainer that only records needs none
+    assert table.check(values) == ''
+    with pytest.raises(ValueError, match=(
+            r'give flow.experiment_min \[L/min\], flow.experiment_max \[L/min\], '
+            r'level.experiment_min \[m\]$')):
+        values.experiment(signals)
+    given = bounds | {'flow.experiment_max': 8.0, 'level.experiment_min': 0.1}
+    assert table.snapshot(given).experiment(signals).measured_lower.tolist() == [0.1, 293.15]
+    with pytest.raises(ValueError, match=r'level.setpoint_min \[m\], level.setpoint_max \[m\]$'):
+        table.snapshot(given).experiment(signals, np.array([1.0]))
+
+
+def test_trainer_that_knows_no_signals_says_how_to_name_them():
+    with pytest.raises(ConfigurationError, match=r"system 'oven': give .* like \['level \[m\]'\]"):
+        trainer_table(None, {'system': 'oven'})
+
+
+def test_type_without_a_usual_field_wants_one():
+    with pytest.raises(ValueError, match='where the number is in a geometry_msgs/msg/Twist is not '
+                                         'known: name its field'):
+        place('s', 's', 'm/s', {'type': 'geometry_msgs/msg/Twist'})
+    said = {'type': 'geometry_msgs/msg/Twist', 'field': 'linear.x'}
+    assert place('s', 's', 'm/s', said).unit == 'm/s'

@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pages, figures and pictures: their text, what JSON cannot hold, and what an error leaves."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import koopman_ros
+from koopman_ros.core import plots
+
+
+def test_a_table_in_markdown():
+    head = 'case', 'error [K]'
+    assert plots.table(head, [('bias', 0.5), ('a|b', '1')], numbers=(1,)) == (
+        '| case | error [K] |\n|---|---:|\n| bias | 0.5 |\n| a\\|b | 1 |')
+    with pytest.raises(ValueError, match='a row of 1 cells in a table of 2 columns'):
+        plots.table(head, [('bias',)])
+
+
+def test_a_page_names_versions_and_machine_and_leaves_out_what_is_empty(tmp_path):
+    path = plots.write_page(tmp_path / 'new' / 'report.md', 'Title', [
+        'First.', '', plots.bullets([]), plots.bullets(['one', 'two']),
+        plots.Picture('a.png', 'Seen. In detail.')], ('numpy', 'not-installed'))
+    title, about, *sections = path.read_text().split('\n\n')
+    assert title == '# Title'
+    assert about.startswith(f'*koopman_ros {koopman_ros.__version__}, Python ')
+    assert f', numpy {np.__version__}; ' in about
+    assert 'not-installed' not in about
+    assert f'{plots.machine()["cpu_count"]} processors' in about
+    assert sections == ['First.', '- one\n- two', '![Seen](a.png)', '*Seen. In detail.*\n']
+
+
+def test_figures_hold_null_for_what_json_does_not_know(tmp_path):
+    path = plots.write_figures(tmp_path / 'new' / 'summary.json', {
+        'a': math.inf, 'b': [1, math.nan, {'c': (np.float64(-math.inf), True, None)}], 'd': 'NaN'})
+    # what cannot be written leaves the old ones
+    with pytest.raises(TypeError):
+        plots.write_figures(path, {'what': object()})
+    assert json.loads(path.read_text()) == {
+        'a': None, 'b': [1, None, {'c': [None, True, None]}], 'd': 'NaN'}
+    assert [file.name for file in path.parent.iterdir()] == ['summary.json']
+
+
+def test_a_drawing_is_written_when_its_block_ends_without_an_error(tmp_path):
+    path = tmp_path / 'new' / 'picture.png'
+    with pytest.raises(ZeroDivisionError), plots.drawing(path, size=(2.0, 2.0)):
+        raise ZeroDivisionError
+    with plots.drawing(path, 2, 1, size=(3.0, 3.0), sharex=True) as (figure, (upper, lower)):
+        upper.plot([0.0, 1.0], label='seen')
+        lower.plot([0.0, 1.0], label='seen')
+        plots.draw_limits(lower, (0.2, 0.8), 'limits')
+        plots.legend(figure, (upper, lower), 2)
+        assert not path.exists()
+    assert path.read_bytes().startswith(b'\x89PNG\r\n')
+    (shown,) = figure.legends
+    assert [text.get_text() for text in shown.get_texts()] == ['seen', 'limits']

@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""First steps of a program: the threads of its linear algebra."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+# In place of the main function of a program: the bits of an inverse, which depend on the number of
+# threads from some 100 rows on.
+LOOK = """
+import hashlib, sys, types
+from koopman_ros import process_entry
+
+def look():
+    import numpy as np
+    inverse = np.linalg.inv(np.random.default_rng(0).normal(size=(400, 400)))
+    print(hashlib.sha256(inverse.tobytes()).hexdigest())
+    return 0
+
+process_entry.importlib = types.SimpleNamespace(
+    import_module=lambda name: types.SimpleNamespace(main=look))
+process_entry.run_program(f'koopman_ros.nodes.{sys.argv[1]}', 130)
+"""
+NAMES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+
+
+def bits(program: str, threads: str) -> str:
+    environment = {name: text for name, text in os.environ.items() if name not in NAMES}
+    if threads:
+        environment |= dict.fromkeys(NAMES, threads)
+    return subprocess.run([sys.executable, '-c', LOOK, program], env=environment, check=True,
+                          capture_output=True, text=True, timeout=240).stdout
+
+
+@pytest.fixture(scope='module')
+def of_one_thread() -> str:
+    found = bits('controller', '1')
+    assert len(found) == 65
+    return found
+
+
+@pytest.mark.parametrize(('program', 'threads'), [('controller', ''), ('replay', '4')])
+def test_bits_of_a_program_do_not_depend_on_the_number_of_threads(
+        program: str, threads: str, of_one_thread: str) -> None:
+    """As it is by default, or set by the user."""
+    assert bits(program, threads) == of_one_thread
