@@ -225,7 +225,7 @@ def _run_in_lockstep(harness: Harness, name: str, seconds: float) -> float:
         Temperature, f'{_NAMESPACE}/{name}/{reactor.TEMPERATURE}',
         lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
     # without noise, a measurement at rest repeats itself as that of a frozen sensor
-    noise: dict[str, Any] = {f'{reactor.TEMPERATURE}.noise': _NOISE}
+    noise: dict[str, Any] = {f'{reactor.TEMPERATURE}.measurement_noise': _NOISE}
     with _start(harness, 'plant', f'{_NAMESPACE}/{name}', speed=0.0, lockstep=True,
                 duration=seconds, sample_period=1.0, lockstep_subscribers=2, **noise):
         harness.wait_until(lambda: len(arrivals) > round(seconds),

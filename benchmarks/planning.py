@@ -109,8 +109,8 @@ def _controller(case: PartialCase) -> Controller:
     """Return a controller that measures every state, its law alone on the shipped lift."""
     model = case.lift
     return Controller(model, case.tuning(
-        model, estimator='measured_state', noise=0.0, wander=0.0, initial_error=0.0,
-        levels=('mpc',), validity_margin=_MARGIN))
+        model, estimator='measured_state', measurement_noise=0.0, disturbance_noise=0.0,
+        initial_error=0.0, fallback_order=('mpc',), learned_model_margin=_MARGIN))
 
 
 def _course(case: PartialCase, controller: Controller, samples: int

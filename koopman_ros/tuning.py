@@ -52,10 +52,10 @@ class SensorLimits:
         name='max_rate', none=ANY)
     jump: Array = column(
         'measured', 0.0, 'Change between two measurements that noise alone may bring; 0: any.',
-        name='max_jump', none=ANY)
-    frozen_timeout: float = parameter(
+        name='max_step', none=ANY)
+    stuck_sensor_timeout: float = parameter(
         20.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
-        'than half of max_jump; 0: for ever.', 's', 0.0, 86400.0)
+        'than half of max_step; 0: for ever.', 's', 0.0, 86400.0)
 
 
 @dataclass(frozen=True)
@@ -81,42 +81,42 @@ class Tuning:
     setpoint_ramp: Array = column(
         'controlled', 0.0, 'Fastest change of the tracked set-point; 0: steps.', '{unit}/s',
         none=ANY)
-    setpoint_filter: float = parameter(
+    setpoint_filter_time: float = parameter(
         0.0, 'Time constant with which the tracked set-point follows its ramp; 0: none.', 's',
         0.0, 86400.0)
     estimator: str = parameter(
         '', 'State estimator: disturbance_observer or measured_state where all states are '
         'measured; extended_kalman_filter or unscented_kalman_filter; module:class for one of '
         'your own; empty: chosen by what is measured.', code=True)
-    disturbance_bandwidth: float = parameter(
+    observer_bandwidth: float = parameter(
         0.0, 'Bandwidth of the disturbance observer. Higher removes offsets sooner and passes '
         'more noise to the inputs. 0: no observer.', '1/s', 0.0, 1000.0)
     max_disturbance: Array = column(
         'inputs', 0.0, 'Largest estimated disturbance, as an equivalent change of this input; 0: '
         'any.', none=ANY)
-    tolerance: Array = column(
+    tracking_tolerance: Array = column(
         'inputs', UNBOUNDED, 'Deviation of the measured input from its command above which the '
         'estimator takes the measured one.')
-    noise: Array = column(
+    measurement_noise: Array = column(
         'measured', 0.0, 'Standard deviation of the measurement noise, for a Kalman filter; 0: '
         'that of the training record.')
-    wander: Array = column(
+    disturbance_noise: Array = column(
         'inputs', 0.0, 'Random walk of the input disturbance in a minute, as a standard '
         'deviation, for a Kalman filter; 0: derived from the model.')
     initial_error: Array = column(
         'states', 0.0, 'Standard deviation of the first estimate of this state, for a Kalman '
         'filter; 0: a fourth of the trained range.')
-    levels: tuple[str, ...] = parameter(
+    fallback_order: tuple[str, ...] = parameter(
         ('sdre', 'linear'), 'Control laws, the best first: mpc (model predictive), sdre '
         '(state-dependent Riccati equation), linear (LQR), pi; module:class for one of your own.',
         code=True)
-    validity_margin: float = parameter(
+    learned_model_margin: float = parameter(
         0.1, 'Distance outside the trained range, in half-ranges, up to which the nonlinear laws '
         'act; beyond it the linear one acts.', '', 0.0, UNBOUNDED)
-    linear_margin: float = parameter(
+    linear_model_margin: float = parameter(
         0.5, 'Distance outside the trained range, in half-ranges, up to which the laws linear and '
         'pi act; beyond it the safe inputs are commanded.', '', 0.0, UNBOUNDED)
-    safe: Array = value_column(
+    safe_value: Array = value_column(
         'inputs', 0.0, 'Safe value: commanded when no law can act; brought within min and max.')
     hold_timeout: float = parameter(
         60.0, 'Time without a usable measurement or law after which the safe inputs are '
@@ -124,7 +124,7 @@ class Tuning:
     recovery_time: float = parameter(
         10.0, 'Time for which a better law must have been possible before it acts again.', 's',
         0.0, 86400.0)
-    transfer_time: float = parameter(
+    bumpless_transfer_time: float = parameter(
         0.0, 'Time constant of the bumpless transfer between laws, models, tunings and modes.',
         's', 0.0, 86400.0)
     max_gain: float = parameter(
@@ -171,10 +171,11 @@ class Tuning:
             if not np.all(limits.lower < limits.upper):
                 raise ValueError(f'{kind} limits must be lower < upper, got '
                                  f'{limits.lower.tolist()} and {limits.upper.tolist()}')
-        if not np.all(np.isfinite(made.safe)):
-            raise ValueError(f'safe must be finite, got {made.safe.tolist()}')
-        if not made.levels or len(set(made.levels)) != len(made.levels):
-            raise ValueError(f'levels must be one law or more, each once, got {made.levels}')
+        if not np.all(np.isfinite(made.safe_value)):
+            raise ValueError(f'safe_value must be finite, got {made.safe_value.tolist()}')
+        if not made.fallback_order or len(set(made.fallback_order)) != len(made.fallback_order):
+            raise ValueError('fallback_order must be one law or more, each once, got '
+                             f'{made.fallback_order}')
         return made
 
     @classmethod
@@ -189,4 +190,5 @@ class Tuning:
         return cls(**{
             'state_weight': 1.0 / model.states.scale ** 2,
             'input_weight': 1.0 / inputs.scale ** 2,
-            'limits': InputLimits(inputs.lower, inputs.upper), 'safe': inputs.center, **given})
+            'limits': InputLimits(inputs.lower, inputs.upper),
+            'safe_value': inputs.center, **given})

@@ -87,10 +87,10 @@ def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = 
     n_y = 2 if informed else 1
     return Controller(model, Tuning.for_model(
         model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
-        controlled=('temperature',), transfer_time=0.0,
-        estimator='extended_kalman_filter', noise=np.array([1e-4, NOISE])[-n_y:],
-        wander=np.full(1, WANDER * np.sqrt(60.0)), initial_error=FIRST_GUESS,
-        levels=laws, validity_margin=MARGIN, linear_margin=MARGIN),
+        controlled=('temperature',), bumpless_transfer_time=0.0,
+        estimator='extended_kalman_filter', measurement_noise=np.array([1e-4, NOISE])[-n_y:],
+        disturbance_noise=np.full(1, WANDER * np.sqrt(60.0)), initial_error=FIRST_GUESS,
+        fallback_order=laws, learned_model_margin=MARGIN, linear_model_margin=MARGIN),
         None if informed else TEMPERATURE)
 
 

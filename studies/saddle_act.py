@@ -40,7 +40,7 @@ from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state
 from koopman_ros.ros.codec import stamp_nanoseconds
-from koopman_ros.ros.topics import CONTROLLER_STATE, LOOP_QOS
+from koopman_ros.ros.topics import CONTROLLER_INTERNALS, LOOP_QOS
 from koopman_ros.testing import HarnessError
 from studies.saddle import (
     becomes,
@@ -109,7 +109,7 @@ def run_seed(folder: Path, seed: int, speed: float) -> dict[str, float | bool]:
     save(names_and_ranges(), signals)
     bags = [folder / 'start_up.mcap', folder / 'recorded.mcap']
     scenario = Scenario({'temperature': SADDLE_TEMPERATURE}, _PLANT, step_time=0.0, duration=0.0,
-                        speed=speed, plant={'temperature.noise': NOISE, 'seed': seed},
+                        speed=speed, plant={'temperature.measurement_noise': NOISE, 'seed': seed},
                         controller=_controller_parameters(signals))
     rows: list[Row] = []
     estimates: dict[int, JointState] = {}
@@ -127,7 +127,7 @@ def run_seed(folder: Path, seed: int, speed: float) -> dict[str, float | bool]:
             estimates[stamp_nanoseconds(message.header.stamp)] = message
 
         operator.harness.node.create_subscription(
-            JointState, CONTROLLER_STATE, on_estimate, LOOP_QOS)
+            JointState, CONTROLLER_INTERNALS, on_estimate, LOOP_QOS)
         phases = _operate(operator, bags[1], learned)
     model = load(learned)
     run = _reconstructed(rows, estimates, model, phases)
@@ -146,17 +146,18 @@ def names_and_ranges() -> LiftedModel:
 
 def _controller_parameters(model: Path) -> dict[str, object]:
     return {
-        'system': 'none', 'model': model, 'levels': ['pi'], 'pi.temperature.gain': PI_GAIN,
+        'system': 'none', 'model': model, 'fallback_order': ['pi'], 'pi.temperature.gain': PI_GAIN,
         'pi.temperature.integral_time': PI_TIME, 'temperature.setpoint_ramp': RAMP,
-        'temperature.noise': NOISE, 'mpc.temperature.max': to_celsius(LIMIT_TEMPERATURE),
+        'temperature.measurement_noise': NOISE,
+        'mpc.temperature.max': to_celsius(LIMIT_TEMPERATURE),
         'coolant_temperature.min': to_celsius(float(WIDE.lower[0])),
         'coolant_temperature.max': to_celsius(float(WIDE.upper[0])),
         'coolant_temperature.rate_limit': float(WIDE.rate[0]),
-        'coolant_temperature.wander': WANDER * SECONDS_PER_MINUTE ** 0.5,
-        'coolant_temperature.safe': 5.0, 'temperature.weight': 1.0,
-        'coolant_temperature.weight': 1.0, 'validity_margin': MARGIN,
+        'coolant_temperature.disturbance_noise': WANDER * SECONDS_PER_MINUTE ** 0.5,
+        'coolant_temperature.safe_value': 5.0, 'temperature.weight': 1.0,
+        'coolant_temperature.weight': 1.0, 'learned_model_margin': MARGIN,
         # the PI law asks nothing of a model, wherever the plant is
-        'linear_margin': _ANYWHERE,
+        'linear_model_margin': _ANYWHERE,
         # names and ranges have no time constant that would say it
         'model_check_length': 100.0}
 
@@ -166,9 +167,9 @@ def _trainer_parameters(bag: Path, learned: Path, seed: int) -> dict[str, object
     return {
         'system': 'none', 'states_measured': ['temperature [K]'],
         'inputs_commanded': ['coolant_temperature [K]'], 'output': bag, 'model_output': learned,
-        'hidden_states': 1, 'model_coordinates': 5, 'training_starts': 1,
-        'experiment_on': SETPOINT, 'experiment_length': SECONDS_PER_MINUTE * MINUTES,
-        'experiment_shortest_hold': 30.0, 'experiment_longest_hold': 90.0,
+        'unmeasured_states': 1, 'lifted_dimension': 5, 'restarts': 1,
+        'experiment_signal': SETPOINT, 'experiment_length': SECONDS_PER_MINUTE * MINUTES,
+        'experiment_min_hold_time': 30.0, 'experiment_max_hold_time': 90.0,
         'experiment_seed': seed, 'temperature.setpoint_min': to_celsius(low),
         'temperature.setpoint_max': to_celsius(high),
         # where the PI law could not bring it back
@@ -188,7 +189,7 @@ def _operate(operator: Operator, bag: Path, learned: Path) -> list[tuple[str, fl
     operator.switch('trainer/experiment', False)
     operator.begin('training', 'a lift is learned from temperature and coolant')
     operator.train(learned, _TIMEOUT)
-    operator.set('controller', model=str(learned.resolve()), levels=list(LAWS),
+    operator.set('controller', model=str(learned.resolve()), fallback_order=list(LAWS),
               **{'temperature.setpoint_ramp': 0.0})
     operator.begin('lift', 'the lift has taken over')
     begin = operator.seconds
@@ -284,14 +285,14 @@ def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) 
 
     return Controller(model, Tuning.for_model(
         model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,
-        controlled=('temperature',), transfer_time=0.0,
+        controlled=('temperature',), bumpless_transfer_time=0.0,
         plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(
             np.full(n_x, PI_GAIN if alone else 0.0), np.full(n_x, PI_TIME))},
-        noise=np.array([1e-4, NOISE])[-n_y:],
-        wander=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
+        measurement_noise=np.array([1e-4, NOISE])[-n_y:],
+        disturbance_noise=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
         **({'setpoint_ramp': np.array([RAMP])} if alone else
            {'estimator': 'extended_kalman_filter', 'initial_error': FIRST_GUESS}),
-        levels=laws, validity_margin=MARGIN, linear_margin=MARGIN),
+        fallback_order=laws, learned_model_margin=MARGIN, linear_model_margin=MARGIN),
         None if informed or alone else TEMPERATURE)
 
 

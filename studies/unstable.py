@@ -100,8 +100,8 @@ def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: 
     """
     settings = Tuning.for_model(
         model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
-        controlled=('temperature',), transfer_time=0.0,
-        levels=laws, validity_margin=margin, linear_margin=margin)
+        controlled=('temperature',), bumpless_transfer_time=0.0,
+        fallback_order=laws, learned_model_margin=margin, linear_model_margin=margin)
     before = steady(begin)[1]
     return simulate(
         Controller(model, settings), Process(SYSTEM, 0, x0, before),

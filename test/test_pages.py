@@ -18,7 +18,7 @@ from koopman_ros.control.laws import Plan
 from koopman_ros.core.message_fields import CARRIERS, place
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
-from koopman_ros.ros.controller_messages import active_limits
+from koopman_ros.ros.controller_messages import active_constraints
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
@@ -100,7 +100,8 @@ def test_interfaces_list_the_limits_of_a_plan() -> None:
     wiring, none = preset_wiring('reactor'), np.zeros(1)
     assert wiring is not None
     (state,), (given,) = wiring.signals.states, wiring.signals.inputs
-    names = active_limits(wiring.signals, Plan(*3 * (none,), none, none, none), Time(), '').name
+    plan = Plan(*3 * (none,), none, none, none)
+    names = active_constraints(wiring.signals, plan, Time(), '').name
     assert [row[0].strip('`') for row in _rows('interfaces.md') if row[0].startswith('`at_')] == [
         name.replace(given, '<input>').replace(f'_{state} ', '_<state> ') for name in names]
 

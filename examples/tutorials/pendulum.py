@@ -153,7 +153,7 @@ runs, held = {}, {}
 for contender in (found.contenders[0], found.chosen):
     controller = Controller(contender.model, Tuning.for_model(
         contender.model, state_weight=np.array([1.0 / 0.1 ** 2, 1.0]),
-        input_weight=np.array([1.0 / 2.0 ** 2]), limits=limits, transfer_time=30.0))
+        input_weight=np.array([1.0 / 2.0 ** 2]), limits=limits, bumpless_transfer_time=30.0))
     run = simulate(controller, start, [at(0.1, SetpointRequest(0, goal))], duration=2.0,
                    period=0.02)
     runs[contender.name] = run

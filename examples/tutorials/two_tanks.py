@@ -149,18 +149,18 @@ for signals in (model.states, model.inputs):
 # ## In control
 #
 # The pumps give 0 to 12 V, and change by at most 2 V/s. Weights are those of squared errors in the
-# signals' units: 1 cm of level is worth 1 V here. `disturbance_bandwidth` is that of the
+# signals' units: 1 cm of level is worth 1 V here. `observer_bandwidth` is that of the
 # disturbance observer, which finds out what the model does not know; 0 leaves it out.
 
 # %%
 limits = InputLimits(lower=np.zeros(2), upper=np.full(2, 12.0), rate=np.full(2, 2.0))
 
 
-def controller(disturbance_bandwidth):
+def controller(observer_bandwidth):
     """Return the controller of the model, with an observer of some bandwidth in 1/s."""
     return Controller(model, Tuning.for_model(
         model, state_weight=np.full(2, 1.0 / 0.01 ** 2), input_weight=np.ones(2), limits=limits,
-        transfer_time=30.0, disturbance_bandwidth=disturbance_bandwidth))
+        bumpless_transfer_time=30.0, observer_bandwidth=observer_bandwidth))
 
 
 tanks = Process(truth, 0, truth.nominal_state, truth.nominal_input)

@@ -76,7 +76,7 @@ class Configuration:
     @cached_property
     def safe_input(self) -> Array:
         """What is commanded when no law can act, (n_u,) in input units."""
-        return kept(self.tuning.limits.within(self.tuning.safe))
+        return kept(self.tuning.limits.within(self.tuning.safe_value))
 
     @cached_property
     def nominal_input(self) -> Array:

@@ -66,13 +66,13 @@ class StateEstimation:
 
         That is the command, unless a measurement (n_u,) of the input says that it was not
         reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences
-        below `tolerance` count for nothing: a bias would come into the loop.
+        below `tracking_tolerance` count for nothing: a bias would come into the loop.
 
         :return: (n_u,) in scaled deviations, and whether it follows the command.
         """
         if state.command is None:
             return np.zeros(self.model.n_u), True
-        u, tolerance = state.command, self.tuning.tolerance
+        u, tolerance = state.command, self.tuning.tracking_tolerance
         if measured is None or not np.isfinite(measured).all():
             return self.model.inputs.to_deviation(u), True
         u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
@@ -169,7 +169,7 @@ class StateEstimation:
             return False
         seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS
         # where measurements are always that rare, they are all there is
-        return seconds * self.tuning.disturbance_bandwidth > _LOST and (
+        return seconds * self.tuning.observer_bandwidth > _LOST and (
             seconds > _GAP * state.interval)
 
     def predict(self, state: State, elapsed: float, u: Array) -> Estimate | None:

@@ -162,9 +162,9 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
     """
     name = tuning.estimator or (
         'extended_kalman_filter' if not outputs.determine_state else
-        'disturbance_observer' if tuning.disturbance_bandwidth > 0.0 else 'measured_state')
+        'disturbance_observer' if tuning.observer_bandwidth > 0.0 else 'measured_state')
     levels = {}
-    for law_name in tuning.levels:
+    for law_name in tuning.fallback_order:
         law = plug_in(law_name, 'law', LAWS, Law, model, tuning)
         estimator = plug_in(name, 'estimator', ESTIMATORS, Estimator, law.model, outputs, tuning)
         levels[law_name] = Level(law_name, law, estimator, tuning.controlled)

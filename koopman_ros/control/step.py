@@ -158,13 +158,14 @@ class ControlStep(Configuration):
         """Return the state with the set-point of now; `x` (n_x,) is what it begins from."""
         return replace(state, setpoint=setpoints.advance(
             state.setpoint, self.best.controlled_of(x), self.controlled,
-            self.tuning.setpoint_ramp, time.now_ns, time.counted, self.tuning.setpoint_filter))
+            self.tuning.setpoint_ramp, time.now_ns, time.counted,
+            self.tuning.setpoint_filter_time))
 
     def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
                  time: StepTime) -> tuple[State, Array, Report]:
         """Choose a level, and bring its input within the limits."""
         transfer = state.transfer and state.transfer.after(
-            time.elapsed, self.tuning.transfer_time)
+            time.elapsed, self.tuning.bumpless_transfer_time)
         target, changes = None, dict(WITHOUT_LAW)
         if state.mode is Mode.MANUAL:
             wanted = state.manual_input if state.manual_input is not None else (
@@ -255,7 +256,7 @@ class ControlStep(Configuration):
                 return dict(WITHOUT_LAW), wanted, replace(done, recovery=share)
             passing = supervisor.resumes is not None
             return {} if passing else {**WITHOUT_LAW, 'transfer': state.transfer}, held, done
-        if state.law != level and state.command is not None and self.tuning.transfer_time:
+        if state.law != level and state.command is not None and self.tuning.bumpless_transfer_time:
             # the command was not this law's so far
             transfer = with_step(None, held - result.u)
         offset = None if transfer is None else transfer.offset

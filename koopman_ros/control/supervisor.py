@@ -38,9 +38,9 @@ class FallbackOrder:
 
     def __post_init__(self) -> None:
         if list(self.margins) != sorted(self.margins):
-            raise ValueError(f'levels = {list(self.laws)}, validity_margin and linear_margin: the '
-                             'margin of a level must not be below that of a better one, got '
-                             f'{list(self.margins)}')
+            raise ValueError(f'fallback_order = {list(self.laws)}, learned_model_margin and '
+                             'linear_model_margin: the margin of a level must not be below '
+                             f'that of a better one, got {list(self.margins)}')
 
     @cached_property
     def levels(self) -> tuple[str, ...]:

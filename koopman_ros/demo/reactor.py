@@ -37,4 +37,4 @@ def constant(name: str) -> float:
 def scenario(model: str, setpoint: float, **others: Any) -> Scenario:
     """Return a loop without disturbance observer, with a set-point in K."""
     return Scenario({TEMPERATURE: setpoint}, controller={
-        'model': model, 'disturbance_bandwidth': 0.0}, **others)
+        'model': model, 'observer_bandwidth': 0.0}, **others)

@@ -47,11 +47,11 @@ _TRAINING_TIMEOUT = 300.0  # s
 _EXPERIMENT_TIMEOUT = 600.0  # s
 # What the fouled reactor bears; see the bounds of the experiment.
 _EXPERIMENT = {
-    'experiment_on': MANUAL, 'experiment_length': 60.0 * _EXPERIMENT_MINUTES,
-    'experiment_longest_hold': 180.0, 'experiment_seed': 1,
+    'experiment_signal': MANUAL, 'experiment_length': 60.0 * _EXPERIMENT_MINUTES,
+    'experiment_max_hold_time': 180.0, 'experiment_seed': 1,
     f'{reactor.COOLANT_TEMPERATURE}.experiment_min': 5.5,
     f'{reactor.COOLANT_TEMPERATURE}.experiment_max': 20.5,
-    f'{reactor.COOLANT_TEMPERATURE}.safe': 13.0,
+    f'{reactor.COOLANT_TEMPERATURE}.safe_value': 13.0,
 }
 
 
@@ -65,7 +65,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     present = load(model_path(reactor.MODEL))
     setpoint = float(present.states.center[0]) + STEP
     scenario = reactor.scenario(reactor.MODEL, setpoint, step_time=_STEP_TIME, duration=0.0,
-                                speed=speed, plant={'temperature.noise': NOISE})
+                                speed=speed, plant={'temperature.measurement_noise': NOISE})
     bags = [output / 'before.mcap', output / 'after.mcap']
     new_model = output / 'retrained.safetensors'
     table = LiveTable('a controller without observer learns its plant anew',

@@ -80,7 +80,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
         setpoints, name, plan.step_time, plan.duration, plant.sample_period, speed,
         plant={f'{signal}.initial_offset': state.initial_offset
                for signal, state in plan.states.items()},
-        controller={} if plan.observer else {'disturbance_bandwidth': 0.0})
+        controller={} if plan.observer else {'observer_bandwidth': 0.0})
     logs = output / 'logs'
     logs.mkdir(parents=True, exist_ok=True)
     bag, picture = output / 'closed_loop.mcap', output / 'closed_loop.png'

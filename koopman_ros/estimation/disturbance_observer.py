@@ -40,7 +40,7 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
 
 class DisturbanceObserver(Estimator):
     """
-    Two equal poles for each state, set by `disturbance_bandwidth`; every state is measured.
+    Two equal poles for each state, set by `observer_bandwidth`; every state is measured.
 
     With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
     prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
@@ -63,7 +63,7 @@ class DisturbanceObserver(Estimator):
 
     def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
         """Divide the innovation between state and disturbance."""
-        p = math.exp(-self.tuning.disturbance_bandwidth * seconds)
+        p = math.exp(-self.tuning.observer_bandwidth * seconds)
         duration = seconds / self.model.seconds_per_time_unit
         difference = x - predicted.x
         w = predicted.w + ((1.0 - p) ** 2 / duration) * difference

@@ -56,14 +56,15 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
     half = 0.5 * (model.states.upper - model.states.lower)
     slowest = float(np.min(np.abs(np.linalg.eigvals(
         model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
-    wander = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
+    disturbance_noise = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
         max(slowest, 1.0 / _LONGEST))
-    noise, wander, error = (
+    noise, disturbance_noise, error = (
         np.where(own > 0.0, own, default) for own, default in (
-            (tuning.noise, np.where(recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half)),
-            (tuning.wander / math.sqrt(SECONDS_PER_MINUTE), wander),
+            (tuning.measurement_noise, np.where(
+                recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half)),
+            (tuning.disturbance_noise / math.sqrt(SECONDS_PER_MINUTE), disturbance_noise),
             (tuning.initial_error, _GUESS * half)))
-    return noise, wander / model.inputs.scale, error / model.states.scale
+    return noise, disturbance_noise / model.inputs.scale, error / model.states.scale
 
 
 class ExtendedKalmanFilter(Estimator):

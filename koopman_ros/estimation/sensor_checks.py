@@ -86,10 +86,10 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     should_move = still & (np.abs(stuck.travel) > 0.5 * limits.jump)
     stood = np.where(should_move, (time_ns - np.array(stuck.since_ns)) / NANOSECONDS, 0.0)
     i = int(np.argmax(stood))
-    if stood[i] > limits.frozen_timeout > 0.0:
+    if stood[i] > limits.stuck_sensor_timeout > 0.0:
         return Verdict(accepted, reason(
             Code.FROZEN, signal=outputs.names[i], value=float(y[i]),
-            timeout=limits.frozen_timeout, change=0.5 * float(limits.jump[i])))
+            timeout=limits.stuck_sensor_timeout, change=0.5 * float(limits.jump[i])))
     return Verdict(accepted, moved=moved)
 
 

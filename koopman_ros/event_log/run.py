@@ -20,11 +20,11 @@ from koopman_ros.event_log.sources import lately, Models, read_records
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.controller import built, ReplayParameters, table_of
 from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.parameters.signal_topics import CONTROLLER_EVENTS, signals_of
+from koopman_ros.parameters.signal_topics import EVENT_LOG, signals_of
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.records import BagReadError, summary
 
-RECORDS = f'/{CONTROLLER_EVENTS}'  # topic of the records in a bag
+RECORDS = f'/{EVENT_LOG}'  # topic of the records in a bag
 
 
 class Result(enum.IntEnum):

@@ -100,7 +100,7 @@ class Serial(Backend):
 
 def backend_of(text: str) -> Backend:
     """
-    Return the backend of a parameter `scheduler`.
+    Return the backend of a parameter `executor`.
 
     ``''`` is this process, ``'process'`` a process of its own, ``'joblib:4'`` four processes,
     ``'joblib'`` one for each core, and ``'tcp://host:port'`` (or ``'tls://...'``) the workers of a

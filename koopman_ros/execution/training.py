@@ -48,7 +48,7 @@ class TrainingJob(Job):
     """
     A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`.
 
-    Of a fleet with ``plants``, such fields by name, and ``scheduler``.
+    Of a fleet with ``plants``, such fields by name, and ``executor``.
     """
 
     def __init__(self, task: Mapping[str, object]) -> None:

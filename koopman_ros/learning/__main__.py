@@ -6,7 +6,7 @@ The process that retrains: a task in JSON on the first line of its input, JSON l
 
 Each line holds either ``progress`` (share done) with ``text``, or at last ``summary`` and
 ``files``, or ``error``, or ``stopped``. The task of a fleet has ``plants``, a task each by name,
-and ``scheduler``; then these last lines come for each ``plant``, and after all ``ended``. It ends
+and ``executor``; then these last lines come for each ``plant``, and after all ``ended``. It ends
 early on SIGINT, on SIGTERM, and when its input is closed, so that it does not outlive the process
 that started it.
 """
@@ -78,7 +78,7 @@ def _fleet(values: Mapping[str, Any], now_and_then: OnProgress) -> int:
         return now_and_then(sum(shares.values()) / len(shares), f'{name}: {text}' if name else '')
 
     codes = []
-    for name, outcome in retrain_fleet(tasks, values.get('scheduler', ''), on_progress):
+    for name, outcome in retrain_fleet(tasks, values.get('executor', ''), on_progress):
         shares[name] = 1.0
         if outcome.summary is not None:
             _print(plant=name, summary=outcome.summary, files=outcome.files)

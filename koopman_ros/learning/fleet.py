@@ -64,9 +64,9 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
     The outcomes come round by round, in each in the order of the plants. The lifts are the same
     wherever they are learned.
 
-    :param tasks: by the names of the plants; their own `scheduler` counts for nothing.
+    :param tasks: by the names of the plants; their own `executor` counts for nothing.
     :param scheduler: where they are worked, see :func:`~koopman_ros.execution.backend_of`.
-    :raises ValueError: for plants that would write the same file, none, or another `scheduler`
+    :raises ValueError: for plants that would write the same file, none, or another `executor`
         than there is.
     :raises SchedulerLost: when a scheduler is not reached, or is lost; yielded outcomes stand.
     """
@@ -77,7 +77,7 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
 
 def kind_of(task: TrainingTask) -> tuple[object, ...]:
     """Return the properties that lifts of siblings share."""
-    return (task.model_class, task.coordinates, task.equations, task.hidden_states,
+    return (task.model_class, task.coordinates, task.physical_model, task.unmeasured_states,
             *((state.name, state.unit) for state in task.states),
             *((one.name, one.unit) for one in task.inputs))
 
@@ -97,13 +97,13 @@ def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnP
         tried = set()
         for name, task in waiting.items():
             kind = kind_of(task)
-            if task.sibling != FIRST:
+            if task.warm_start_model != FIRST:
                 now[name] = task
             elif kind in first:
-                now[name] = replace(task, sibling=first[kind])
+                now[name] = replace(task, warm_start_model=first[kind])
             elif kind not in tried:
                 tried.add(kind)
-                now[name] = replace(task, sibling='')
+                now[name] = replace(task, warm_start_model='')
         with contextlib.closing(backend.run(_retrained, now, watch=watch, apart=True)) as found:
             for name, outcome in found:
                 task = waiting.pop(name)

@@ -171,7 +171,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
     """
     checked_device(task.device)
-    with backend_of(task.scheduler) as backend:
+    with backend_of(task.executor) as backend:
         return retrain_by(backend, task, on_progress)
 
 
@@ -190,7 +190,8 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     :raises Stopped: when `on_progress` asked for it; nothing is written then.
     """
     thresholds = _checked(task)
-    current, sibling = (load(path) if path else None for path in (task.model, task.sibling))
+    current, sibling = (load(path) if path else None
+                        for path in (task.model, task.warm_start_model))
     plant, states, inputs = known(task, current)
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
@@ -201,7 +202,7 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     _stop_if(on_progress(0.0, 'reading bags'))
     with bounded_reading(task.bags):
         record = read_record(source, task.most_samples, task.seed,
-                             hidden=bool(task.hidden_states or task.equations),
+                             hidden=bool(task.unmeasured_states or task.physical_model),
                              tick=_reading(on_progress, source), backend=backend)
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
@@ -250,9 +251,9 @@ def _checked(task: TrainingTask) -> Thresholds:
                          f'{", ".join((*CLASSES, BEST))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
-    if task.sibling == FIRST:
-        raise ValueError(f'sibling = {FIRST!r} is the first of a fleet: retrain several plants in '
-                         'one call, or name a model file')
+    if task.warm_start_model == FIRST:
+        raise ValueError(f'warm_start_model = {FIRST!r} is the first of a fleet: retrain several '
+                         'plants in one call, or name a model file')
     return Thresholds(task.margin, task.condition)
 
 
@@ -263,11 +264,11 @@ def _estimate(task: TrainingTask, plant: Plant, episodes: list[Episode],
     def watch(done: int, total: int, text: str) -> bool:
         return on_progress(_at('estimate', done / total), f'estimating: {text}')
 
-    if task.equations:
-        return estimate_parameters(plant, episodes, plant_class(task.equations), task.constants,
-                                   seed=task.seed, watch=watch)
-    if task.hidden_states:
-        return identify_unmeasured(plant, episodes, task.hidden_states, seed=task.seed,
+    if task.physical_model:
+        return estimate_parameters(plant, episodes, plant_class(task.physical_model),
+                                   task.constants, seed=task.seed, watch=watch)
+    if task.unmeasured_states:
+        return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=task.seed,
                                    watch=watch, backend=backend)
     return identify(plant, episodes, methods=methods, seed=task.seed, watch=watch,
                     backend=backend)
@@ -298,8 +299,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
             reasons = decision.reasons
         if not reasons:
             break
-        warnings.append(f'it was learned from nothing, as what training made of {task.sibling} '
-                        f'would be refused: {"; ".join(reasons)}')
+        warnings.append('it was learned from nothing, as what training made of '
+                        f'{task.warm_start_model} would be refused: {"; ".join(reasons)}')
     return learned, decision, reasons
 
 

@@ -52,10 +52,10 @@ class TrainingTask:
     input_matrix_degree: int = 0
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
     #: not compared with the present one, which has other states
-    hidden_states: int = 0
+    unmeasured_states: int = 0
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
     #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.
-    equations: str = ''
+    physical_model: str = ''
     #: constants of it that are looked for, see :func:`koopman_ros.plants.sought_of`
     constants: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
@@ -68,10 +68,10 @@ class TrainingTask:
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
     #: where it is worked, see :func:`~koopman_ros.execution.backend_of`
-    scheduler: str = ''
+    executor: str = ''
     #: file of a lift of a plant of the same kind, which training begins from; empty for nothing.
     #: In a fleet also ``'first'``, see :func:`~koopman_ros.learning.fleet.retrain_fleet`.
-    sibling: str = ''
+    warm_start_model: str = ''
     device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
@@ -100,12 +100,12 @@ def known(task: TrainingTask, current: LiftedModel | None
     :param current: the present lift, where there is one.
     :raises ValueError: for a task whose parts do not fit each other or the present lift.
     """
-    if task.equations and (task.hidden_states or task.input_gain):
-        raise ValueError(f'equations = {task.equations!r} say which states there are and what '
-                         'inputs do: set hidden_states to 0 and give no input_gain')
-    if task.constants and not task.equations:
-        raise ValueError(f'constants name {", ".join(task.constants)}, but there are no equations '
-                         'that have them: give the plant in equations')
+    if task.physical_model and (task.unmeasured_states or task.input_gain):
+        raise ValueError(f'physical_model = {task.physical_model!r} says which states there are '
+                         'and what inputs do: set unmeasured_states to 0 and give no input_gain')
+    if task.constants and not task.physical_model:
+        raise ValueError(f'constants name {", ".join(task.constants)}, but there is no '
+                         'physical_model that has them')
     states: Sequence[RecordedState] = task.states
     inputs: Sequence[RecordedInput] = task.inputs
     if current is None:
@@ -114,7 +114,7 @@ def known(task: TrainingTask, current: LiftedModel | None
         some = [name for name in current.states.names
                 if name in {state.name for state in states}]
         # the others are estimated
-        partly = bool(task.equations) and 0 < len(some) < len(current.states)
+        partly = bool(task.physical_model) and 0 < len(some) < len(current.states)
         states = _in_order(states, current.states.only(some) if partly else current.states,
                            'state', task.model)
         inputs = _in_order(inputs, current.inputs, 'input', task.model)

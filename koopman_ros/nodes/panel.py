@@ -108,7 +108,7 @@ class PanelNode(LoopNode):
                                     self.resolve_topic_name)
         self._ended = threading.Event()
         self._subscribe()
-        self._operator_actions = self._matching.publish(topics.OPERATOR_ACTIONS)
+        self._operator_actions = self._matching.publish(topics.AUDIT_LOG)
         self._nodes = {role: RemoteNode(
             self, getattr(settings, role),
             {service: kind for of, service, kind in _SERVICES.values() if of == role},
@@ -132,10 +132,10 @@ class PanelNode(LoopNode):
                           ('active_setpoints', topics.LATCHED_QOS)):
             Inlet(self, lambda topic, hear, of, qos=qos: matching.subscribe(topic, hear, of, qos),
                   getattr(self._wiring, kind), self._signals.units, partial(self._on_signal, kind))
-        matching.subscribe(topics.CONTROLLER_STATE, self._on_internals, qos=_WATCHING)
-        matching.subscribe(topics.CONTROLLER_PLAN, self._on_plan, qos=_WATCHING)
-        matching.subscribe(topics.ACTIVE_LIMITS, self._on_limits, qos=_WATCHING)
-        matching.subscribe(topics.CONTROLLER_EVENTS, self._on_record)
+        matching.subscribe(topics.CONTROLLER_INTERNALS, self._on_internals, qos=_WATCHING)
+        matching.subscribe(topics.PREDICTED_TRAJECTORY, self._on_plan, qos=_WATCHING)
+        matching.subscribe(topics.ACTIVE_CONSTRAINTS, self._on_limits, qos=_WATCHING)
+        matching.subscribe(topics.EVENT_LOG, self._on_record)
         matching.subscribe(topics.DIAGNOSTICS, self._on_diagnostics, qos=QoSProfile(depth=100))
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_event, QoSProfile(depth=1000))
@@ -341,7 +341,7 @@ class PanelNode(LoopNode):
         name, value, setpoint = action.name, float(action.value), action.what == 'setpoint'
         place = (self._wiring.setpoints if setpoint else self._wiring.manual)[name]
         read, unit = self.view.read[name], self._signals.units[name]
-        if not self.count_publishers(topics.CONTROLLER_EVENTS):
+        if not self.count_publishers(topics.EVENT_LOG):
             reply(_not_running(CONTROLLER))
             return
         accepted = 'accepted'

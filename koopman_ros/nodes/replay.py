@@ -24,7 +24,7 @@ def _prepare() -> Callable[[], int]:
         # those of a controller with the new model may be given, too
         beside = tuning(load_suitable(new_model, force=True).model, given) if new_model else ()
         parameters = node.declare_table(REPLAY_TABLE, beside)
-        topic = node.resolve_topic_name(topics.CONTROLLER_EVENTS)
+        topic = node.resolve_topic_name(topics.EVENT_LOG)
     finally:
         node.destroy_node()
     return lambda: _run(parameters, topic, given)

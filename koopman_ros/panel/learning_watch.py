@@ -24,7 +24,7 @@ from koopman_ros.panel.training_report import (
     report_base,
     report_time,
 )
-from koopman_ros.parameters.signal_topics import CONTROLLER_EVENTS, Wiring
+from koopman_ros.parameters.signal_topics import EVENT_LOG, Wiring
 
 LAST = 3600.0  # s of the end of a bag that are compared
 _PERIOD = 1.0  # s between two looks at the files of a report
@@ -86,7 +86,7 @@ class LearningWatch:
             'model': os.path.dirname(model) or os.path.dirname(new) or '.'}
         file = folder / 'replay.yaml'
         file.write_text(yaml.safe_dump({'/**': {'ros__parameters': parameters}}))
-        topics = dict.fromkeys((CONTROLLER_EVENTS, *(
+        topics = dict.fromkeys((EVENT_LOG, *(
             place.topic for place in self._wiring.commands.values())))
         remaps = [part for topic in topics for part in (
             '-r', f'{topic}:={self._resolve(topic)}')]

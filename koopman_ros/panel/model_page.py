@@ -193,15 +193,15 @@ def _experiment(page: PageLayout) -> None:
 
 def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[str]:
     """Return the steps and limits of an experiment, in lines."""
-    if 'experiment_on' not in parameters:
+    if 'experiment_signal' not in parameters:
         return ['Trainer not running: no limits available']
 
     def text(name: str) -> str:
         return f'{parameters[name].text} {parameters[name].unit}'.rstrip()
 
-    on = parameters['experiment_on'].text
+    on = parameters['experiment_signal'].text
     lines = [f'steps: {on}, for {text("experiment_length")}, each '
-             f'{text("experiment_shortest_hold")} to {text("experiment_longest_hold")}']
+             f'{text("experiment_min_hold_time")} to {text("experiment_max_hold_time")}']
     for name in parameters:
         signal, _, last = name.rpartition('.')
         if last != 'experiment_min':
@@ -209,7 +209,7 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         if on == 'setpoint' and f'{signal}.setpoint_min' in parameters:
             lines.append(f'{signal}: set-points {text(f"{signal}.setpoint_min")} to '
                          f'{text(f"{signal}.setpoint_max")}')
-        what = 'steps within' if f'{signal}.safe' in parameters else 'aborts outside'
+        what = 'steps within' if f'{signal}.safe_value' in parameters else 'aborts outside'
         lines.append(f'{signal}: {what} {text(name)} to {text(f"{signal}.experiment_max")}')
     return lines
 

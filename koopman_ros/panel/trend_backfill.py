@@ -13,7 +13,7 @@ from koopman_ros.core.units import conversion, NANOSECONDS
 from koopman_ros.event_log.records import parse, RecordError
 from koopman_ros.panel.faceplates import pen
 from koopman_ros.panel.view_model import LoopViewModel
-from koopman_ros.parameters.signal_topics import CONTROLLER_EVENTS, Wiring
+from koopman_ros.parameters.signal_topics import EVENT_LOG, Wiring
 from koopman_ros.records import BagReadError, read_messages
 from koopman_ros.records.series import stamped_number
 
@@ -43,7 +43,7 @@ def read_past(path: str, wiring: Wiring, read: Mapping[str, str],
         for name, place in getattr(wiring, kind).items():
             places.setdefault(resolve(place.topic), []).append(
                 (kind, name, place, conversion(place.unit, signals.units[name])))
-    events = resolve(CONTROLLER_EVENTS)
+    events = resolve(EVENT_LOG)
     past = LoopViewModel(signals, read, span, 0.0)
     for number, entry in enumerate(read_messages(path, (*places, events), recover=True)):
         if number % _BATCH == 0:

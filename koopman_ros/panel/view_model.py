@@ -104,7 +104,7 @@ class LoopViewModel:
             self.trends.add(name, stamp, value)
 
     def take_internals(self, values: Mapping[str, float]) -> None:
-        """Take the topic `controller_state`: values by name with unit."""
+        """Take the topic `controller_internals`: values by name with unit."""
         for name, own in self._inputs.items():
             prefix = f'{name} ' if len(self._inputs) > 1 else ''
             own.values['disturbance'] = values.get(f'{prefix}disturbance [{own.unit}]', math.nan)
@@ -242,7 +242,7 @@ class LoopViewModel:
         no_plant, no_controller = (any(one.role == role for one in silences)
                                    for role in (PLANT, CONTROLLER))
         control = self.conditions.statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
-        levels = self._parameters.get(CONTROLLER, {}).get('levels')
+        levels = self._parameters.get(CONTROLLER, {}).get('fallback_order')
         best = str(levels.value[0]) if levels else 'sdre'
         reason = control.values.get('reason', 'none')
         return Snapshot(

@@ -99,14 +99,14 @@ def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
 
 def _cross_check(signals: Signals, values: ControllerParameters) -> str:
     tuning = values.tuning
-    if tuning.validity_margin > tuning.linear_margin:
-        return (f'validity_margin = {tuning.validity_margin} must be at most linear_margin = '
-                f'{tuning.linear_margin}: change the other one first')
+    if tuning.learned_model_margin > tuning.linear_model_margin:
+        return (f'learned_model_margin = {tuning.learned_model_margin} must be at most '
+                f'linear_model_margin = {tuning.linear_model_margin}: change the other one first')
     try:
-        for law in tuning.levels:
+        for law in tuning.fallback_order:
             plug_class(law, 'law', LAWS, Law)
     except ValueError as error:
-        return f'levels = {list(tuning.levels)}: {error}'
+        return f'fallback_order = {list(tuning.fallback_order)}: {error}'
     try:
         plug_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
     except ValueError as error:
@@ -118,7 +118,7 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Return the parameter dataclasses of known plug-ins, and of those that values name."""
     found: dict[str, type[Any]] = {}
     # what is no plug-in, the check of the parameters refuses
-    for name in dict.fromkeys((*LAWS, *given.get('levels', ()))):
+    for name in dict.fromkeys((*LAWS, *given.get('fallback_order', ()))):
         with contextlib.suppress(ValueError):
             found[short_name(name)] = plug_class(name, 'law', LAWS, Law).Parameters
     for name in dict.fromkeys((*ESTIMATORS, *filter(None, (given.get('estimator'),)))):
@@ -134,13 +134,14 @@ def _dynamics(model: LiftedModel) -> dict[str, Any]:
         model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
     stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
-    levels = {} if np.all(modes.real <= 0.0) else {'levels': ('mpc', 'sdre', 'linear')}
+    levels = {} if np.all(modes.real <= 0.0) else {'fallback_order': ('mpc', 'sdre', 'linear')}
     # a window, a fifth of it, is to show the slowest mode, and not to let an unstable one run off
     shown = max(slowest, 0.1 * fastest, float(np.max(modes.real)), 1e-3)
     return {**levels,
             'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
-            'transfer_time': min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0,
-            'disturbance_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
+            'bumpless_transfer_time': (
+                min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0),
+            'observer_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
 
 
 def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
@@ -177,7 +178,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         defaults |= {f'{name}.weight': 1.0 / float(box.scale[i]) ** 2,
                      f'{name}.min': shown(float(box.lower[i])),
                      f'{name}.max': shown(float(box.upper[i])),
-                     f'{name}.safe': shown(float(box.center[i]))}
+                     f'{name}.safe_value': shown(float(box.center[i]))}
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),

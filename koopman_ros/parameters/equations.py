@@ -43,7 +43,7 @@ def refused(equations: str, texts: Sequence[str]) -> str:
             from koopman_ros.plants import plant_class, sought_of
             sought_of(plant_class(equations), ranges)
     except ValueError as error:
-        return f'equations = {equations!r} with constants_estimated = {list(texts)}: {error}'
+        return f'physical_model = {equations!r} with estimated_constants = {list(texts)}: {error}'
     return '' if equations or not ranges else (
-        f'constants_estimated names {", ".join(ranges)}, must be empty without equations: give '
+        f'estimated_constants names {", ".join(ranges)}, must be empty without equations: give '
         'the plant whose constants they are')

@@ -206,13 +206,14 @@ def rests_outside(controller: Controller) -> str:
     where = 'does not come to rest' if np.isnan(rest.x).any() else (
         f'rests at about {listed(model.states, rest.x)} if one extrapolates')
     better = ', '.join(
-        f'{name}.safe = {shown(held, unit):.6g} {display_unit(unit)} or '
+        f'{name}.safe_value = {shown(held, unit):.6g} {display_unit(unit)} or '
         f'{"more" if held > now else "less"}'
         for name, unit, now, held in zip(model.inputs.names, model.inputs.units, safe.tolist(),
                                          holding.tolist(), strict=True))
     under = ', '.join(
-        f'{name}.safe = {shown(now, unit):.6g} {display_unit(unit)}' for name, unit, now in zip(
-            model.inputs.names, model.inputs.units, safe.tolist(), strict=True))
+        f'{name}.safe_value = {shown(now, unit):.6g} {display_unit(unit)}'
+        for name, unit, now in zip(model.inputs.names, model.inputs.units, safe.tolist(),
+                                   strict=True))
     return (f'under {under} the plant leaves the trained range, {ranges(model)}, and '
             f'{where}: no law can act there, and the way back is slow; record data from there and '
             f'train again, or set {better} if that is still safe')

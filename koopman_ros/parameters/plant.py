@@ -46,7 +46,7 @@ from koopman_ros.plants.simulation import integration_limits
 class StateParameters(MeasuredPlace):
     """How a state is measured."""
 
-    noise: float = parameter(
+    measurement_noise: float = parameter(
         0.0, 'standard deviation of its measurement', '{unit}', 0.0, 1e9)
     bias: float = parameter(
         0.0, 'by how much it is measured too high', '{unit}', -UNBOUNDED, UNBOUNDED)

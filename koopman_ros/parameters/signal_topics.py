@@ -22,11 +22,11 @@ from koopman_ros.core.units import check_unit, conversion, Display, Displays
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.table import ConfigurationError
 
-CONTROLLER_STATE = 'controller_state'
-CONTROLLER_EVENTS = 'controller_events'
-CONTROLLER_PLAN = 'controller_plan'
-ACTIVE_LIMITS = 'active_limits'
-OPERATOR_ACTIONS = 'operator_actions'
+CONTROLLER_INTERNALS = 'controller_internals'
+EVENT_LOG = 'event_log'
+PREDICTED_TRAJECTORY = 'predicted_trajectory'
+ACTIVE_CONSTRAINTS = 'active_constraints'
+AUDIT_LOG = 'audit_log'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 

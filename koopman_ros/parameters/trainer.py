@@ -32,15 +32,15 @@ from koopman_ros.model import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters.equations import named_ranges, refused
 from koopman_ros.parameters.signal_topics import (
-    ACTIVE_LIMITS,
-    CONTROLLER_EVENTS,
-    CONTROLLER_PLAN,
-    CONTROLLER_STATE,
+    ACTIVE_CONSTRAINTS,
+    AUDIT_LOG,
+    CONTROLLER_INTERNALS,
     DEFAULT_SYSTEM,
     DIAGNOSTICS,
+    EVENT_LOG,
     InputPlaces,
     named_units,
-    OPERATOR_ACTIONS,
+    PREDICTED_TRAJECTORY,
     preset,
     refusal,
     Signals,
@@ -52,7 +52,7 @@ from koopman_ros.parameters.signal_topics import (
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
-FIRST = 'first'  # as `sibling`, the first plant of a fleet whose lift is accepted
+FIRST = 'first'  # as `warm_start_model`, the first plant of a fleet whose lift is accepted
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +95,14 @@ class TrainerParameters:
     min_free_disk: float = parameter(
         100.0, 'room that the disk must have; with less, recording does not start, or stops', 'MB',
         0.0, 1e12)
-    experiment_on: str = parameter(
+    experiment_signal: str = parameter(
         COMMAND, 'what the experiment steps: the commands of the plant, those that a controller '
         'in manual mode passes on, or the set-points of a controller in automatic mode',
         choices=(COMMAND, MANUAL, SETPOINT))
     experiment_length: float = parameter(
         3600.0, 'length of the experiment', 's', 0.0, 1e6, open_minimum=True)
-    experiment_shortest_hold: float = parameter(30.0, 'shortest step', 's', 0.01, 1e6)
-    experiment_longest_hold: float = parameter(120.0, 'longest step', 's', 0.01, 1e6)
+    experiment_min_hold_time: float = parameter(30.0, 'shortest step', 's', 0.01, 1e6)
+    experiment_max_hold_time: float = parameter(120.0, 'longest step', 's', 0.01, 1e6)
     experiment_timeout: float = parameter(
         10.0, 'wall time without a newer measurement after which the experiment is aborted', 's',
         0.0, 86400.0, open_minimum=True)
@@ -120,9 +120,9 @@ class TrainerParameters:
     model_class: str = parameter(
         IDENTITY_LIFT, 'class of the new model; best learns all of them and takes one by the rule '
         'of the comparison of classes', choices=(*CLASSES, BEST))
-    model_coordinates: int = parameter(
+    lifted_dimension: int = parameter(
         3, 'coordinates n_z of a new identity lift', '', 2, 8)
-    training_starts: int = parameter(
+    restarts: int = parameter(
         3, 'starts of which each coordinate keeps the best', '', 1, 100)
     training_seed: int = parameter(
         0, 'seed of the training, of what is held out, and of what is taken of a long record', '',
@@ -130,14 +130,14 @@ class TrainerParameters:
     training_samples: int = parameter(
         20_000, 'samples that are learned from and judged by; a longer record is averaged, where '
         'that loses nothing, and segments from all over its range are taken', '', 1000, 1_000_000)
-    sibling: str = parameter(
+    warm_start_model: str = parameter(
         '', 'lift of a plant of the same kind that training begins from, instead of from nothing: '
         'name of a shipped model, or path of a model file; first, with --loops, for the first '
         'plant whose lift is accepted; empty for none')
-    scheduler: str = parameter(
+    executor: str = parameter(
         '', 'where a training works: empty for a process of its own beside this node; joblib for '
         'one on each core, joblib:N for N of them; tcp://host:port for the workers of a Dask '
-        'scheduler', read_only=True)
+        'executor', read_only=True)
     device: str = parameter(
         'cpu', 'what evaluates the residuals, on every worker: cpu, or a GPU as torch names it, '
         'like cuda')
@@ -152,24 +152,24 @@ class TrainerParameters:
         'measured, of which held-out segments choose: weak_form, total_variation, or module:Class',
         code=True)
     methods: Mapping[str, Any] = plugin_parameters()
-    hidden_states: int = parameter(
+    unmeasured_states: int = parameter(
         0, 'most states of the plant that are not measured, which a lift is learned with; 0 where '
         'all are', '', 0, 4)
-    equations: str = parameter(
+    physical_model: str = parameter(
         '', 'plant whose equations are fitted in place of a polynomial: one of the library, the '
         'name of an entry point of the group koopman_ros.plants, or package.module:Class; empty '
         'for none', code=True)
-    constants_estimated: tuple[str, ...] = parameter(
+    estimated_constants: tuple[str, ...] = parameter(
         ('',), 'constants of the equations that are estimated, in SI as the plant node has them, '
         'with their ranges, e.g. friction [0.01, 0.5]; a name alone for the range that the class '
         'gives, an empty name for those of which the class says that they are')
     synchronisation_tolerance: float = parameter(
         0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
         0.0, 10.0)
-    gate_margin: float = parameter(
+    acceptance_margin: float = parameter(
         0.1, 'share by which the held-out error of a new lift must be below those of the present '
         'lift and of the best linear model', '', 0.0, 0.99)
-    gate_condition: float = parameter(
+    max_condition_number: float = parameter(
         1e4, 'largest condition number of the coordinates of a new lift', '', 1.0, 1e12,
         open_minimum=True)
 
@@ -189,7 +189,7 @@ class TrainerParameters:
     experiment_max: Array = value_column('inputs', 0.0, 'highest value of a step')
     experiment_rate_limit: Array = column(
         'inputs', 0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
-    safe: Array = value_column(
+    safe_value: Array = value_column(
         'inputs', 0.0, 'what is safe whatever happened; the experiment starts and ends with it')
     delay: Array = column(
         'inputs', 0.0, 'dead time of the actuator: a command acts this long after it was given',
@@ -210,9 +210,9 @@ class TrainerParameters:
         return Experiment(
             duration=self.experiment_length, names=names, lower=lower, upper=upper,
             rate=np.where(rate > 0.0, rate, UNBOUNDED),
-            home=self.safe if setpoints is None else setpoints,
-            hold_shortest=self.experiment_shortest_hold,
-            hold_longest=self.experiment_longest_hold, measured=tuple(signals.states),
+            home=self.safe_value if setpoints is None else setpoints,
+            hold_shortest=self.experiment_min_hold_time,
+            hold_longest=self.experiment_max_hold_time, measured=tuple(signals.states),
             measured_lower=self.measured_min, measured_upper=self.measured_max,
             seed=self.experiment_seed)
 
@@ -242,17 +242,17 @@ class TrainerParameters:
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""
-        return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
-                'seed': self.training_seed, 'starts': self.training_starts,
+        return {'model_class': self.model_class, 'coordinates': self.lifted_dimension,
+                'seed': self.training_seed, 'starts': self.restarts,
                 'most_samples': self.training_samples,
                 'input_matrix_degree': self.input_matrix_degree,
-                'hidden_states': self.hidden_states, 'equations': self.equations,
-                'constants': named_ranges(self.constants_estimated),
+                'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
+                'constants': named_ranges(self.estimated_constants),
                 'methods': self.identification_methods,
                 'method_parameters': {name: asdict(own) for name, own in self.methods.items()
                                       if name in map(short_name, self.identification_methods)},
-                'margin': self.gate_margin, 'condition': self.gate_condition,
-                'scheduler': self.scheduler, 'device': self.device}
+                'margin': self.acceptance_margin, 'condition': self.max_condition_number,
+                'executor': self.executor, 'device': self.device}
 
 
 def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
@@ -268,9 +268,9 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     own = preset(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
-    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, CONTROLLER_STATE,
-                          CONTROLLER_PLAN, ACTIVE_LIMITS, CONTROLLER_EVENTS,
-                          OPERATOR_ACTIONS, DIAGNOSTICS)
+    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, CONTROLLER_INTERNALS,
+                          PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS, EVENT_LOG,
+                          AUDIT_LOG, DIAGNOSTICS)
     if present is not None:
         defaults['input_matrix_degree'] = present.input_matrix_degree
         for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
@@ -281,7 +281,7 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
                 defaults |= {f'{name}.{low}': shown(float(box.lower[i])),
                              f'{name}.{high}': shown(float(box.upper[i]))}
                 if box is present.inputs:
-                    defaults[f'{name}.safe'] = shown(float(box.center[i]))
+                    defaults[f'{name}.safe_value'] = shown(float(box.center[i]))
     methods: dict[str, type[Any]] = {}
     for names in ((), given.get('identification_methods', ())):
         # what is no method, the check of the parameters refuses
@@ -333,7 +333,7 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
         return (f'output = {values.output!r} is one file, which max_bag_size and '
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
-    if reason := scheduler_refusal(values.scheduler):
+    if reason := scheduler_refusal(values.executor):
         return reason
     try:
         parameters_of(values.identification_methods)
@@ -348,15 +348,15 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.input_matrix != (0.0,) and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
                 'input_matrix is given, of which nothing is learned')
-    if values.hidden_states and values.input_matrix_degree:
+    if values.unmeasured_states and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
-                'hidden_states are learned, on which B would depend')
-    if values.equations and values.hidden_states:
-        return (f'hidden_states is {values.hidden_states}, must be 0 where equations say which '
-                'states there are')
-    if values.equations and values.input_matrix != (0.0,):
-        return 'input_matrix must be a single 0 where equations say what the inputs do'
-    return (refused(values.equations, values.constants_estimated)
+                'unmeasured_states are learned, on which B would depend')
+    if values.physical_model and values.unmeasured_states:
+        return (f'unmeasured_states is {values.unmeasured_states}, must be 0 where physical_model '
+                'says which states there are')
+    if values.physical_model and values.input_matrix != (0.0,):
+        return 'input_matrix must be a single 0 where physical_model says what the inputs do'
+    return (refused(values.physical_model, values.estimated_constants)
             or Wiring(signals, values.states, values.inputs).check())
 
 

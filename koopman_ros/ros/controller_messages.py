@@ -126,7 +126,7 @@ def planned(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointTr
     return message
 
 
-def active_limits(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointState:
+def active_constraints(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointState:
     """Return which limits are active in a plan, under names that say what -1 and 1 stand for."""
     return _named({what.format(name): value for what, of, values in (
         ('at_range_{} [-1 lower, 1 upper]', signals.inputs, plan.at_range),
@@ -144,9 +144,9 @@ class ReportPublisher:
             wiring.active_setpoints, states,
             lambda topic, kind: matching.publish(topic, kind, topics.LATCHED_QOS))
         self._predicted = Outlet(wiring.predicted, states, matching.publish)
-        self._internals = matching.publish(topics.CONTROLLER_STATE)
-        self._plan = matching.publish(topics.CONTROLLER_PLAN)
-        self._active_limits = matching.publish(topics.ACTIVE_LIMITS)
+        self._internals = matching.publish(topics.CONTROLLER_INTERNALS)
+        self._plan = matching.publish(topics.PREDICTED_TRAJECTORY)
+        self._active_limits = matching.publish(topics.ACTIVE_CONSTRAINTS)
         self._published: Array | None = None  # (n_c,) set-points
 
     def publish(self, signals: Signals, report: Report, stamp: Time, frame_id: str) -> None:
@@ -163,7 +163,7 @@ class ReportPublisher:
         if plan is not None and topics.heard(self._plan):
             self._plan.publish(planned(signals, plan, stamp, frame_id))
         if plan is not None and topics.heard(self._active_limits):
-            self._active_limits.publish(active_limits(signals, plan, stamp, frame_id))
+            self._active_limits.publish(active_constraints(signals, plan, stamp, frame_id))
 
 
 class RecordPublisher:
@@ -180,7 +180,7 @@ class RecordPublisher:
         self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
         self._started = False
-        self._publisher = matching.publish(topics.CONTROLLER_EVENTS, matched=self._on_matched)
+        self._publisher = matching.publish(topics.EVENT_LOG, matched=self._on_matched)
 
     def start(self) -> None:
         """Publish the state from which the controller begins to act."""

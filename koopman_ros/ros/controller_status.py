@@ -237,8 +237,8 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
     if not report.measurement.follows:
         yield ACTUATORS, (
             f'the {now.input} does not follow its command within '
-            f'{_listed(now, tuning.tolerance)}: the observer uses the measured input; check the '
-            'actuator and its limits')
+            f'{_listed(now, tuning.tracking_tolerance)}: the observer uses the measured input; '
+            'check the actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
             'the disturbance estimate is at its bound of '
@@ -316,7 +316,7 @@ def _figures(now: Situation, condition: str) -> dict[str, object]:
         'missed measurements': now.counts.missed,
         'measurements rejected': now.counts.refused,
         **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
-           if 'mpc' in now.parameters.tuning.levels else {}),
+           if 'mpc' in now.parameters.tuning.fallback_order else {}),
         **{f'{what} parts of {name}': count for what, counts in (
             ('late', now.assembler.late), ('missing', now.assembler.missing),
             ('doubled', now.assembler.doubled)) for name, count in counts.items()},

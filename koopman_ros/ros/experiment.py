@@ -97,11 +97,12 @@ class PlantExperiment:
         for place in stepped(self.settings, self._wiring).values():
             topic = resolve(place.topic)
             if others := other_publishers(self._node, topic):
-                return f'{others} publishes on {topic}: end it, or choose another experiment_on'
-        if self.settings.experiment_on in (MANUAL, SETPOINT):
+                return (f'{others} publishes on {topic}: end it, or choose another '
+                        'experiment_signal')
+        if self.settings.experiment_signal in (MANUAL, SETPOINT):
             answers = resolve(next(iter(self._wiring.commands.values())).topic)
             if not self._node.count_publishers(answers):
-                mode = 'manual' if self.settings.experiment_on == MANUAL else 'automatic'
+                mode = 'manual' if self.settings.experiment_signal == MANUAL else 'automatic'
                 return (f'nobody publishes on {answers}: start the controller and switch it to '
                         f'{mode} mode')
         try:

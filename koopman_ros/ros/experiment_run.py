@@ -53,9 +53,9 @@ _ACKNOWLEDGED = 0.2  # s for the last command to arrive
 
 def stepped(settings: TrainerParameters, wiring: Wiring) -> dict[str, Place]:
     """Return where an experiment publishes, by name of the signal that it steps."""
-    if settings.experiment_on == SETPOINT:
+    if settings.experiment_signal == SETPOINT:
         return wiring.setpoints
-    return wiring.manual if settings.experiment_on == MANUAL else wiring.commands
+    return wiring.manual if settings.experiment_signal == MANUAL else wiring.commands
 
 
 class ExperimentRun:
@@ -72,7 +72,7 @@ class ExperimentRun:
         places = stepped(settings, wiring)
         signals = wiring.signals
         self._settings, self._signals = settings, signals
-        self._on_setpoints = settings.experiment_on == SETPOINT
+        self._on_setpoints = settings.experiment_signal == SETPOINT
         self._units = {name: (signals.states if self._on_setpoints else signals.inputs)[name]
                        for name in places}
         # what is known of the controller
@@ -104,13 +104,13 @@ class ExperimentRun:
             node, self._subscribe, wiring.measured, signals.states, self._on_measurement)
         self._answers = Inlet(
             node, self._subscribe, wiring.commands, signals.inputs, self._on_command) if (
-                settings.experiment_on != COMMAND) else None
+                settings.experiment_signal != COMMAND) else None
         self._inputs = None if self._on_setpoints else Inlet(
             node, self._subscribe, wiring.applied, signals.inputs, self._on_applied)
         if self._on_setpoints:
             Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
                   signals.states, lambda heard: self._tracked.update(heard.values))
-            self._subscribe(topics.CONTROLLER_EVENTS, self._on_record, String)
+            self._subscribe(topics.EVENT_LOG, self._on_record, String)
         self._outlet = Outlet(places, self._units, lambda topic, kind: owned.keep(
             node.create_publisher(kind, topic, topics.LOOP_QOS)))
         owned.timer(_TICK, self._on_tick)

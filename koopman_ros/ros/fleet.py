@@ -56,7 +56,7 @@ def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
         return 1
     if not tasks:
         return 1
-    end = _retrain({'plants': tasks, 'scheduler': scheduler}, arrived)
+    end = _retrain({'plants': tasks, 'executor': scheduler}, arrived)
     return 1 if failed or not (end.accepted or end.refused) else 0 if end.accepted else 2
 
 
@@ -73,7 +73,7 @@ def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
             raise ConfigurationError('there is no bag to train from: name it in bags')
         signals = trainer_signals(present, {name: getattr(settings, name) for name in SIGNALS})
         wiring = Wiring(signals, settings.states, settings.inputs)
-        return task_fields(node, settings, wiring, bags), settings.scheduler
+        return task_fields(node, settings, wiring, bags), settings.executor
     finally:
         node.destroy_node()
 

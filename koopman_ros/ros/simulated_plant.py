@@ -91,7 +91,7 @@ class SimulatedPlant:
 
     def measure(self, sample: int) -> tuple[Array, Array, Array]:
         """Return measurement, variance and resolution of all states (n_x,) for a sample."""
-        noise, resolution = self._column('noise'), self._column('resolution')
+        noise, resolution = self._column('measurement_noise'), self._column('resolution')
         drawn = np.array([plants.sensor_noise(one, self._parameters.seed, sample, i)
                           for i, one in enumerate(noise.tolist())])
         # the steps of the scale have the variance of a uniform error

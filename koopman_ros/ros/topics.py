@@ -30,13 +30,13 @@ from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.core.plugins import plug
 from koopman_ros.parameters.signal_topics import (
-    ACTIVE_LIMITS,
+    ACTIVE_CONSTRAINTS,
+    AUDIT_LOG,
     CLOCK,
-    CONTROLLER_EVENTS,
-    CONTROLLER_PLAN,
-    CONTROLLER_STATE,
+    CONTROLLER_INTERNALS,
     DIAGNOSTICS,
-    OPERATOR_ACTIONS,
+    EVENT_LOG,
+    PREDICTED_TRAJECTORY,
     Wiring,
 )
 from koopman_ros.ros.hosted import HostedNode
@@ -46,8 +46,8 @@ from koopman_ros.ros.node import Owned
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
 # JointTrajectory the one with their course in time.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
-TYPES = {CONTROLLER_STATE: JointState, CONTROLLER_PLAN: JointTrajectory,
-         ACTIVE_LIMITS: JointState, CONTROLLER_EVENTS: String, OPERATOR_ACTIONS: String,
+TYPES = {CONTROLLER_INTERNALS: JointState, PREDICTED_TRAJECTORY: JointTrajectory,
+         ACTIVE_CONSTRAINTS: JointState, EVENT_LOG: String, AUDIT_LOG: String,
          DIAGNOSTICS: DiagnosticArray, CLOCK: Clock}
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.

@@ -57,7 +57,8 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
         'bags': [os.path.abspath(bag) for bag in bags],
         'output': os.path.abspath(settings.model_output),
         'model': file(settings.model), 'plant': settings.system,
-        'sibling': FIRST if settings.sibling == FIRST else file(settings.sibling),
+        'warm_start_model': (FIRST if settings.warm_start_model == FIRST
+                             else file(settings.warm_start_model)),
         'states': [{'name': name, 'unit': unit, 'place': found(wiring.measured[name])}
                    for name, unit in states.items()],
         'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),

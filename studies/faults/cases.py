@@ -37,7 +37,7 @@ _FAST = {'lockstep': True, 'speed': 30.0}
 _SILENT = {'lockstep': True, 'speed': 60.0}
 # s of plant time between two looks of the controller, which are 0.1 s of wall time apart
 _LOOK = 8.0
-_NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'mpc.time_limit': 1e-6}
+_NEVER_IN_TIME = {'fallback_order': ('mpc', 'sdre', 'linear'), 'mpc.time_limit': 1e-6}
 _SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 1.0, 'recovery_time': 1.0}
 # Largest distance from the set-point after a few seconds of the safe inputs.
 _NEAR = {REACTOR.name: 10.0, TWO_TANKS.name: 0.08}
@@ -268,7 +268,8 @@ _OPERATORS = (
           ('coolant-limited', 'controller may not command less than', 'controller',
            reactor.coolant_limits()[0]))),
     _constant('noise', 'noise of 0.1 K, for good',
-              partial(changed_for_good, parameters={'temperature.noise': 0.1}), band=0.5,
+              partial(changed_for_good, parameters={'temperature.measurement_noise': 0.1}),
+              band=0.5,
               offset=0.5),
     _constant('two-state', 'the concentration moves, which the model does not know, and the feed '
               'gets 1 K warmer; near the stable point',

@@ -48,12 +48,14 @@ class Day:
 DAYS = {
     'soak': Day(REACTOR, (42.0, 50.0), {
         'constants.feed_temperature': (74.0, 80.0),
-        'constants.heat_transfer_coefficient': (750.0, 917.0), 'temperature.noise': (0.0, 0.05)},
+        'constants.heat_transfer_coefficient': (750.0, 917.0),
+        'temperature.measurement_noise': (0.0, 0.05)},
         ('reactor_nz3', 'reactor_nz4', '/nowhere.safetensors')),
     # what the coolant can make up for at once
     'soak-saddle': Day(SADDLE, (73.0, 81.0), {
         'constants.feed_temperature': (74.0, 80.0),
-        'constants.heat_transfer_coefficient': (800.0, 870.0), 'temperature.noise': (0.02, 0.08)},
+        'constants.heat_transfer_coefficient': (800.0, 870.0),
+        'temperature.measurement_noise': (0.02, 0.08)},
         ('two_state_saddle', '/nowhere.safetensors'))}
 
 

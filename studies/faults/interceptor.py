@@ -174,7 +174,7 @@ class Interceptor:
             self._to_plant = self._publishers(wiring.commands, _BEHIND)
         for kind, topic, callback, qos in (
                 (DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS),
-                (String, topics.CONTROLLER_EVENTS, self._on_record,
+                (String, topics.EVENT_LOG, self._on_record,
                  topics.profile(MOST_RECORDS, reliable=True))):
             node.create_subscription(kind, topic, callback, qos)
         self._listen(wiring.applied, self._on_applied, topics.LATCHED_QOS)

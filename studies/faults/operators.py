@@ -190,7 +190,7 @@ def out_of_reach(loop: FaultHarness) -> None:
 def limited(loop: FaultHarness) -> None:
     """Hold the temperature under a limit that is below its set-point, for a while."""
     name = f'{reactor.TEMPERATURE}.max'
-    limits: list[JointState] = loop.ros.listen(JointState, topics.ACTIVE_LIMITS)
+    limits: list[JointState] = loop.ros.listen(JointState, topics.ACTIVE_CONSTRAINTS)
     with loop.fault():
         refused = loop.set_parameters('controller', **{name: LIMIT})
         loop.expect(not refused, f'the limit was refused: {refused}')

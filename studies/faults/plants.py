@@ -137,28 +137,30 @@ REACTOR = Plant(
 TWO_TANKS = Plant(
     'two_tanks', setpoint=(0.1, 0.15), other=(0.09, 0.14), by_hand=(7.0, 2.0), band=0.002,
     settle=80.0, afterwards=200.0, recovery=180.0, never={'level_2': 0.08}, highest=0.35, tuned={
-        **_each(('level_1', 'level_2'), max_rate=0.03, max_jump=0.01),
-        **_each(('pump_1', 'pump_2'), rate_limit=2.0), 'transfer_time': 10.0})
+        **_each(('level_1', 'level_2'), max_rate=0.03, max_step=0.01),
+        **_each(('pump_1', 'pump_2'), rate_limit=2.0), 'bumpless_transfer_time': 10.0})
 # Four levels in one message, two of them controlled.
 _LEVELS = ('level_1', 'level_2', 'level_3', 'level_4')
 QUADRUPLE_TANK = Plant(
     'quadruple_tank', setpoint=(0.15, 0.1), other=(0.14, 0.11), by_hand=(3.2, 2.8), band=0.002,
     settle=200.0, afterwards=300.0, recovery=270.0, never={'level_2': 0.042}, highest=0.25,
     wired={f'{name}.topic': 'levels' for name in _LEVELS}, tuned={
-        **_each(_LEVELS, max_rate=0.01, max_jump=0.01),
-        **_each(('pump_1', 'pump_2'), rate_limit=1.0), 'transfer_time': 10.0})
+        **_each(_LEVELS, max_rate=0.01, max_step=0.01),
+        **_each(('pump_1', 'pump_2'), rate_limit=1.0), 'bumpless_transfer_time': 10.0})
 # The reactor of two states where no coolant that is held holds it, its concentration estimated.
 SADDLE = Plant(
     'saddle', kind='two_state', setpoint=(76.85,), other=(73.85,), by_hand=(26.85,), band=0.5,
     settle=120.0, afterwards=420.0, recovery=300.0, highest=110.0,
     simulated={'concentration.initial_offset': -0.37733466,
-               'temperature.initial_offset': 25.53008526, 'temperature.noise': 0.05}, tuned={
+               'temperature.initial_offset': 25.53008526,
+               'temperature.measurement_noise': 0.05}, tuned={
         'model': 'two_state_saddle', 'states_measured': ('temperature [K]',),
-        'levels': ('mpc', 'sdre', 'pi'), 'temperature.noise': 0.05,
+        'fallback_order': ('mpc', 'sdre', 'pi'), 'temperature.measurement_noise': 0.05,
         'concentration.initial_error': 0.2, 'temperature.max_rate': 2.0,
-        'temperature.max_jump': 2.0, 'pi.temperature.gain': 6.0,
+        'temperature.max_step': 2.0, 'pi.temperature.gain': 6.0,
         'pi.temperature.integral_time': 60.0,
-        **_each(('coolant_temperature',), wander=0.775, min=-20.0, max=100.0, rate_limit=1.0)})
+        **_each(('coolant_temperature',), disturbance_noise=0.775, min=-20.0, max=100.0,
+                rate_limit=1.0)})
 # It falls where nothing acts; its rate is estimated from the angle.
 PENDULUM = Plant(
     'pendulum', setpoint=(0.0,), other=(0.1,), by_hand=(0.0,), band=math.inf, settle=4.0,

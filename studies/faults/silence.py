@@ -30,7 +30,7 @@ SLOW = {'speed': 1.0, 'start_time': 10_000.0}
 _STRAY = 1000.0  # s behind the stamps of the plant
 # Of the standard library: no law, no estimator, none at all, and one that ends the process.
 _NO_PLUG_INS: tuple[dict[str, Any], ...] = (
-    *({'levels': ['sdre', name]} for name in (
+    *({'fallback_order': ['sdre', name]} for name in (
         'json:dumps', 'builtins:dict', 'no.such:thing', 'unittest.__main__:main')),
     *({'estimator': name} for name in (
         'os:getcwd', 'builtins:dict', 'unittest.__main__:main')))
@@ -49,7 +49,7 @@ def without_news(loop: FaultHarness, make: Maker) -> None:
     """Let measurements come without a new stamp: the inputs are held, then go to safe values."""
     altered(loop, make, 150.0)
     _expect_error(loop)
-    safe = [loop.on.default(f'{name}.safe') for name in loop.on.inputs]
+    safe = [loop.on.default(f'{name}.safe_value') for name in loop.on.inputs]
     last = [command.values for command in loop.trace.commands
             if command.seconds <= loop.trace.end][-1]
     loop.expect(max(abs(a - b) for a, b in zip(last, safe, strict=True)) < 1e-6,
@@ -144,7 +144,7 @@ def experiment(loop: FaultHarness) -> None:
     with loop.fault():
         loop.start('trainer', {
             'system': loop.on.system, 'record_at_start': False, 'min_free_disk': 0.0,
-            'experiment_shortest_hold': 5.0, 'experiment_longest_hold': 6.0,
+            'experiment_min_hold_time': 5.0, 'experiment_max_hold_time': 6.0,
             **{f'{name}.experiment_rate_limit': loop.on.rate for name in loop.on.inputs}})
         answer = loop.ros.set_bool('trainer/experiment', True)
         loop.expect(answer.success, f'no experiment: {answer.message}')

@@ -180,7 +180,7 @@ def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minu
     controller = Controller(model, Tuning.for_model(
         model, state_weight=np.ones(1), input_weight=np.ones(1),
         limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1)),
-        transfer_time=30.0))
+        bumpless_transfer_time=30.0))
     rng = np.random.default_rng([seed, 2])
     run = simulate(
         controller, plants.Process(system, 0, np.asarray(x0), system.nominal_input),

@@ -33,7 +33,7 @@ class PartialCase:
     plant: str  #: its name in the catalogue, and that of its shipped lift
     measured: tuple[str, ...]  #: (n_y,) names of the states that are
     noise: Array  #: (n_y,) standard deviations, in state units
-    wander: Array  #: (n_u,) of an unknown influence in a second, in input units
+    disturbance_noise: Array  #: (n_u,) of an unknown influence in a second, in input units
     initial_error: Array  #: (n_x,) how wrong a first guess may be, in state units
     Q: Array  #: (n_x,) weights of squared state errors
     R: Array  #: (n_u,) weights of squared input deviations
@@ -140,9 +140,9 @@ class PartialCase:
         """Return what a controller of this package is tuned by; `others` replace that by name."""
         return Tuning.for_model(model, **{
             'state_weight': self.Q, 'input_weight': self.R, 'limits': self.limits,
-            'controlled': tuple(self.setpoint), 'transfer_time': 0.0,
-            'estimator': 'extended_kalman_filter', 'noise': self.noise,
-            'wander': self.wander * np.sqrt(60.0),
+            'controlled': tuple(self.setpoint), 'bumpless_transfer_time': 0.0,
+            'estimator': 'extended_kalman_filter', 'measurement_noise': self.noise,
+            'disturbance_noise': self.disturbance_noise * np.sqrt(60.0),
             'initial_error': self.initial_error,
             'plugins': {'mpc': MPCParameters(upper=self.state_upper) if len(self.state_upper)
                         else MPCParameters()}, **others})

@@ -33,7 +33,8 @@ class Own:
 
     def __init__(self, case: PartialCase, model: LiftedModel, laws: tuple[str, ...]) -> None:
         self._controller = Controller(model, case.tuning(
-            model, levels=laws, validity_margin=MARGIN, linear_margin=MARGIN), case.outputs)
+            model, fallback_order=laws, learned_model_margin=MARGIN,
+            linear_model_margin=MARGIN), case.outputs)
         self._state = self._controller.initialise(State(), case.start[1])
         self._period_ns, self._number = round(case.period * NANOSECONDS), 0
         self._setpoint: Array | None = None
@@ -70,7 +71,8 @@ class LinearQuadraticGaussian:
         # an input that wanders, as for the others, from one sample to the next; what is returned
         # beside the covariance is the gain of a predictor, which lags by a sample
         noise = np.diag(case.noise ** 2)
-        P = control.dlqe(self._A, self._B, self._C, case.period * np.diag(case.wander ** 2),
+        P = control.dlqe(self._A, self._B, self._C,
+                         case.period * np.diag(case.disturbance_noise ** 2),
                          noise)[1]
         self._L = np.linalg.solve(self._C @ P @ self._C.T + noise, self._C @ P).T
         # what holds a set-point, as far as the linear model tells

@@ -26,7 +26,7 @@ PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
 # Margins that are never exceeded: without fallback the learned law acts everywhere.
-NO_FALLBACK: dict[str, Any] = {'validity_margin': 1e9, 'linear_margin': 1e9}
+NO_FALLBACK: dict[str, Any] = {'learned_model_margin': 1e9, 'linear_model_margin': 1e9}
 
 
 @lru_cache
@@ -36,7 +36,7 @@ def shipped_model() -> LiftedModel:
 
 
 def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 1.0,
-                       fallback: bool = True, linear_margin: float = 0.5,
+                       fallback: bool = True, linear_model_margin: float = 0.5,
                        model: LiftedModel | None = None) -> Controller:
     """
     Return the controller with the default parameters of its node and the shipped model.
@@ -44,12 +44,12 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
     :param bandwidth: of the observer, in 1/min.
     :param coolant_weight: in 1/K^2.
     :param fallback: whether the distance from the training data decides which law acts.
-    :param linear_margin: up to which the linear law does, in half widths.
+    :param linear_model_margin: up to which the linear law does, in half widths.
     """
     model = model or shipped_model()
     tuning = built(table_of(model).snapshot({
-        'disturbance_bandwidth': bandwidth / SECONDS_PER_MINUTE,
-        'coolant_temperature.weight': coolant_weight, 'linear_margin': linear_margin}),
+        'observer_bandwidth': bandwidth / SECONDS_PER_MINUTE,
+        'coolant_temperature.weight': coolant_weight, 'linear_model_margin': linear_model_margin}),
         model).tuning
     return Controller(model, tuning if fallback else replace(tuning, **NO_FALLBACK))
 

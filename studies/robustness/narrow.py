@@ -79,9 +79,10 @@ def judge_reactor(course: Simulation, since: float = 0.0) -> Metrics:
             'safe_share': float(np.mean([level == control.SAFE for level in course.levels]))}
 
 
-def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
+def far_from_the_model(linear_model_margin: float, bandwidth: float) -> Metrics:
     """Judge the loop with the shipped lift after it has lost 40 % of UA, from then on."""
-    controller = loop.reactor_controller(bandwidth=bandwidth, linear_margin=linear_margin)
+    controller = loop.reactor_controller(bandwidth=bandwidth,
+                                         linear_model_margin=linear_model_margin)
     return judge_reactor(TRIALS[1].run(controller), _DISTURBED)
 
 
@@ -103,7 +104,7 @@ def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
     controller = Controller(model, control.Tuning.for_model(
         model, state_weight=np.ones(2), input_weight=np.ones(1),
         limits=control.InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
-        safe=np.zeros(1), transfer_time=1.0,
+        safe_value=np.zeros(1), bumpless_transfer_time=1.0,
         **({'recovery_time': 1.0} if fallback else loop.NO_FALLBACK)))
 
     # put into the controller's state, since it refuses set-points outside its data

@@ -225,7 +225,7 @@ def two_state_end(start: tuple[float, float]) -> End:
                   system=system, concentration=start[1])
 
 
-def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics:
+def back_from_safe(system: ControlAffineSystem, linear_model_margin: float) -> Metrics:
     """Start at rest under the safe coolant, `outside` the trained range by so many half widths."""
     coldest = COOLANT_RANGE[0]
     rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
@@ -235,7 +235,8 @@ def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics
         return replace(before, state=replace(before.state, supervisor=Supervisor(SAFE)))
 
     course = loop.run_loop(
-        loop.reactor_controller(linear_margin=linear_margin), system, rest, coldest, _RETURN,
+        loop.reactor_controller(linear_model_margin=linear_model_margin), system, rest, coldest,
+        _RETURN,
         [at(0.0, safe), at(0.0, at_setpoint(SETPOINT))])
     return {'rest_kelvin': float(rest[0]),
             'outside': loop.shipped_model().states.violation(rest),

@@ -100,7 +100,7 @@ def study(backend: Backend | None = None) -> Found:
             **{f'fallback={fallback}': {f'{start:g}K to {goal:g}K': end.value
                                         for (start, goal), end in grid.items()}
                for fallback, grid in grids.items()},
-            'from_the_safe_coolant': {f'{name}/linear_margin={margin:g}': found
+            'from_the_safe_coolant': {f'{name}/linear_model_margin={margin:g}': found
                                       for (name, margin), found in back.items()},
             'two_state': {f'{kelvin:g}K, {c:.3g}mol/L': end.value
                           for (kelvin, c), end in two_state_grid.items()}},
@@ -108,7 +108,7 @@ def study(backend: Backend | None = None) -> Found:
             'reactor': {'/'.join(key): narrow.judge_reactor(course)
                         for key, course in courses['reactor'].items()},
             'heat_transfer_-40%': {
-                f'linear_margin={margin:g}/bandwidth={bandwidth:g}': judged
+                f'linear_model_margin={margin:g}/bandwidth={bandwidth:g}': judged
                 for (margin, bandwidth), judged in far.items()},
             'two_state': {'/'.join(key): narrow.judge_two_state(course)
                           for key, course in courses['two_state'].items()}}}

@@ -34,8 +34,8 @@ def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object)
         limits=InputLimits(inputs.lower - n_u, inputs.upper + n_u, 0.5 * n_u),
         setpoint_ramp=0.1 * states.scale, max_disturbance=2.0 * inputs.scale,
         sensor=SensorLimits(middle - reach, middle + reach, 0.1 * reach, 0.2 * reach, 5.0),
-        disturbance_bandwidth=0.2, hold_timeout=5.0,
-        transfer_time=3.0), **changes), outputs)
+        observer_bandwidth=0.2, hold_timeout=5.0,
+        bumpless_transfer_time=3.0), **changes), outputs)
 
 
 def mixed(model: LiftedModel) -> Outputs:
@@ -61,7 +61,7 @@ events = st.lists(st.tuples(kinds, st.lists(shares, min_size=4, max_size=4), wai
 ENDLESS = {'lower': np.array([-math.inf]), 'upper': np.array([math.inf]),
            'rate': np.array([math.inf])}
 REACTORS = [[first, first, *others] for first, *others in (
-    [controller(), controller(disturbance_bandwidth=0.0, transfer_time=0.0),
+    [controller(), controller(observer_bandwidth=0.0, bumpless_transfer_time=0.0),
      controller(input_weight=np.array([1e-4]))],
     [controller('reactor_linear'), controller(sensor=ENDLESS)],
     [controller('reactor_nz3', setpoint_ramp=np.array([0.2])), controller('reactor_linear')])]
@@ -75,7 +75,7 @@ def random_controllers(n_x: int, n_u: int, seed: int, all_states: bool, n_c: int
     part = {'controlled': model.states.names[:n_c], 'setpoint_ramp': 0.1 * model.states.scale[
         :n_c]} if n_c else {}
     found = [tuned(model, outputs, **part), tuned(model, outputs),
-             tuned(model, outputs, disturbance_bandwidth=0.0, **part)]
+             tuned(model, outputs, observer_bandwidth=0.0, **part)]
     if all_states and n_x > 1 and n_c:
         with contextlib.suppress(ValueError):
             # what is measured may leave the disturbance open
@@ -200,8 +200,8 @@ def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
 
 def test_an_array_of_another_size_is_refused():
     good = tuned(random_lift(2, n_u=2))
-    for name in ('state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance', 'tolerance',
-                 'safe'):
+    for name in ('state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
+                 'tracking_tolerance', 'safe_value'):
         for wrong in (np.ones(1), np.ones(3), np.ones((2, 1))):
             with pytest.raises((ValueError, TypeError), match='one number for each of'):
                 Controller(good.model, replace(good.tuning, **{name: wrong}))

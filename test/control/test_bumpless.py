@@ -126,7 +126,7 @@ def test_from_a_coolant_that_the_law_would_not_choose(by):
 
 @pytest.mark.parametrize('change', [
     {'input_weight': np.array([0.05])}, {'state_weight': np.array([0.1])},
-    {'disturbance_bandwidth': 12.0 / 60.0}, {'transfer_time': 5.0},
+    {'observer_bandwidth': 12.0 / 60.0}, {'bumpless_transfer_time': 5.0},
     {'limits': InputLimits(np.array([270.0]), np.array([320.0]), np.array([5.0]))},
 ], ids=lambda change: next(iter(change)))
 def test_retuning(change):
@@ -197,7 +197,7 @@ def test_a_coolant_that_is_no_number_is_not_taken_over():
 
 
 def test_who_wants_no_transfer_is_answered_by_the_law_from_the_first_measurement_on():
-    free = controller(transfer_time=0.0, disturbance_bandwidth=0.0, limits=InputLimits(
+    free = controller(bumpless_transfer_time=0.0, observer_bandwidth=0.0, limits=InputLimits(
         np.array([278.15]), np.array([305.15]), np.array([np.inf])))
     measured = np.array([START + 2.0])
     _, alone, _ = free.step(State(), measured, EPOCH)

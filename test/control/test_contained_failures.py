@@ -209,9 +209,10 @@ def test_random_events_on_every_law_and_estimator_end_in_a_command(system):
     for seed, (name, measured, levels, estimator) in enumerate(CASES):
         if name != system:
             continue
-        controller = tuned(system, measured, levels=levels, estimator=estimator)
+        controller = tuned(system, measured, fallback_order=levels, estimator=estimator)
         run, rng = Checked(controller), np.random.default_rng(seed)
-        others = [tuned(name, measured, levels=other, estimator=estimator) for other in LEVELS]
+        others = [tuned(name, measured, fallback_order=other, estimator=estimator)
+                  for other in LEVELS]
         for event in random_events(controller, rng, 25):
             run.do(event)
             if rng.random() < 0.05:
@@ -224,7 +225,7 @@ def test_random_events_on_every_law_and_estimator_end_in_a_command(system):
 @pytest.mark.parametrize('failure', [*FAILURES, *RESULTS], ids=lambda _: '')
 def test_a_law_that_fails_hands_over_to_the_next_level(plugin, failure):
     levels = (plugin(Linear, 'compute', failure), 'linear')
-    run = Checked(tuned('two_tanks', levels=levels))
+    run = Checked(tuned('two_tanks', fallback_order=levels))
     center = run.controller.model.states.center
     for k in range(5):
         run.do(Measurement((10 + k) * SECOND, center + 1e-4 * k))
@@ -266,7 +267,8 @@ def test_the_loop_goes_on_when_an_estimator_works_again(monkeypatch):
 
 
 def test_an_interrupt_is_not_contained(plugin):
-    run = Checked(tuned('two_tanks', levels=(plugin(Linear, 'compute', KeyboardInterrupt()),)))
+    law = plugin(Linear, 'compute', KeyboardInterrupt())
+    run = Checked(tuned('two_tanks', fallback_order=(law,)))
     with pytest.raises(KeyboardInterrupt):
         run.do(Measurement(SECOND, run.controller.model.states.center))
 
@@ -322,7 +324,8 @@ def test_a_recovery_that_has_come_to_the_training_data_by_itself_is_over():
 @pytest.mark.parametrize('levels', [('mpc', 'sdre', 'linear'), ('mpc', 'linear')])
 def test_plans_that_are_always_late_do_not_keep_the_safe_input(levels):
     """A sensor that was broken for a while; the deadline is missed by every plan."""
-    run = Checked(tuned('reactor', levels=levels, hold_timeout=5.0, **{'mpc.time_limit': 1e-9}))
+    run = Checked(tuned('reactor', fallback_order=levels, hold_timeout=5.0,
+                        **{'mpc.time_limit': 1e-9}))
     center = run.controller.model.states.center
     for k in range(60):
         value = center + 0.01 * (k % 3)

@@ -311,11 +311,13 @@ def test_the_mode_changes_between_operator_and_law():
 
 @pytest.mark.parametrize(('part', 'name', 'value'), [
     ('', 'state_weight', 0.0), ('', 'state_weight', -1.0), ('', 'input_weight', 0.0),
-    ('', 'input_weight', np.nan), ('', 'setpoint_ramp', 0.0), ('', 'safe', np.inf),
-    ('', 'tolerance', -1.0), ('', 'transfer_time', np.inf), ('sensor', 'rate', 0.0),
-    ('sensor', 'jump', np.nan), ('sensor', 'frozen_timeout', -1.0), ('limits', 'rate', 0.0),
-    ('', 'state_weight', 'heavy'), ('', 'validity_margin', -0.1), ('', 'hold_timeout', -1.0),
-    ('', 'recovery_time', math.nan), ('', 'levels', ()), ('', 'levels', ('sdre', 'sdre'))])
+    ('', 'input_weight', np.nan), ('', 'setpoint_ramp', 0.0), ('', 'safe_value', np.inf),
+    ('', 'tracking_tolerance', -1.0), ('', 'bumpless_transfer_time', np.inf),
+    ('sensor', 'rate', 0.0),
+    ('sensor', 'jump', np.nan), ('sensor', 'stuck_sensor_timeout', -1.0), ('limits', 'rate', 0.0),
+    ('', 'state_weight', 'heavy'), ('', 'learned_model_margin', -0.1), ('', 'hold_timeout', -1.0),
+    ('', 'recovery_time', math.nan), ('', 'fallback_order', ()),
+    ('', 'fallback_order', ('sdre', 'sdre'))])
 def test_a_tuning_that_makes_no_sense_is_refused(part, name, value):
     loop = controller()
     tuning = loop.tuning
@@ -328,7 +330,7 @@ def test_a_tuning_that_makes_no_sense_is_refused(part, name, value):
 def test_margins_in_the_wrong_order_are_refused():
     loop = controller()
     with pytest.raises(ValueError, match='margin'):
-        replace(loop, tuning=replace(loop.tuning, validity_margin=2.0))
+        replace(loop, tuning=replace(loop.tuning, learned_model_margin=2.0))
 
 
 @pytest.mark.parametrize('part', ['limits', 'sensor'])
@@ -447,7 +449,7 @@ def test_the_filter_follows_a_step_with_its_time_constant():
     for second in range(1, 20):
         setpoint = moved(setpoint, NOW + second * SECOND, lag=10.0)
         assert setpoint.active[0] == pytest.approx(310.0 + 10.0 * math.exp(-0.1 * second))
-    loop = controller(setpoint_filter=10.0)
+    loop = controller(setpoint_filter_time=10.0)
     report = measured(loop, started(loop, (310.0,)), START, 1)[2]
     assert report.target.setpoint[0] == pytest.approx(310.0 + (START - 310.0) * math.exp(-0.1))
 

@@ -59,7 +59,7 @@ def loop(model, *controlled, lower=0.0, upper=6.0, **others):
         model, state_weight=np.ones(model.n_x), input_weight=np.ones(n_u),
         limits=InputLimits(np.broadcast_to(lower, n_u).astype(float),
                            np.broadcast_to(upper, n_u).astype(float), np.full(n_u, np.inf)),
-        controlled=controlled, disturbance_bandwidth=0.3, **others))
+        controlled=controlled, observer_bandwidth=0.3, **others))
 
 
 def stepped(controller, state, x, second):
@@ -329,7 +329,7 @@ def test_a_successor_keeps_the_setpoints_of_the_same_signals():
     state = stepped(before, State(), [1.0, 1.0, 1.0], 0)[0]
     state = asked(before, [1.2, 1.3], state)[0]
     state = stepped(before, state, [1.0, 1.0, 1.0], 1)[0]
-    again = loop(THREE, 'h2', 'h3', transfer_time=5.0).hand_over(before, state)
+    again = loop(THREE, 'h2', 'h3', bumpless_transfer_time=5.0).hand_over(before, state)
     np.testing.assert_array_equal(again.setpoint.active, [1.2, 1.3])
     other = loop(THREE, 'h1', 'h3')
     moved = other.hand_over(before, state)

@@ -45,8 +45,9 @@ def controller(model=None, *, lower=-1e3, upper=1e3, rate=np.inf, laws=('pi',), 
         'state_weight': np.ones(model.n_x), 'input_weight': np.ones(model.n_u),
         'limits': InputLimits(np.full(model.n_u, lower), np.full(model.n_u, upper),
                               np.full(model.n_u, rate)),
-        'transfer_time': 0.0, 'plugins': {'pi': PIParameters(gain, time)}, 'levels': laws,
-        'validity_margin': 1.0, 'linear_margin': 1.0, **others}))
+        'bumpless_transfer_time': 0.0, 'plugins': {'pi': PIParameters(gain, time)},
+        'fallback_order': laws,
+        'learned_model_margin': 1.0, 'linear_model_margin': 1.0, **others}))
 
 
 def run(one, setpoint=10.0, seconds=200.0, u=0.0, events=()):

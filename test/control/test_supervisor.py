@@ -246,7 +246,7 @@ def test_it_leads_back_from_either_side(side):
     step = Controller(model, Tuning.for_model(
         model, state_weight=np.ones(1), input_weight=np.ones(1),
         limits=InputLimits(np.array([-9.0]), np.array([9.0]), np.ones(1)),
-        disturbance_bandwidth=0.5, transfer_time=5.0, safe=np.array([4.0 * side])))
+        observer_bandwidth=0.5, bumpless_transfer_time=5.0, safe_value=np.array([4.0 * side])))
     state = step.initialise(State(), np.array([4.0 * side]))
     state, refused = step.request_setpoint(state, np.array([-0.5 * side]))
     assert refused is None
@@ -302,12 +302,12 @@ def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range
                            SAFE, 305.0))
     assert narrowed.rest.holding[0] == pytest.approx(holding, abs=0.05)
     words = rests_outside(narrowed)
-    assert 'under coolant_temperature.safe = 5 degC' in words
+    assert 'under coolant_temperature.safe_value = 5 degC' in words
     assert 'leaves the trained range' in words
-    assert ('record data from there and train again, or set coolant_temperature.safe = 25.8'
+    assert ('record data from there and train again, or set coolant_temperature.safe_value = 25.8'
             ) in words
-    assert rests_outside(controller(narrow(), safe=np.array([holding + 0.1]))) == ''
+    assert rests_outside(controller(narrow(), safe_value=np.array([holding + 0.1]))) == ''
     # and one that drives the reactor up
-    hot = controller(safe=np.array([305.15]))
+    hot = controller(safe_value=np.array([305.15]))
     assert hot.rest.holding[0] < 305.15
     assert 'or less' in rests_outside(hot)

@@ -57,14 +57,14 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_law_or_estimator_that_is_none_is_refused(parameter: str, name: str) -> None:
     table = table_of(load(model_path('reactor_nz4')))
     reason = table.check(table.snapshot({
-        parameter: ('sdre', name) if parameter == 'levels' else name}))
+        parameter: ('sdre', name) if parameter == 'fallback_order' else name}))
     assert name in reason
     assert parameter in reason
 
 
 @pytest.mark.usefixtures('modules')
 @pytest.mark.parametrize(('parameter', 'value', 'missing'), [
-    ('levels', ('own_plugs:HalfLaw',), 'lacks compute'),
+    ('fallback_order', ('own_plugs:HalfLaw',), 'lacks compute'),
     ('estimator', 'own_plugs:HalfEstimator', 'lacks correct, restart')])
 def test_a_refusal_names_the_methods_that_a_class_lacks(
         parameter: str, value: object, missing: str) -> None:

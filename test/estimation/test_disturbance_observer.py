@@ -194,14 +194,14 @@ def test_an_actuator_that_reaches_less_than_is_commanded(tells):
 
 
 def test_without_the_observer_the_offset_stays():
-    loop = asked(controller(disturbance_bandwidth=0.0), CHANGED['UA −20 %'])
+    loop = asked(controller(observer_bandwidth=0.0), CHANGED['UA −20 %'])
     assert abs(loop.run(300)[-1].temperature - SETPOINT) > 3.0
 
 
 @pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (6.0, 0.04, 0.09),
                                                        (12.0, 0.09, 0.4)])
 def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
-    loop = Reactor(controller(disturbance_bandwidth=bandwidth / 60.0), noise=0.1)
+    loop = Reactor(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
     commands = np.array([s.command for s in loop.run(600)[200:]])
     assert low < np.std(commands) < high
     # the filter adds no offset
@@ -269,7 +269,7 @@ def test_a_sensor_that_freezes_under_way_is_found_out():
 
 def test_a_plant_at_rest_is_not_frozen_and_nothing_is_when_that_is_switched_off():
     assert levels(Reactor(controller()).run(100, lambda _: START)) == ['sdre']
-    loop = asked(controller(sensor={'frozen_timeout': 0.0}))
+    loop = asked(controller(sensor={'stuck_sensor_timeout': 0.0}))
     assert levels(loop.run(60, lambda _: START)) == ['sdre']
 
 

@@ -58,10 +58,11 @@ def first(model: LiftedModel, n_y: int) -> Outputs:
 
 
 def kalman(kind: type[Estimator], model: LiftedModel, outputs: Outputs, *, noise: float = 0.1,
-           wander: float = 0.05, error: float = 0.3) -> Any:
-    """Return a filter; wander and error are in scaled deviations, the former per root second."""
+           disturbance_noise: float = 0.05, error: float = 0.3) -> Any:
+    """Return a filter; the former noise is per root second, errors are in scaled deviations."""
     return kind(model, outputs, Tuning.for_model(
-        model, noise=noise, wander=wander * np.sqrt(60.0) * model.inputs.scale,
+        model, measurement_noise=noise,
+        disturbance_noise=disturbance_noise * np.sqrt(60.0) * model.inputs.scale,
         initial_error=error * model.states.scale).for_signals(model, outputs.names), None)
 
 
@@ -93,7 +94,7 @@ def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
 
 @pytest.mark.parametrize('kind', FILTERS)
 def test_the_covariance_follows_the_nonlinear_flow(kind):
-    one = kalman(kind, TRUTH, TEMPERATURE, wander=1e-4)
+    one = kalman(kind, TRUTH, TEMPERATURE, disturbance_noise=1e-4)
     x, w, u = np.array([0.2, -0.3]), np.array([0.0, 0.4]), np.array([0.5])
     P = 1e-8 * np.eye(4)
     found = one.predict(Estimate(x, w, P), u, 20.0)
@@ -151,9 +152,10 @@ def saddle(model: LiftedModel = TRUTH, **changes: object) -> Controller:
     return Controller(model, Tuning.for_model(model, **{
         'state_weight': np.array([0.0, 1.0]), 'input_weight': np.ones(1), 'limits': WIDE,
         'controlled': ('temperature',),
-        'noise': np.array([NOISE]), 'wander': np.array([0.1 * np.sqrt(60.0)]),
+        'measurement_noise': np.array([NOISE]),
+        'disturbance_noise': np.array([0.1 * np.sqrt(60.0)]),
         'initial_error': np.array([0.2, 2.0]),
-        'levels': ('sdre',), 'validity_margin': 0.3, **changes}), TEMPERATURE)
+        'fallback_order': ('sdre',), 'learned_model_margin': 0.3, **changes}), TEMPERATURE)
 
 
 def held(temperature: float) -> tuple[Array, Array]:
@@ -263,8 +265,8 @@ def test_more_inputs_than_outputs_and_fewer():
 def test_a_start_up_from_far_outside_the_data_arrives():
     # a PI law, which asks nothing of the model, until the data begin
     limits = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
-    one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), levels=('sdre', 'pi'),
-                 linear_margin=3.0, plugins={'pi': PIParameters([0.0, 8.0], [1.0, 120.0])})
+    one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), fallback_order=('sdre', 'pi'),
+                 linear_model_margin=3.0, plugins={'pi': PIParameters([0.0, 8.0], [1.0, 120.0])})
     u0 = np.array([300.0])
     loop = simulate(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
         at(0.0, Initialisation(u0)), at(5.0, SetpointRequest(0, np.array([350.0])))],
@@ -285,7 +287,7 @@ def test_noise_that_is_not_given_is_that_of_the_record():
     half = 0.5 * (model.states.upper[0] - model.states.lower[0])
     for noise, one, expected in ((0.0, model, 1e-3 * half), (0.0, known, 0.125),
                                  (0.5, known, 0.5)):
-        given = Tuning.for_model(one, noise=noise)
+        given = Tuning.for_model(one, measurement_noise=noise)
         assert uncertainty(one, outputs, given)[0] == pytest.approx([expected], rel=1e-12)
 
 
@@ -295,7 +297,8 @@ def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_
     one = Controller(model, Tuning.for_model(
         model, state_weight=np.ones(2), input_weight=np.ones(1), controlled=(outputs.names[0],),
         limits=InputLimits(model.inputs.lower, model.inputs.upper, np.ones(1)),
-        noise=np.array([0.1]), wander=0.05 * np.sqrt(60.0) * model.inputs.scale,
+        measurement_noise=np.array([0.1]),
+        disturbance_noise=0.05 * np.sqrt(60.0) * model.inputs.scale,
         initial_error=0.3 * model.states.scale, estimator='extended_kalman_filter'), outputs)
     own = kalman(ExtendedKalmanFilter, model, outputs)
     state, now, expected, before = State(), 10 ** 12, None, None

@@ -266,9 +266,10 @@ def test_tried_loops_of_another_plant_are_refused():
 def levels_on_the_way(model, levels, start, setpoint):
     """Let a controller bring the plant dx/dt = x + u to a set-point; return (level, reason)s."""
     loop = Controller(model, Tuning.for_model(
-        model, state_weight=np.ones(1), input_weight=np.ones(1), disturbance_bandwidth=5.0,
+        model, state_weight=np.ones(1), input_weight=np.ones(1), observer_bandwidth=5.0,
         limits=InputLimits(*(np.full(1, bound) for bound in (-3.0, 3.0, np.inf))),
-        transfer_time=0.0, levels=levels, validity_margin=1.0, linear_margin=1.0,
+        bumpless_transfer_time=0.0, fallback_order=levels, learned_model_margin=1.0,
+        linear_model_margin=1.0,
         recovery_time=0.5))
     x, h, found = np.array([start]), 0.05, []
     state, refused = loop.request_setpoint(State(), np.array([setpoint]))

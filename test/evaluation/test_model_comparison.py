@@ -36,7 +36,7 @@ def one(model: LiftedModel, outputs: Outputs | None = None) -> Controller:
     limits = InputLimits(model.inputs.lower, model.inputs.upper, np.full(model.n_u, np.inf))
     return Controller(model, Tuning.for_model(
         model, state_weight=np.ones(model.n_x), input_weight=np.ones(model.n_u), limits=limits,
-        noise=0.01, wander=1e-3 * np.sqrt(60.0)),
+        measurement_noise=0.01, disturbance_noise=1e-3 * np.sqrt(60.0)),
         outputs)
 
 
@@ -139,7 +139,7 @@ def test_steady_noise_tells_nothing():
 def test_reactor_under_control_tells_lifts_from_models_of_another(noise):
     lift = shipped('reactor_nz4')
     run = simulate(
-        controller(lift, disturbance_bandwidth=0.1),
+        controller(lift, observer_bandwidth=0.1),
         Process(REACTOR, 0, REACTOR.nominal_state, REACTOR.nominal_input),
         [at(500.0, SetpointRequest(0, np.array([START - 4.0]))),
          at(700.0, SetpointRequest(0, np.array([START - 1.0])))],

@@ -81,8 +81,8 @@ def controller(case: Case, law: str = 'sdre', bandwidth: float = 0.0) -> Control
     return Controller(case.model, Tuning.for_model(
         case.model, state_weight=np.full(n_x, 3.0), input_weight=np.ones(n_u),
         limits=InputLimits(np.full(n_u, low), np.full(n_u, high), np.full(n_u, np.inf)),
-        disturbance_bandwidth=bandwidth / case.seconds,
-        levels=(law,), validity_margin=EVERYWHERE, linear_margin=EVERYWHERE))
+        observer_bandwidth=bandwidth / case.seconds,
+        fallback_order=(law,), learned_model_margin=EVERYWHERE, linear_model_margin=EVERYWHERE))
 
 
 def process(case: Case) -> Process:

@@ -57,8 +57,8 @@ HAPPENS = st.one_of(
     st.tuples(st.just('applied'), st.floats(COOLANT - 30.0, COOLANT + 30.0)),
     st.tuples(st.just('exchange'), st.sampled_from([
         {'model': 'reactor_nz3'}, {'model': 'reactor_nz4'}, {'coolant_temperature.weight': 0.3},
-        {'model': 'reactor_linear', 'disturbance_bandwidth': 0.0}, {'disturbance_bandwidth': 0.1},
-        {'setpoint_filter': 20.0, 'temperature.setpoint_ramp': 0.1},
+        {'model': 'reactor_linear', 'observer_bandwidth': 0.0}, {'observer_bandwidth': 0.1},
+        {'setpoint_filter_time': 20.0, 'temperature.setpoint_ramp': 0.1},
         {'coolant_temperature.rate_limit': 0.2}])),
     st.tuples(st.just('snapshot')))
 

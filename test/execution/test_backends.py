@@ -169,5 +169,5 @@ def test_other_names_are_refused(text):
         backend_of(text)
     table = trainer_table(None, {
         'system': 'own', 'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})
-    assert table.check(table.snapshot({'scheduler': text})).startswith('scheduler is ')
-    assert 'scheduler' not in table.check(table.snapshot({'scheduler': 'joblib:2'}))
+    assert table.check(table.snapshot({'executor': text})).startswith('scheduler is ')
+    assert 'executor' not in table.check(table.snapshot({'executor': 'joblib:2'}))

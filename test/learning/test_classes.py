@@ -205,13 +205,13 @@ def test_it_is_retrained_where_the_task_says(bag, tmp_path):
     """The same lift comes of it, and what fails writes nothing."""
     models = []
     for scheduler in ('', 'process'):
-        done = retrain(replace(task(bag, tmp_path, 'linear'), scheduler=scheduler))
+        done = retrain(replace(task(bag, tmp_path, 'linear'), executor=scheduler))
         models.append(load(done.model_file))
         (tmp_path / 'new.safetensors').unlink()
     assert models[0].A.tobytes() == models[1].A.tobytes()
     assert models[0].tried_loops == models[1].tried_loops
     for change, error, text in (
-            ({'scheduler': 'joblib:0'}, ValueError, "scheduler is 'joblib:0', must be"),
+            ({'executor': 'joblib:0'}, ValueError, "scheduler is 'joblib:0', must be"),
             ({'device': 'abacus'}, ValueError, "device is 'abacus', but torch")):
         with pytest.raises(error, match=text):
             retrain(replace(task(bag, tmp_path, 'linear'), **change))

@@ -21,7 +21,7 @@ def tasks_of_reactors(tmp_path_factory):
         name: write_bag(folder / f'{name}.mcap', driven(reactor(share), 12.0))
         for name, share in (('first', 1.0), ('second', 0.9))}}
     return {name: TrainingTask((str(bag),), str(folder / f'{name}.safetensors'), '', STATES,
-                               INPUTS, coordinates=2, starts=1, sibling='first')
+                               INPUTS, coordinates=2, starts=1, warm_start_model='first')
             for name, bag in bags.items()}
 
 
@@ -62,7 +62,8 @@ def test_a_lift_begins_from_that_of_the_first_sibling(tasks, ended):
 
 
 def test_a_request_to_end_leaves_the_rest_alone(tasks, tmp_path):
-    asked = {name: replace(tasks[name], output=str(tmp_path / f'{name}.safetensors'), sibling='')
+    asked = {name: replace(tasks[name], output=str(tmp_path / f'{name}.safetensors'),
+                           warm_start_model='')
              for name in ('first', 'second')}
     outcomes = dict(retrain_fleet(asked, on_progress=lambda *_: True))
     assert all(one.stopped and not one.error for one in outcomes.values())

@@ -176,7 +176,7 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
     monkeypatch.setattr(task_module, 'identify_unmeasured',
                         partial(identify_unmeasured, highest_degree=2))
     found = retrain(TrainingTask((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1],
-                                 INPUTS, model_class='polynomial', hidden_states=1))
+                                 INPUTS, model_class='polynomial', unmeasured_states=1))
     assert found.reasons == ()
     assert not any('hidden_1' in warning for warning in found.decision.warnings)
     model = load(found.model_file)
@@ -194,10 +194,10 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
 @pytest.fixture(scope='module')
 def by_equations(tmp_path_factory):
     """Return what the equations make of eight minutes of the lower level alone."""
-    folder = tmp_path_factory.mktemp('equations')
+    folder = tmp_path_factory.mktemp('physical_model')
     task = TrainingTask((str(write_tanks(folder / 'run.mcap', 500.0)),),
                         str(folder / 'new.safetensors'), '', STATES[:1], INPUTS,
-                        model_class='polynomial', equations='two_tanks',
+                        model_class='polynomial', physical_model='two_tanks',
                         constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
     # as the process that retrains is given it
     return retrain(TrainingTask.from_json(json.dumps(asdict(task))))
@@ -230,8 +230,8 @@ def test_constants_are_in_summary_report_and_diagnostics(by_equations):
 
 
 @pytest.mark.parametrize(('given', 'words'), [
-    ({'equations': 'two_tanks', 'hidden_states': 1}, 'set hidden_states to 0'),
-    ({'equations': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
+    ({'physical_model': 'two_tanks', 'unmeasured_states': 1}, 'set unmeasured_states to 0'),
+    ({'physical_model': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
     ({'constants': {'orifice_1': None}}, 'constants name orifice_1, but there are no equations')])
 def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
@@ -245,7 +245,7 @@ def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
     present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), TANKS.B, *boxes, 's',
                                Provenance('two tanks'))
     task = TrainingTask((), '', 'present', STATES[:1], INPUTS)
-    plant, states, inputs = known(replace(task, equations='two_tanks'), present)
+    plant, states, inputs = known(replace(task, physical_model='two_tanks'), present)
     assert plant.state_names == tuple(state.name for state in states) == ('level_2',)
     assert plant.input_names == tuple(one.name for one in inputs) == TANKS.input_names
     with pytest.raises(ValueError, match=r'has the states level_1 \[m\], level_2 \[m\]'):

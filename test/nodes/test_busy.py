@@ -26,7 +26,7 @@ from support.nodes import opened, seconds, temperature
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2,
-            'coolant_temperature.rate_limit': 20.0, 'coolant_temperature.safe': SAFE}
+            'coolant_temperature.rate_limit': 20.0, 'coolant_temperature.safe_value': SAFE}
 
 # A control step that takes as long as somebody keeps the pipe of the second argument open, and a
 # watchdog that is five times as quick as it is.
@@ -59,7 +59,7 @@ class BusyBench:
             'controller', SETTINGS, ('-p', f'use_sim_time:={simulated}'.lower()),
             (sys.executable, '-c', BUSY, str(pipe)))
         self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
-        self.records = ros.listen(String, topics.CONTROLLER_EVENTS)
+        self.records = ros.listen(String, topics.EVENT_LOG)
         self.thermometer = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
         if simulated:
             ros.wait_until(lambda: time.get_subscription_count() > 0)

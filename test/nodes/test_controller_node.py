@@ -191,7 +191,7 @@ def measure_on(bench: Bench, count: int, first: float) -> float:
 
 def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
     bench.ros.set_parameters('controller', **{
-        'disturbance_bandwidth': 0.1, 'coolant_temperature.max_disturbance': 100.0})
+        'observer_bandwidth': 0.1, 'coolant_temperature.max_disturbance': 100.0})
     for k in range(60):
         # a thermometer that does not follow: the observer takes it for a plant that is cooled
         bench.measure(STEADY - 8.0 - 0.01 * (k % 2), 2.0 + k)
@@ -204,7 +204,7 @@ def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
 
 
 def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', disturbance_bandwidth=0.1)
+    bench.ros.set_parameters('controller', observer_bandwidth=0.1)
     # whole seconds of the clock of the node, so that ages are known
     last = measure_on(bench, 20, float(int(time.time()) - 40))
     status = bench.status()
@@ -252,8 +252,8 @@ def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are
 
 
 def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', disturbance_bandwidth=0.1)
-    internals = bench.ros.listen(JointState, topics.CONTROLLER_STATE)
+    bench.ros.set_parameters('controller', observer_bandwidth=0.1)
+    internals = bench.ros.listen(JointState, topics.CONTROLLER_INTERNALS)
     predicted = bench.ros.listen(Temperature, reactor.PREDICTED_TEMPERATURE)
     bench.ros.meet('controller')
     last = measure_on(bench, 10, 2.0)
@@ -273,11 +273,12 @@ def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
 
 
 def test_a_plan_is_told_with_the_limits_that_are_active(bench: Bench) -> None:
-    plans = bench.ros.listen(JointTrajectory, topics.CONTROLLER_PLAN)
-    limits = bench.ros.listen(JointState, topics.ACTIVE_LIMITS)
+    plans = bench.ros.listen(JointTrajectory, topics.PREDICTED_TRAJECTORY)
+    limits = bench.ros.listen(JointState, topics.ACTIVE_CONSTRAINTS)
     bench.ros.meet('controller')
     bench.ros.set_parameters('controller', **{
-        'levels': ['mpc', 'sdre'], 'recovery_time': 0.0, 'coolant_temperature.rate_limit': 0.1})
+        'fallback_order': ['mpc', 'sdre'], 'recovery_time': 0.0,
+        'coolant_temperature.rate_limit': 0.1})
     bench.measure(STEADY, 2.0)
     before = bench.measure(STEADY, 3.0).temperature
     # too cold, which takes a coolant that is warmer than it may get at once
@@ -304,8 +305,8 @@ def test_a_plan_is_told_with_the_limits_that_are_active(bench: Bench) -> None:
     # one a sample at most, and none of another law
     stamps = [seconds(message) for message in plans]
     assert len(stamps) == len(set(stamps)) == len(limits)
-    bench.ros.set_parameters('controller', levels=['sdre', 'linear'])
-    internals = bench.ros.listen(JointState, topics.CONTROLLER_STATE)
+    bench.ros.set_parameters('controller', fallback_order=['sdre', 'linear'])
+    internals = bench.ros.listen(JointState, topics.CONTROLLER_INTERNALS)
     bench.ros.meet('controller')
     bench.measure(STEADY, 5.0)
     bench.ros.wait_until(lambda: internals and seconds(internals[-1]) == 5.0)
@@ -323,11 +324,11 @@ def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
     # accepted nevertheless
     assert until_read(lambda: bench.ros.set_parameters_atomically(
         'controller', model=str(narrow))).successful
-    words = 'under coolant_temperature.safe = 5 degC'
+    words = 'under coolant_temperature.safe_value = 5 degC'
     status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe input'))
     assert 'leaves the trained range' in value(status, 'safe input')
     bench.ros.wait_until(lambda: words in bench.process.output())
-    bench.ros.set_parameters('controller', **{'coolant_temperature.safe': 27.0})
+    bench.ros.set_parameters('controller', **{'coolant_temperature.safe_value': 27.0})
     bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
     assert until_read(lambda: bench.ros.set_parameters_atomically(
         'controller', model='reactor_nz4')).successful

@@ -33,7 +33,7 @@ SERVICE = 'trainer/experiment'
 TRAINER, JACKET = 'unit_1/trainer', '/unit_1/jacket'
 TABLE = trainer_table(load(model_path(reactor.MODEL)))
 SIGNALS = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
-SAFE = round(to_celsius(float(TABLE.snapshot({}).safe[0])), 9)
+SAFE = round(to_celsius(float(TABLE.snapshot({}).safe_value[0])), 9)
 PRESENT = PlantTable().system(PlantTable().snapshot({})).nominal_input[0]  # K
 IDLE = {'record_at_start': False}
 LOST = 'the trainer does not command any more'
@@ -94,8 +94,8 @@ def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> l
 
 def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
-    given = {'experiment_length': 300.0, 'experiment_seed': 5, 'experiment_shortest_hold': 15.0,
-             'experiment_longest_hold': 60.0}
+    given = {'experiment_length': 300.0, 'experiment_seed': 5, 'experiment_min_hold_time': 15.0,
+             'experiment_max_hold_time': 60.0}
     measured = start_with_plant(ros, **given)
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     assert status.level == DiagnosticStatus.OK
@@ -145,9 +145,9 @@ def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
     # a busy machine may be as slow
     bench.set(experiment_timeout=10.0)
 
-    bench.set(**{'experiment_on': 'manual'})
+    bench.set(**{'experiment_signal': 'manual'})
     assert 'start the controller and switch it to manual mode' in bench.start()[1]
-    bench.set(**{'experiment_on': 'command'})
+    bench.set(**{'experiment_signal': 'command'})
 
 
 def test_contradicting_limits_are_refused() -> None:
@@ -156,9 +156,9 @@ def test_contradicting_limits_are_refused() -> None:
              'coolant_temperature.experiment_min = 30.0 degC cannot be used: '
              'coolant_temperature: lower = 303.15 must be below upper = 300.65'),
             ('temperature.experiment_max', 20.0, 'temperature.experiment_max = 20.0 degC cannot'),
-            ('experiment_longest_hold', 10.0, 'experiment_longest_hold = 10.0 s cannot be used: '
+            ('experiment_max_hold_time', 10.0, 'experiment_max_hold_time = 10.0 s cannot be used: '
              'hold_shortest = 30.0 s must be above 0 and not above hold_longest = 10.0 s'),
-            ('experiment_on', 'setpoints', 'must be one of command, manual, setpoint')):
+            ('experiment_signal', 'setpoints', 'must be one of command, manual, setpoint')):
         assert words in TABLE.check(TABLE.snapshot({name: given}))
 
 
@@ -227,7 +227,7 @@ def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Be
     assert ros.wait_until(lambda: '/bench publishes' in (answer := bench.start())[1]
                           and answer) == (
         False, 'refused: /bench publishes on /unit_1/jacket: end it, or choose another '
-        'experiment_on')
+        'experiment_signal')
     ros.node.destroy_publisher(other)
 
 

@@ -22,11 +22,11 @@ from support.tanks import LEVELS, linear, PUMPS, TANKS
 STATUS, SERVICE = 'trainer: experiment', 'trainer/experiment'
 LOW, HIGH, RATE, SAFE = (5.0, 1.0), (7.5, 3.0), (0.5, 0.125), (6.0, 2.0)  # V, V/s
 TRAINER = {
-    'system': 'two_tanks', 'record_at_start': False, 'experiment_shortest_hold': 5.0,
-    'experiment_longest_hold': 20.0, **{
+    'system': 'two_tanks', 'record_at_start': False, 'experiment_min_hold_time': 5.0,
+    'experiment_max_hold_time': 20.0, **{
         f'{name}.{key}': numbers[i] for i, name in enumerate(PUMPS) for key, numbers in (
             ('experiment_min', LOW), ('experiment_max', HIGH), ('experiment_rate_limit', RATE),
-            ('safe', SAFE))},
+            ('safe_value', SAFE))},
     **{f'{name}.experiment_{end}': bound for name in LEVELS
        for end, bound in (('min', 0.02), ('max', 0.5))}}
 PLANT = {'system': 'two_tanks', 'sample_period': 1.0, 'lockstep': True, 'speed': 0.0}
@@ -105,12 +105,12 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
     model = linear(tmp_path)
     ros.start('controller', {'system': 'two_tanks', 'model': model, **{
         f'{name}.{key}': number for name in PUMPS for key, number in (
-            ('min', 0.0), ('max', 12.0), ('safe', 2.0))}, **{
+            ('min', 0.0), ('max', 12.0), ('safe_value', 2.0))}, **{
         f'{name}.weight': 1e4 for name in LEVELS}})
     asked = [ros.speak(JointState, f'{name}/setpoint', to='controller') for name in LEVELS]
     ros.start('trainer', {
-        **TRAINER, 'model': model, 'experiment_on': 'setpoint', 'experiment_length': 250.0,
-        'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 50.0, **{
+        **TRAINER, 'model': model, 'experiment_signal': 'setpoint', 'experiment_length': 250.0,
+        'experiment_min_hold_time': 20.0, 'experiment_max_hold_time': 50.0, **{
             f'{name}.setpoint_{end}': float(bound[i]) for i, name in enumerate(LEVELS)
             for end, bound in (('min', low), ('max', high))}})
     ros.meet('trainer')
@@ -169,7 +169,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
 
 
 def test_setpoints_that_nobody_tracks_refuse_the_start(ros: Harness, tmp_path: Path) -> None:
-    bench = Bench(ros, tmp_path, experiment_on='setpoint', experiment_timeout=1.0, **{
+    bench = Bench(ros, tmp_path, experiment_signal='setpoint', experiment_timeout=1.0, **{
         f'{name}.setpoint_{end}': bound for name in LEVELS
         for end, bound in (('min', 0.1), ('max', 0.2))})
     assert bench.start(0.15, 0.25)[1] == (
@@ -188,10 +188,10 @@ def test_pumps_through_a_controller_that_leaves_manual_mode(ros: Harness, tmp_pa
     commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
     ros.start('controller', {'system': 'two_tanks', 'model': model, **{
         f'{name}.{key}': number for name in PUMPS for key, number in (
-            ('min', 0.0), ('max', 12.0), ('safe', 2.0))}})
+            ('min', 0.0), ('max', 12.0), ('safe_value', 2.0))}})
     ros.meet('controller')
     ros.set_bool('controller/set_automatic', False)
-    ros.start('trainer', {**TRAINER, 'model': model, 'experiment_on': 'manual',
+    ros.start('trainer', {**TRAINER, 'model': model, 'experiment_signal': 'manual',
                           'experiment_length': 60000.0})
     ros.meet('trainer')
     ros.start('plant', {**PLANT, 'speed': 50.0})

@@ -46,7 +46,7 @@ def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
 def test_plants_of_one_call_are_trained_in_one_place(ros: Harness, tmp_path: Path) -> None:
     given = arguments(tmp_path, {'a': ['a.mcap'], 'b': ['b.mcap']})
     site = yaml.safe_load((tmp_path / 'site.yaml').read_text())
-    site['/b/trainer']['ros__parameters']['scheduler'] = 'joblib:2'
+    site['/b/trainer']['ros__parameters']['executor'] = 'joblib:2'
     (tmp_path / 'site.yaml').write_text(yaml.safe_dump(site))
     program = ros.start('trainer', arguments=given)
     assert program.wait(30.0) == 1

@@ -55,12 +55,12 @@ PARAMETERS = """
     model: nowhere.safetensors
 /line/exits/controller:
   ros__parameters:
-    levels: ['sdre', 'hosted_exits:Law']
+    fallback_order: ['sdre', 'hosted_exits:Law']
 /line/struck/controller:
   ros__parameters:
     measurement_timeout: 0.3
     hold_timeout: 0.2
-    coolant_temperature.safe: {safe}
+    coolant_temperature.safe_value: {safe}
     coolant_temperature.rate_limit: 1000.0
 """
 

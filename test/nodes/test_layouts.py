@@ -21,7 +21,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.estimation import Innovation
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.controller_messages import active_limits, internals
+from koopman_ros.ros.controller_messages import active_constraints, internals
 
 # What a layout shows: topics with one value by themselves, and internals by their names.
 TEMPERATURES = {reactor.TEMPERATURE, reactor.ACTIVE_SETPOINT, reactor.PREDICTED_TEMPERATURE,
@@ -37,9 +37,9 @@ ONE, NONE = np.ones(1), np.zeros(1)
 ESTIMATE = EstimateReport(ONE, NONE, False, np.eye(1), Innovation(NONE, 1.0, 1))
 PLAN = Plan(np.arange(2.0), np.ones((2, 1)), np.ones((1, 1)), NONE, NONE, NONE)
 NAMES = {
-    topics.CONTROLLER_STATE: list(internals(WIRING.signals, Report(
+    topics.CONTROLLER_INTERNALS: list(internals(WIRING.signals, Report(
         Mode.AUTOMATIC, 'mpc', estimate=ESTIMATE), Time(), '').name),
-    topics.ACTIVE_LIMITS: list(active_limits(WIRING.signals, PLAN, Time(), '').name)}
+    topics.ACTIVE_CONSTRAINTS: list(active_constraints(WIRING.signals, PLAN, Time(), '').name)}
 
 
 def published(topic: str, field: str, name: str = '') -> str:
@@ -82,7 +82,7 @@ def test_plotjuggler_shows_what_is_published_and_subscribes_to_it() -> None:
 
 def test_a_kalman_filter_leaves_the_places_of_the_others() -> None:
     plain = internals(WIRING.signals, Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name
-    assert NAMES[topics.CONTROLLER_STATE][:len(plain)] == list(plain)
+    assert NAMES[topics.CONTROLLER_INTERNALS][:len(plain)] == list(plain)
 
 
 def test_foxglove_shows_what_is_published() -> None:

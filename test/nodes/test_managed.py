@@ -200,7 +200,7 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert not [s for s in ros.statuses if s.name.startswith('controller')]
     assert len(loop.commands) == count
     # code that was not named at the start
-    for name, code in (('levels', ['sdre', 'json:dumps']), ('estimator', 'this:s')):
+    for name, code in (('fallback_order', ['sdre', 'json:dumps']), ('estimator', 'this:s')):
         (result,) = ros.set_parameters('controller', **{name: code})
         assert 'fixed at start' in result.reason
     bad = tmp_path / 'bad.safetensors'
@@ -243,7 +243,7 @@ def test_controller_goes_on_from_the_last_command(ros: Harness) -> None:
     ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller').publish(
         temperature(8.0, 0.0))
     ros.wait_until(lambda: loop.answered() and loop.commands[-1].temperature == 8.0)
-    records = ros.listen(String, topics.CONTROLLER_EVENTS)
+    records = ros.listen(String, topics.EVENT_LOG)
     ros.meet('controller')
     for way in ('deactivate', 'cleanup', 'configure', 'activate'), ('deactivate', 'activate'):
         count = len(loop.commands)
@@ -360,9 +360,9 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     stays_down(ros, 'trainer')
     assert not [s for s in ros.statuses if s.name.startswith('trainer')]
     assert len(loop.commands) == count
-    (result,) = ros.set_parameters('trainer', equations='this:s')
+    (result,) = ros.set_parameters('trainer', physical_model='this:s')
     assert 'fixed at start' in result.reason
-    assert ros.set_parameters('trainer', **{'coolant_temperature.safe': 10.0})[0].successful
+    assert ros.set_parameters('trainer', **{'coolant_temperature.safe_value': 10.0})[0].successful
     assert change(ros, 'trainer', 'configure')
     assert change(ros, 'trainer', 'activate')
     timer = begin()

@@ -54,7 +54,7 @@ def own_laws(tmp_path: Path) -> Iterator[Harness]:
 
 def test_a_law_of_ones_own_acts_by_its_own_parameters(own_laws: Harness) -> None:
     bench = Bench(own_laws, {
-        **PURE, 'levels': ['own_laws:Proportional', 'linear'], 'Proportional.gain': 3.0,
+        **PURE, 'fallback_order': ['own_laws:Proportional', 'linear'], 'Proportional.gain': 3.0,
         'coolant_temperature.rate_limit': 0.0})
     at_rest = bench.measure(STEADY, 2.0).temperature
     assert bench.measure(STEADY + 0.5, 3.0).temperature == pytest.approx(at_rest - 1.5, abs=0.02)
@@ -73,7 +73,7 @@ def test_a_law_of_ones_own_acts_by_its_own_parameters(own_laws: Harness) -> None
 
 
 def test_a_law_that_raises_hands_over_to_the_next_level(own_laws: Harness) -> None:
-    bench = Bench(own_laws, {'levels': ['own_laws:Raises', 'sdre', 'linear']})
+    bench = Bench(own_laws, {'fallback_order': ['own_laws:Raises', 'sdre', 'linear']})
     bench.measure(STEADY, 2.0)
     status = own_laws.wait_for_status(STATUS, lambda s: 'KeyError' in s.message)
     assert value(status, 'active law') == 'learned law'
@@ -81,6 +81,6 @@ def test_a_law_that_raises_hands_over_to_the_next_level(own_laws: Harness) -> No
 
 
 def test_a_law_without_compute_is_refused_at_the_start(own_laws: Harness) -> None:
-    process = own_laws.start('controller', {'levels': ['own_laws:WithoutCompute']})
+    process = own_laws.start('controller', {'fallback_order': ['own_laws:WithoutCompute']})
     assert own_laws.wait_for_end(process) != 0
     assert 'lacks compute' in process.output()

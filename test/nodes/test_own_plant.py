@@ -89,17 +89,17 @@ def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempP
 def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
         overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
     assert summary(recorded).counts['/power_setpoint'] > 0
-    lift, linear = train(ros, overlay, TRAIN, 'training_starts:=1')
+    lift, linear = train(ros, overlay, TRAIN, 'restarts:=1')
     # the noise of the sensor is 0.2 K
     assert lift < 0.25 < 1.0 < linear
     model = load(folder / 'oven.safetensors')
     assert (model.provenance.plant, model.n_z) == ('oven', 2)
 
     measured = ros.listen(Temperature, '/temperature')
-    start(ros, overlay, CONTROL, '-p', 'controller:disturbance_bandwidth:=0.0')
+    start(ros, overlay, CONTROL, '-p', 'controller:observer_bandwidth:=0.0')
     ros.meet('controller')
     # the law alone, without noise: what is left is the error of the lift
-    start(ros, overlay, RUN, '-p', 'speed:=0.0', '-p', 'plant:temperature.noise:=0.0')
+    start(ros, overlay, RUN, '-p', 'speed:=0.0', '-p', 'plant:temperature.measurement_noise:=0.0')
     ((topic, kind, content),) = re.findall(r"ros2 topic pub --once (\S+) (\S+) '(.*)'", PAGE)
     asked = topics.message_class(kind)(**yaml.safe_load(content))
     ros.speak(type(asked), topic, to='controller').publish(asked)

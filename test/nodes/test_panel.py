@@ -263,9 +263,9 @@ def finds_what_was_before(desk: Panel, heard: list[Temperature]) -> None:
 
 def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     node, ros = desk.node, desk.ros
-    actions: list[String] = ros.listen(String, topics.OPERATOR_ACTIONS)
+    actions: list[String] = ros.listen(String, topics.AUDIT_LOG)
     (publisher,) = (one for one in node.publishers
-                    if one.topic_name == f'/{topics.OPERATOR_ACTIONS}')
+                    if one.topic_name == f'/{topics.AUDIT_LOG}')
     # the trainer records them, too
     desk.wait(lambda: publisher.get_subscription_count() >= 2)
     desk.wait(lambda: node.snapshot.mode == 'automatic' and not node.snapshot.silences
@@ -298,7 +298,7 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     desk.wait(lambda: {'setpoint', 'mode', 'parameter'} <= {
         mark.kind for mark in node.view.trends.marks(0.0, 1e12)})
     assert controller.stop() == 0
-    desk.wait(lambda: not node.count_publishers(topics.CONTROLLER_EVENTS))
+    desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))
     assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(
         False, 'the controller is not running: start it')
     ros.wait_until(lambda: len(actions) >= 11)

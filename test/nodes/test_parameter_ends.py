@@ -38,11 +38,11 @@ STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324
 TINY = 1e-300
 # What the names of the trainer's parameters for experiments begin with.
-EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperature.safe',
+EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperature.safe_value',
               'temperature.experiment', 'temperature.setpoint')
 # A lower limit and its upper one, which must change together to reach the ends.
-PAIRS = (('validity_margin', 'linear_margin'),
-         ('experiment_shortest_hold', 'experiment_longest_hold'),
+PAIRS = (('learned_model_margin', 'linear_model_margin'),
+         ('experiment_min_hold_time', 'experiment_max_hold_time'),
          *((f'{name}min', f'{name}max') for name in (
              'coolant_temperature.', 'mpc.temperature.', 'temperature.sensor_',
              'coolant_temperature.experiment_', 'temperature.experiment_',

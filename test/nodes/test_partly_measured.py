@@ -27,19 +27,19 @@ SAMPLES = 600
 
 
 def test_no_offset_is_left_and_what_is_not_measured_is_known(ros: Harness) -> None:
-    internals = ros.listen(JointState, topics.CONTROLLER_STATE)
+    internals = ros.listen(JointState, topics.CONTROLLER_INTERNALS)
     measured = ros.listen(Temperature, 'temperature')
-    recorded = ros.listen(String, topics.CONTROLLER_EVENTS)
+    recorded = ros.listen(String, topics.EVENT_LOG)
     setpoint = ros.node.create_publisher(Temperature, 'setpoint', topics.LOOP_QOS)
     ros.start('controller', {
         'system': 'two_state', 'states_measured': "['temperature [K]']",
-        'temperature.noise': 0.05, 'coolant_temperature.wander': 1.0})
+        'temperature.measurement_noise': 0.05, 'coolant_temperature.disturbance_noise': 1.0})
     ros.meet('controller')
     ros.wait_until(setpoint.get_subscription_count)
     setpoint.publish(temperature(SETPOINT))
     ros.start('plant', {
         'system': 'two_state', 'constants.feed_temperature': FEED - to_kelvin(0.0), 'speed': 0.0,
-        'duration': float(SAMPLES), 'temperature.noise': 0.05, 'lockstep': True,
+        'duration': float(SAMPLES), 'temperature.measurement_noise': 0.05, 'lockstep': True,
         'lockstep_subscribers': 2})
     status = ros.wait_for_status('controller: control', lambda status: (
         int(value(status, 'measurements')) >= SAMPLES))
@@ -78,16 +78,17 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law(ros: Harness, tmp_p
                           Provenance('signals alone')), file)
     measured = ros.listen(Temperature, 'temperature')
     commands = ros.listen(Temperature, 'coolant_setpoint')
-    recorded = ros.listen(String, topics.CONTROLLER_EVENTS)
-    internals = ros.listen(JointState, topics.CONTROLLER_STATE)
+    recorded = ros.listen(String, topics.EVENT_LOG)
+    internals = ros.listen(JointState, topics.CONTROLLER_INTERNALS)
     ros.start('controller', {
-        'system': 'none', 'model': file, 'levels': "['pi']", 'pi.temperature.gain': 3.0,
-        'pi.temperature.integral_time': 60.0, 'coolant_temperature.safe': 5.0,
-        'transfer_time': 10.0,
-        'temperature.noise': 0.02, 'model_check_factor': 0.0})
+        'system': 'none', 'model': file, 'fallback_order': "['pi']", 'pi.temperature.gain': 3.0,
+        'pi.temperature.integral_time': 60.0, 'coolant_temperature.safe_value': 5.0,
+        'bumpless_transfer_time': 10.0,
+        'temperature.measurement_noise': 0.02, 'model_check_factor': 0.0})
     ros.speak(Temperature, 'setpoint', to='controller').publish(temperature(SETPOINT))
     ros.start('plant', {
-        'system': 'two_state', 'speed': 50.0, 'temperature.noise': 0.02, 'lockstep': True,
+        'system': 'two_state', 'speed': 50.0, 'temperature.measurement_noise': 0.02,
+        'lockstep': True,
         'lockstep_subscribers': 2})
 
     def rests() -> bool:
@@ -95,7 +96,7 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law(ros: Harness, tmp_p
         return len(measured) > 120 and abs(sum(late) / len(late) - SETPOINT) < 0.05
 
     ros.wait_until(rests)
-    ros.set_parameters('controller', model='two_state', levels=['sdre', 'linear'])
+    ros.set_parameters('controller', model='two_state', fallback_order=['sdre', 'linear'])
     begun = len(measured)
     status = ros.wait_for_status('controller: control', lambda status: (
         value(status, 'active law') == 'learned law'))

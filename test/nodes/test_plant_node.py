@@ -113,7 +113,7 @@ def bench(shared_bench: Bench) -> Bench:
 def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Bench) -> None:
     (steady,) = bench.wait_for_more(1)
     assert steady.variance == 0.0
-    bench.set(**{'temperature.noise': 0.5})
+    bench.set(**{'temperature.measurement_noise': 0.5})
     bench.ros.wait_until(lambda: bench.measured[-1].variance > 0.0)
     measured = bench.wait_for_more(50)
     assert {message.variance for message in measured} == {0.25}
@@ -122,7 +122,7 @@ def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Ben
         [steady.temperature + sensor_noise(0.5, SEED, round(seconds(message)) - 1)
          for message in measured], abs=1e-6)
 
-    bench.set(**{'temperature.noise': 0.0, 'temperature.bias': 2.0})
+    bench.set(**{'temperature.measurement_noise': 0.0, 'temperature.bias': 2.0})
     bench.wait_for(lambda celsius: celsius == pytest.approx(steady.temperature + 2.0, abs=1e-6))
     biased = seconds(bench.measured[-1])
     status = bench.status(lambda s: float(value(s, 'time [s]')) >= biased)

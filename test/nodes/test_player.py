@@ -39,13 +39,13 @@ from support.nodes import complaint, run_here, temperature, TIMEOUT
 SAMPLES = 61
 SETPOINT = 42.0  # degC
 TOPICS = {'/temperature', '/concentration', '/setpoint', '/active_setpoint', '/coolant_setpoint',
-          '/coolant_temperature', '/predicted_temperature', '/controller_state',
-          '/controller_events', '/diagnostics'}
+          '/coolant_temperature', '/predicted_temperature', '/controller_internals',
+          '/event_log', '/diagnostics'}
 LATCHED = {'/active_setpoint', '/coolant_temperature'}
 # A minute of a loop with a step, a noisy two-state reactor and a slow coolant.
 SCENARIO = reactor.scenario(
     reactor.MODEL, SETPOINT + 273.15, step_time=20.0, duration=60.0, speed=60.0,
-    plant={'system': 'two_state', 'temperature.noise': 0.05, 'seed': 3,
+    plant={'system': 'two_state', 'temperature.measurement_noise': 0.05, 'seed': 3,
            'coolant_temperature.delay': 1.0, 'coolant_temperature.lag': 2.0})
 
 
@@ -138,7 +138,7 @@ def test_lockstep_gives_bit_identical_commands(
         ros: Harness, recorded_loop: Path, capfd: pytest.CaptureFixture[str]) -> None:
     recorded = records.read_series(recorded_loop, '/coolant_setpoint')
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
-    ros.start('controller', {'disturbance_bandwidth': 0.0})
+    ros.start('controller', {'observer_bandwidth': 0.0})
     ros.meet('controller')
     play(recorded_loop, rate=0.0)
     ros.wait_until(lambda: len(commands) >= SAMPLES)

@@ -40,7 +40,7 @@ from support.nodes import opened, temperature, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
 SETPOINTS = [(20.0 * k, 46.0 + math.sin(k)) for k in range(1, 150)]
-SETTINGS = {'temperature.setpoint_ramp': 0.05, 'disturbance_bandwidth': 0.0166666666667}
+SETTINGS = {'temperature.setpoint_ramp': 0.05, 'observer_bandwidth': 0.0166666666667}
 
 
 def put(content: bytes, path: Path) -> None:
@@ -102,7 +102,7 @@ def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None
     bad = itertools.cycle((b'', b'garbage' * 1000, whole[:len(whole) // 2], whole[:-1]))
     put(whole, file)
     ros.start('controller', {'model': file, **SETTINGS, **PATIENT})
-    records = ros.listen(String, topics.CONTROLLER_EVENTS)
+    records = ros.listen(String, topics.EVENT_LOG)
     bench = Bench(ros)
     setpoint = ros.speak(Temperature, reactor.SETPOINT, to='controller')
     # with the snapshot for who listens
@@ -223,7 +223,7 @@ def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPa
     center = SHIPPED.states.center
 
     def situation(*levels: str) -> model_checks.Situation:
-        parameters = table_of(SHIPPED, {}).snapshot({'levels': levels})
+        parameters = table_of(SHIPPED, {}).snapshot({'fallback_order': levels})
         return model_checks.Situation(parameters, State(), center, None)
 
     model_checks.refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
@@ -267,7 +267,7 @@ def test_model_that_predicts_what_was_measured_much_worse_is_refused(
     """It takes over neither by parameter nor by service, unless the operator insists."""
     file = tmp_path / 'model.safetensors'
     put(model_path('reactor_nz4').read_bytes(), file)
-    ros.start('controller', {'model': file, 'transfer_time': 0.0, **PATIENT})
+    ros.start('controller', {'model': file, 'bumpless_transfer_time': 0.0, **PATIENT})
     bench = Bench(ros)
     bench.period = 5.0
     setpoint = ros.speak(Temperature, reactor.SETPOINT, to='controller')

@@ -40,7 +40,7 @@ COOLANT = 24.5  # degC, not what the law would command
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.
 SETTINGS = {'coolant_temperature.rate_limit': 0.5, 'temperature.setpoint_ramp': 1.0,
             'measurement_timeout': 0.0}
-RECORDS = f'/{topics.CONTROLLER_EVENTS}'
+RECORDS = f'/{topics.EVENT_LOG}'
 
 
 class Operator:
@@ -89,7 +89,7 @@ class Operator:
 
     def join(self) -> int:
         """Subscribe to the records, as another recorder would; return the snapshot's number."""
-        heard = self.ros.listen(String, topics.CONTROLLER_EVENTS)
+        heard = self.ros.listen(String, topics.EVENT_LOG)
         return self.ros.wait_until(lambda: next(
             (record.number for record in (parse(message.data) for message in heard)
              if record.event == SNAPSHOT), 0))
@@ -133,9 +133,9 @@ def tune_and_swap(operator: Operator) -> None:
     for change, taken in (
             ({'coolant_temperature.weight': 0.3}, True),
             ({'coolant_temperature.weight': -1.0}, False),
-            ({'levels': ['none', 'linear']}, False),
-            ({'levels': ['mpc', 'sdre', 'linear'], 'mpc.temperature.max': 46.2}, True),
-            ({'setpoint_filter': 15.0, 'disturbance_bandwidth': 0.05}, True),
+            ({'fallback_order': ['none', 'linear']}, False),
+            ({'fallback_order': ['mpc', 'sdre', 'linear'], 'mpc.temperature.max': 46.2}, True),
+            ({'setpoint_filter_time': 15.0, 'observer_bandwidth': 0.05}, True),
             ({'model': str(operator.model), 'coolant_temperature.weight': 0.5}, True),
             ({'model': 'none'}, False)):
         assert operator.set(**change) is taken
@@ -177,7 +177,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ros.start('controller', SETTINGS | {'model': 'reactor_nz3'})
         ros.wait_until(lambda: operator.thermometer.get_subscription_count() >= 2)
         ros.meet('controller')
-        runs = ros.listen(String, topics.CONTROLLER_EVENTS)
+        runs = ros.listen(String, topics.EVENT_LOG)
         ros.wait_until(lambda: len({parse(message.data).run for message in runs}) == 1)
         # each who joins is sent a record, which the trainer has once it has found the controller
         ros.wait_until(lambda: operator.join() and int(value(
@@ -331,9 +331,9 @@ def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
     (('-p', 'bags:=[none.mcap]'), "bag 'none.mcap' does not exist"),
     (('-p', "bags:=['']"), "bags = [''] must hold at least one path"),
     (('-p', 'new_model:=none'), 'none.safetensors'),
-    (('-r', '__ns:=/unit_1'), "no records of a controller on '/unit_1/controller_events', it "
-                              'has /controller_events, /coolant_setpoint, /temperature'),
-    (('-r', 'controller_events:=coolant_setpoint'),
+    (('-r', '__ns:=/unit_1'), "no records of a controller on '/unit_1/event_log', it "
+                              'has /event_log, /coolant_setpoint, /temperature'),
+    (('-r', 'event_log:=coolant_setpoint'),
      'is sensor_msgs/msg/Temperature and not std_msgs'),
     *((('-p', 'new_model:=reactor_nz4', '-p', given), words) for given, words in (
         ('coolant_temperature.min:=40.0', 'coolant_temperature.min = 40.0 degC must be below'),
@@ -371,7 +371,7 @@ def test_who_subscribes_is_sent_the_state_twice_where_nothing_happens(ros: Harne
     """The first may come before the subscriber knows the controller, and is lost then."""
     ros.start('controller')
     ros.meet('controller')
-    heard = ros.listen(String, topics.CONTROLLER_EVENTS)
+    heard = ros.listen(String, topics.EVENT_LOG)
     ros.wait_until(lambda: len(heard) > 1)
     records = [parse(message.data) for message in heard]
     assert {record.event for record in records} == {SNAPSHOT}

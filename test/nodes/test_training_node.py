@@ -20,7 +20,7 @@ from support.nodes import children, complaint, ended, run_here, value
 from support.recorded_runs import driven, reactor, write_bag
 
 STATUS = 'trainer: training'
-QUICK = {'model_coordinates': 2, 'training_starts': 1}
+QUICK = {'lifted_dimension': 2, 'restarts': 1}
 
 
 def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Path) -> None:
@@ -115,13 +115,14 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(ros: Harness, tmp_path: Pat
 def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     # no quicker: what is recorded while the machine is busy is what there is to train from
     ros.start('plant', {
-        'lockstep': True, 'speed': 30.0, 'lockstep_subscribers': 2, 'temperature.noise': 0.1,
+        'lockstep': True, 'speed': 30.0, 'lockstep_subscribers': 2,
+        'temperature.measurement_noise': 0.1,
         'constants.heat_transfer_coefficient': 0.8 * constant('heat_transfer_coefficient')})
     process = ros.start('trainer', {
         'output': tmp_path / 'run.mcap', 'model_output': tmp_path / 'new.safetensors',
         'model_class': 'linear',
         # which none meets
-        'gate_margin': 0.99,
+        'acceptance_margin': 0.99,
         'experiment_length': 600.0, 'coolant_temperature.experiment_min': 4.0,
         'min_free_disk': 0.0})
     ros.meet('plant')

@@ -30,9 +30,9 @@ DESK = (1000, 600)  # pixels
 PHONE = (390, 844)
 # an experiment of a few seconds, and a training
 TRAINER = {
-    'model_class': 'polynomial', 'training_starts': 1, 'record_at_start': False,
-    'min_free_disk': 0.0, 'gate_condition': 1e9, 'experiment_on': 'setpoint',
-    'experiment_length': 900.0, 'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
+    'model_class': 'polynomial', 'restarts': 1, 'record_at_start': False,
+    'min_free_disk': 0.0, 'max_condition_number': 1e9, 'experiment_signal': 'setpoint',
+    'experiment_length': 900.0, 'experiment_min_hold_time': 20.0, 'experiment_max_hold_time': 60.0,
     'temperature.setpoint_min': 40.0, 'temperature.setpoint_max': 50.0}
 MEASUREMENTS = 420  # that are learned from
 TRIES = 3
@@ -92,7 +92,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         controller = ros.start('controller', {'model_check_factor': 0.0})
         ros.start('trainer', {**TRAINER, 'output': folder / 'run.mcap', 'model_output': model})
         plant = ros.start('plant', {'speed': 10.0})
-        actions: list[String] = ros.listen(String, topics.OPERATOR_ACTIONS)
+        actions: list[String] = ros.listen(String, topics.AUDIT_LOG)
         url = ros.wait_until(lambda: ADDRESS.search(panel.output()))[1]
         yield Site(ros, browser, url, panel, controller, plant, model, actions)
 
@@ -163,7 +163,8 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
     assert site.plant.stop() == 0
     site.plant = ros.start('plant', {
         'start_time': 10_000.0, 'speed': 100.0, 'lockstep': True, 'lockstep_subscribers': 3,
-        'temperature.noise': 0.01, 'constants.heat_transfer_coefficient': 0.8 * reactor.constant(
+        'temperature.measurement_noise': 0.01,
+        'constants.heat_transfer_coefficient': 0.8 * reactor.constant(
             'heat_transfer_coefficient')})
     with site.page('/model') as page:
         recording, training = card(page, 'Recording'), card(page, 'Training')
@@ -312,10 +313,10 @@ def test_a_plan_is_drawn_ahead_of_now_while_there_is_one(site: Site) -> None:
                 legend[0].data.filter(name => name.includes('planned')).length];
     }"""
     with site.page('/trends') as page:
-        site.ros.set_parameters('controller', levels=['mpc', 'sdre'])
+        site.ros.set_parameters('controller', fallback_order=['mpc', 'sdre'])
         page.wait_for_function(
             f'() => {{ const [ahead, drawn] = ({planned})(); return ahead && drawn === 2; }}')
-        site.ros.set_parameters('controller', levels=['sdre', 'linear'])
+        site.ros.set_parameters('controller', fallback_order=['sdre', 'linear'])
         page.wait_for_function(
             f'() => {{ const [ahead, drawn] = ({planned})(); return !ahead && drawn === 0; }}')
 

@@ -242,7 +242,7 @@ def test_a_fallback_has_its_reason(levels: tuple[str, ...] | None, level: str, m
                                    reason: str, shown: str, fallback: bool) -> None:
     own = view()
     if levels:
-        own.take_parameters(CONTROLLER, {'levels': parameter('levels', levels)})
+        own.take_parameters(CONTROLLER, {'fallback_order': parameter('fallback_order', levels)})
     answered(own, level, mode)
     status(own, CONTROL, OK, mode, {'reason': reason}, NOW)
     now = own.snapshot(NOW)

@@ -49,8 +49,9 @@ def running(shared_ros: Harness) -> Harness:
     ({'model': 'reactor_nz5'}, 'the old model is kept: no model file at '),
     ({'no_such_thing': 1.0}, 'undeclared parameter'),
     ({'temperature.topic': 'elsewhere'}, 'read-only'),
-    ({'validity_margin': 2.0}, 'validity_margin = 2.0 must be at most linear_margin = '
-     f'{TABLE.rows["linear_margin"].default}: change the other one first'),
+    ({'learned_model_margin': 2.0}, 'learned_model_margin = 2.0 must be at most '
+     f'linear_model_margin = {TABLE.rows["linear_model_margin"].default}: '
+     'change the other one first'),
     ({'max_riccati_residual': 2.0}, 'max_riccati_residual = 2.0 must be in (0, 1]'),
 ])
 def test_change_that_does_not_fit_is_refused_with_the_reason(
@@ -250,7 +251,7 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
         ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 1.5,
                         'coolant_temperature.rate_limit': 100.0,
-                        'coolant_temperature.safe': 10.0})
+                        'coolant_temperature.safe_value': 10.0})
     held = bench.commands[0].temperature
     ros.wait_until(lambda: bench.commands[-1].temperature == 10.0)
     own = own_commands(bench, 1.0)
@@ -277,7 +278,7 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
 
 
 QUICK = {'measurement_timeout': 0.5, 'hold_timeout': 0.5, 'recovery_time': 0.0,
-         'coolant_temperature.rate_limit': 100.0, 'coolant_temperature.safe': 10.0}
+         'coolant_temperature.rate_limit': 100.0, 'coolant_temperature.safe_value': 10.0}
 
 
 def test_stamps_that_cycle_hold_the_coolant_and_then_make_it_safe(ros: Harness) -> None:

@@ -131,7 +131,7 @@ def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> No
     ros.wait_until(client.service_is_ready)
     for on, topic in ((COMMAND, reactor.COOLANT_SETPOINT),
                       (MANUAL, reactor.MANUAL_COOLANT_SETPOINT), (SETPOINT, reactor.SETPOINT)):
-        assert ros.set_parameters('/trainer', experiment_on=on)[0].successful
+        assert ros.set_parameters('/trainer', experiment_signal=on)[0].successful
         # it publishes while it waits for the measurement that does not come
         waiting = client.call_async(SetBool.Request(data=True))
         watch(ros, 'trainer', seen, publishes={f'/{topic}'})

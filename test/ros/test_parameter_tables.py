@@ -351,17 +351,20 @@ def test_a_topic_is_not_commanded_and_measured_at_once() -> None:
 
 
 @pytest.mark.parametrize(('given', 'words'), [
-    ({'equations': 'two_thanks'}, "there is no plant 'two_thanks'"),
-    ({'equations': 'two_state', 'constants_estimated': ['volumes']},
+    ({'physical_model': 'two_thanks'}, "there is no plant 'two_thanks'"),
+    ({'physical_model': 'two_state', 'estimated_constants': ['volumes']},
      'volumes is no constant of TwoStateReactor: it has flow_rate, volume'),
-    ({'equations': 'two_state', 'constants_estimated': ['volume [2, 1]']},
+    ({'physical_model': 'two_state', 'estimated_constants': ['volume [2, 1]']},
      r'the range of volume is \[2, 1\] m\^3, must rise and lie in \[0.001, 100\] m\^3'),
-    ({'equations': 'two_state', 'constants_estimated': ['volume 2 1']}, 'must be a name, or one'),
-    ({'equations': 'two_state', 'constants_estimated': ['volume', 'volume']}, 'each name once'),
-    ({'equations': 'quadruple_tank'}, 'does not say which of its constants are to be estimated'),
-    ({'constants_estimated': ['volume']}, 'constants_estimated names volume, must be empty'),
-    ({'equations': 'two_state', 'hidden_states': 1}, 'hidden_states is 1, must be 0'),
-    ({'equations': 'two_state', 'input_matrix': [2.0]}, 'input_matrix must be a single 0')])
+    ({'physical_model': 'two_state', 'estimated_constants': ['volume 2 1']},
+     'must be a name, or one'),
+    ({'physical_model': 'two_state', 'estimated_constants': ['volume', 'volume']},
+     'each name once'),
+    ({'physical_model': 'quadruple_tank'},
+     'does not say which of its constants are to be estimated'),
+    ({'estimated_constants': ['volume']}, 'estimated_constants names volume, must be empty'),
+    ({'physical_model': 'two_state', 'unmeasured_states': 1}, 'unmeasured_states is 1, must be 0'),
+    ({'physical_model': 'two_state', 'input_matrix': [2.0]}, 'input_matrix must be a single 0')])
 def test_equations_that_a_trainer_cannot_fit_are_refused(given: dict[str, Any], words: str
                                                          ) -> None:
     table = trainer_table(load(model_path(reactor.MODEL)))
@@ -370,9 +373,9 @@ def test_equations_that_a_trainer_cannot_fit_are_refused(given: dict[str, Any], 
 
 def test_equations_of_a_trainer_are_those_of_its_task() -> None:
     table = trainer_table(load(model_path(reactor.MODEL)))
-    fields = table.snapshot({'equations': 'two_state', 'constants_estimated': [
+    fields = table.snapshot({'physical_model': 'two_state', 'estimated_constants': [
         'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training()
-    assert fields['equations'] == 'two_state'
+    assert fields['physical_model'] == 'two_state'
     assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
                                    'reaction_enthalpy': None}
 
@@ -387,7 +390,8 @@ def test_nothing_is_below_absolute_zero() -> None:
     ('reactor_nz4', ('sdre', 'linear')), ('two_state', ('sdre', 'linear')),
     ('pendulum', ('mpc', 'sdre', 'linear')), ('two_state_example', ('mpc', 'sdre', 'linear'))])
 def test_an_unstable_plant_is_planned_for(name: str, levels: tuple[str, ...]) -> None:
-    assert table_of(load(model_path(name)), {'system': ''}).snapshot({}).tuning.levels == levels
+    tuning = table_of(load(model_path(name)), {'system': ''}).snapshot({}).tuning
+    assert tuning.fallback_order == levels
 
 
 @pytest.mark.parametrize('name', ['two_tanks', 'pendulum'])
@@ -397,8 +401,8 @@ def test_times_follow_from_the_modes_of_the_plant(name: str) -> None:
     modes = np.linalg.eigvals(plant.drift_jacobian(plant.nominal_state))
     fastest = 0.0 if np.any(modes.real > 0.0) else float(np.max(np.abs(modes)))
     rows = table_of(load(model_path(name)), {'system': ''}).rows
-    assert rows['disturbance_bandwidth'].default == pytest.approx(fastest, rel=0.05)
-    assert rows['transfer_time'].default == pytest.approx(
+    assert rows['observer_bandwidth'].default == pytest.approx(fastest, rel=0.05)
+    assert rows['bumpless_transfer_time'].default == pytest.approx(
         0.5 / fastest if fastest else 0.0, rel=0.05)
 
 

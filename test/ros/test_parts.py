@@ -31,7 +31,7 @@ from koopman_ros.parameters.signal_topics import Signals, signals_of, Wiring
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
-from koopman_ros.ros.controller_messages import active_limits, planned
+from koopman_ros.ros.controller_messages import active_constraints, planned
 from koopman_ros.ros.controller_status import statuses
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.experiment import PlantExperiment
@@ -222,7 +222,7 @@ def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_sta
     assert [(point.time_from_start.sec, point.time_from_start.nanosec)
             for point in message.points] == [(0, 0), (0, 500_000_000), (2, 250_000_000)]
     assert (message.header.stamp.sec, message.header.frame_id) == (7, 'plant')
-    limits = active_limits(signals, plan, Time(sec=7), 'plant')
+    limits = active_constraints(signals, plan, Time(sec=7), 'plant')
     assert dict(zip(limits.name, limits.position, strict=True)) == {
         'at_range_pump [-1 lower, 1 upper]': 0.0, 'at_range_heater [-1 lower, 1 upper]': 1.0,
         'at_rate_pump [-1 falling, 1 rising]': -1.0, 'at_rate_heater [-1 falling, 1 rising]': 0.0,

@@ -91,7 +91,8 @@ def _udp_sockets(pid: int) -> list[str]:
 def test_signal_while_a_program_loads_ends_it_without_a_word(
         ros: Harness, name: str, number: int, code: int) -> None:
     process = ros.start(name, command=importing(
-        ('scipy',), f'os.kill(os.getpid(), {int(number)})', f'startup import {name} as main'))
+        ('scipy',), f'os.kill(os.getpid(), {int(number)})',
+        f'process_entry import {name} as main'))
     assert ros.wait_for_end(process) == code
     assert process.output() == ''
 
@@ -102,7 +103,7 @@ def test_signal_before_the_interpreter_is_up_and_arguments_are_answered_before_t
         assert process.stop(signal.SIGTERM) == 0
     assert process.output() == ''
     process = ros.start('plant', command=(
-        *importing((), 'pass', 'startup import plant as main'), '--speed=2.0'))
+        *importing((), 'pass', 'process_entry import plant as main'), '--speed=2.0'))
     assert process.wait() == 2
     assert 'started' not in process.output()
 
@@ -144,7 +145,7 @@ def test_signals_during_the_start_end_a_node_cleanly(shared_ros: Harness, name: 
 def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path) -> None:
     process = ros.start('trainer', {'output': tmp_path / 'bag.mcap'}, command=(
         'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh',
-        *importing((), 'pass', 'startup import trainer as main')))
+        *importing((), 'pass', 'process_entry import trainer as main')))
     ros.meet('trainer')
     assert process.stop() == 0
     assert summary(tmp_path / 'bag.mcap').complete

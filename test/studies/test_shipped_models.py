@@ -211,7 +211,7 @@ def keeps(name, model):
     settings = Tuning.for_model(
         model, state_weight=task.Q, input_weight=task.R,
         limits=InputLimits(lower, upper, np.full(system.n_u, np.inf)),
-        levels=('sdre',), transfer_time=30.0)
+        fallback_order=('sdre',), bumpless_transfer_time=30.0)
     loop = simulate(
         Controller(model, settings), Process(system, 0, task.x0, system.nominal_input),
         [at(0.0, SetpointRequest(0, x_ref))], period=promise.period,

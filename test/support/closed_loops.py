@@ -43,7 +43,7 @@ def observing(model: LiftedModel, bandwidth: float, bound: float = np.inf) -> Di
     states = model.states
     return DisturbanceObserver(
         model, Outputs(states.names, states.units, np.eye(model.n_x)), Tuning.for_model(
-            model, disturbance_bandwidth=bandwidth, max_disturbance=bound * model.inputs.scale),
+            model, observer_bandwidth=bandwidth, max_disturbance=bound * model.inputs.scale),
         None)
 
 

@@ -31,7 +31,8 @@ STEADY = 51.8  # degC, near the plant's steady state
 # Silence is told by the wall clock, and a busy machine may be silent where no test means it.
 PATIENT = {'measurement_timeout': 0.0}
 # The law alone, which the temperature of a moment determines.
-PURE = {'disturbance_bandwidth': 0.0, 'transfer_time': 0.0, 'frozen_timeout': 0.0, **PATIENT}
+PURE = {'observer_bandwidth': 0.0, 'bumpless_transfer_time': 0.0, 'stuck_sensor_timeout': 0.0,
+        **PATIENT}
 # What a test may have set. The model is left out: it is read in a moment that a busy machine may
 # miss, and no test on a shared bench sets it.
 RESET = {name: PURE.get(name, row.default)

@@ -53,7 +53,7 @@ class HostileSource:
                       for name, value, read_only in (
                           *((text, 1.0, False) for text in TEXTS),
                           *((f'group {text}.{text}', TEXT, True) for text in TEXTS),
-                          ('model', TEXT, False), ('experiment_on', TEXT, False),
+                          ('model', TEXT, False), ('experiment_signal', TEXT, False),
                           *((f'experiment_{end}', TEXT, True) for end in (
                               'length', 'shortest_hold', 'longest_hold')),
                           (f'{TEXTS[0]}.experiment_min', TEXT, True),

@@ -105,7 +105,7 @@ def write_messages(path: Path, rows: Iterable[tuple[int, float, float]],
                     writer.write(topic, serialize(message), stamp_ns + offset)
             for number, record in enumerate(texts):
                 text.data = record
-                topic = f'{prefix}/controller_events'
+                topic = f'{prefix}/event_log'
                 writer.add_topic(topic, message_definition('std_msgs/msg/String'))
                 writer.write(topic, serialize(text), number)
     return path

@@ -147,7 +147,8 @@ class Law(ABC):
     """
     A control law on a model: from an estimate and a target to an input.
 
-    To add one, derive a class in any module and name it in `levels` as ``module:Class``. It is
+    To add one, derive a class in any module and name it in `fallback_order` as
+    ``module:Class``. It is
     constructed when the controller is configured, and then called once a sample. What it has to
     remember it returns as `memory` and is given at the next sample; it keeps nothing itself, so
     that a replay finds the same commands. An exception is a failure: the next level acts.
@@ -172,7 +173,7 @@ class Law(ABC):
     Parameters: ClassVar[type[Any]] = NoParameters
     #: whether it tracks the set-point without the model's steady state
     model_free: ClassVar[bool] = False
-    #: whether it acts up to `linear_margin`, in place of `validity_margin`
+    #: whether it acts up to `linear_model_margin`, in place of `learned_model_margin`
     extrapolates: ClassVar[bool] = False
 
     def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
@@ -196,7 +197,8 @@ class Law(ABC):
     @property
     def margin(self) -> float:
         """The distance outside the training data, in half-ranges, up to which it acts."""
-        return self.tuning.linear_margin if self.extrapolates else self.tuning.validity_margin
+        tuning = self.tuning
+        return tuning.linear_model_margin if self.extrapolates else tuning.learned_model_margin
 
     def unusable(self) -> Reason | None:
         """Return why it can never act, as for a missing package; None where it can."""

@@ -64,8 +64,9 @@ def limits(most: float = math.inf, rate: float = math.inf) -> InputLimits:
 
 def tuning(model: LiftedModel, **given: object) -> Tuning:
     return Tuning.for_model(model, **{
-        'state_weight': Q, 'input_weight': 1.0, 'limits': limits(), 'levels': ('mpc',),
-        'validity_margin': 100.0, 'linear_margin': 100.0, 'recovery_time': 5.0, **given})
+        'state_weight': Q, 'input_weight': 1.0, 'limits': limits(), 'fallback_order': ('mpc',),
+        'learned_model_margin': 100.0, 'linear_model_margin': 100.0, 'recovery_time': 5.0,
+        **given})
 
 
 def law(model: LiftedModel, own: MPCParameters | None = None, **given: object
@@ -178,7 +179,7 @@ def test_plan_with_active_limits_is_that_of_a_general_optimiser():
         model, limits=InputLimits(inputs.center - u_max * inputs.scale,
                                   inputs.center + u_max * inputs.scale,
                                   change * inputs.scale / interval),
-        input_weight=0.1 / inputs.scale ** 2, validity_margin=100.0, linear_margin=100.0
+        input_weight=0.1 / inputs.scale ** 2, learned_model_margin=100.0, linear_model_margin=100.0
         ).for_signals(model, states.names),
         MPCParameters(upper=states.center + np.array(e_max) * states.scale))
     estimate, target = Estimate(np.array(x), w), steady_state_target(model, np.array(x_ref))
@@ -248,7 +249,7 @@ def test_rate_of_the_inputs_is_planned_for():
     start, costs = [0.3, 0.0], {}
     for name in ('mpc', 'sdre'):
         loop = run(UNSTABLE, start, [0.0, 0.0], 200, input_weight=0.1, limits=limits(5.0, 1.0),
-                   levels=(name,))
+                   fallback_order=(name,))
         steps = np.abs(np.diff(np.concatenate([np.zeros((1, 1)), loop.commands]), axis=0))
         assert np.max(steps[1:]) <= PERIOD * 1.0 + 1e-9
         costs[name] = cost_along(
@@ -345,7 +346,7 @@ def test_without_a_package_the_next_level_acts_with_the_advice(monkeypatch, pack
     for name in [name for name in sys.modules if name.startswith('koopman_ros.control.mpc.')]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    loop = run(OSCILLATOR, [1.0, 0.0], [0.0, 0.0], 20, levels=('mpc', 'sdre'))
+    loop = run(OSCILLATOR, [1.0, 0.0], [0.0, 0.0], 20, fallback_order=('mpc', 'sdre'))
     assert set(loop.levels) == {'sdre'}
     why = loop.reports[-1].reason
     assert (why.code, why.cause.code) == (Code.LAW_FAILED, Code.PACKAGE_MISSING)
@@ -374,7 +375,8 @@ def test_plan_that_takes_too_long_costs_one_sample(monkeypatch):
 
     monkeypatch.setattr(time, 'perf_counter', perf_counter)
     controller = Controller(OSCILLATOR[1], tuning(
-        OSCILLATOR[1], levels=('mpc', 'sdre'), plugins={'mpc': MPCParameters(time_limit=5.0)}))
+        OSCILLATOR[1], fallback_order=('mpc', 'sdre'),
+        plugins={'mpc': MPCParameters(time_limit=5.0)}))
     state = controller.request_setpoint(State(), np.zeros(2))[0]
     levels = []
     for k in range(12):
@@ -387,7 +389,7 @@ def test_plan_that_takes_too_long_costs_one_sample(monkeypatch):
 def test_plan_outside_the_data_is_not_followed():
     _, model = linear_plant(OSCILLATOR[1].A, OSCILLATOR[1].B, reach=1.0)
     # fast, with little to brake it
-    one = law(model, input_weight=100.0, validity_margin=0.1)
+    one = law(model, input_weight=100.0, learned_model_margin=0.1)
     found = compute(one, [0.9, 0.9])
     assert (found.u, found.failure.code) == (None, Code.PLAN_OUTSIDE)
     assert found.failure.values['outside'] > 0.1
