@@ -53,7 +53,7 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize('name', [*(f'own_plugs:{name}' for name in NAMES), *(
     f'plug_{name}:Law' for name in MODULES), 'json:dumps', 'os:getcwd', 'builtins:dict',
     'no.such:thing', ':x', 'sys:'])
-@pytest.mark.parametrize('parameter', ['levels', 'estimator'])
+@pytest.mark.parametrize('parameter', ['fallback_order', 'estimator'])
 def test_law_or_estimator_that_is_none_is_refused(parameter: str, name: str) -> None:
     table = table_of(load(model_path('reactor_nz4')))
     reason = table.check(table.snapshot({

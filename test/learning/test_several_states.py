@@ -232,7 +232,8 @@ def test_constants_are_in_summary_report_and_diagnostics(by_equations):
 @pytest.mark.parametrize(('given', 'words'), [
     ({'physical_model': 'two_tanks', 'unmeasured_states': 1}, 'set unmeasured_states to 0'),
     ({'physical_model': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
-    ({'constants': {'orifice_1': None}}, 'constants name orifice_1, but there are no equations')])
+    ({'constants': {'orifice_1': None}},
+     'constants name orifice_1, but there is no physical_model')])
 def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
         known(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)

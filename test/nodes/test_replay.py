@@ -332,7 +332,7 @@ def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
     (('-p', "bags:=['']"), "bags = [''] must hold at least one path"),
     (('-p', 'new_model:=none'), 'none.safetensors'),
     (('-r', '__ns:=/unit_1'), "no records of a controller on '/unit_1/event_log', it "
-                              'has /event_log, /coolant_setpoint, /temperature'),
+                              'has /coolant_setpoint, /event_log, /temperature'),
     (('-r', 'event_log:=coolant_setpoint'),
      'is sensor_msgs/msg/Temperature and not std_msgs'),
     *((('-p', 'new_model:=reactor_nz4', '-p', given), words) for given, words in (

@@ -145,19 +145,19 @@ def test_other_bytes_within_a_chunk(tmp_path: Path, compression: str, rest: byte
     messages = [Message(channel_id=1, sequence=k, log_time=k, publish_time=k, data=number(k))
                 for k in range(21)]
 
-    def encoded(*records: Any) -> bytes:
+    def encoded(*parts: Any) -> bytes:
         builder = RecordBuilder()
-        for one in records:
+        for one in parts:
             one.write(builder)
         return builder.end()
 
-    records = encoded(Schema(data=NUMBER.text.encode(), encoding='ros2msg', id=1,
-                             name=NUMBER.type_name),
-                      Channel(id=1, topic='/x', message_encoding='cdr', metadata={}, schema_id=1),
-                      *messages[:20]) + rest
+    packed = encoded(Schema(data=NUMBER.text.encode(), encoding='ros2msg', id=1,
+                            name=NUMBER.type_name),
+                     Channel(id=1, topic='/x', message_encoding='cdr', metadata={}, schema_id=1),
+                     *messages[:20]) + rest
     chunk = Chunk(compression=compression, message_start_time=0, message_end_time=0,
-                  data=zstandard.compress(records) if compression else records,
-                  uncompressed_crc=0, uncompressed_size=len(records))
+                  data=zstandard.compress(packed) if compression else packed,
+                  uncompressed_crc=0, uncompressed_size=len(packed))
     path.write_bytes(MCAP0_MAGIC + encoded(Header('ros2', ''), chunk, messages[20], DataEnd(0),
                                            Footer(0, 0, 0)) + MCAP0_MAGIC)
     with pytest.raises(records.BagReadError, match='is damaged'):

@@ -55,7 +55,7 @@ class HostileSource:
                           *((f'group {text}.{text}', TEXT, True) for text in TEXTS),
                           ('model', TEXT, False), ('experiment_signal', TEXT, False),
                           *((f'experiment_{end}', TEXT, True) for end in (
-                              'length', 'shortest_hold', 'longest_hold')),
+                              'length', 'min_hold_time', 'max_hold_time')),
                           (f'{TEXTS[0]}.experiment_min', TEXT, True),
                           (f'{TEXTS[0]}.experiment_max', TEXT, True))}
         for node in (CONTROLLER, TRAINER):

@@ -247,7 +247,7 @@ class Silent(Constants):
         return Vessel(leak=self.leak).system()
 
 
-@pytest.mark.parametrize(('plant', 'physical_model', 'ranges', 'words'), [
+@pytest.mark.parametrize(('plant', 'equations', 'ranges', 'words'), [
     (VESSEL, Silent, {}, 'does not say which of its constants are to be estimated: name some of '
      'leak'),
     (VESSEL, Vessel, {'height': None}, 'height is no constant of Vessel: it has gain, strength'),
