@@ -18,8 +18,8 @@ import casadi
 import numpy as np
 import torch
 
-from benchmarks.problems import Case, WHITENING
-from benchmarks.solvers import Trace
+from benchmarks.problems import PlanningCase, WHITENING
+from benchmarks.solvers import CostTrace
 
 # No stopping tests of its own: the trace ends it. All else are IPOPT's defaults, with MUMPS.
 _OPTIONS: dict[str, Any] = {
@@ -31,19 +31,19 @@ _COMPILER: dict[str, Any] = {'jit': True, 'compiler': 'shell', 'jit_options': {
 Graph = tuple[dict[str, Any], dict[str, Any]]
 
 
-def expanded(case: Case, trace: Trace) -> str:
+def expanded(case: PlanningCase, trace: CostTrace) -> str:
     """Run IPOPT on one graph of scalars over all samples."""
     return _solve(case, trace, _expanded_graph)
 
 
-def compiled(case: Case, trace: Trace) -> str:
+def compiled(case: PlanningCase, trace: CostTrace) -> str:
     """Run IPOPT on compiled derivatives of one sample, summed over the samples."""
     if shutil.which('gcc') is None:
         raise RuntimeError('there is no C compiler: install gcc')
     return _solve(case, trace, _compiled_graph)
 
 
-def _solve(case: Case, trace: Trace, build: Callable[[Case], Graph]) -> str:
+def _solve(case: PlanningCase, trace: CostTrace, build: Callable[[PlanningCase], Graph]) -> str:
     start = os.times()[:4]
     watch = _Watch(case.layout.size, trace)
     problem, derivatives = build(case)
@@ -58,7 +58,7 @@ def _solve(case: Case, trace: Trace, build: Callable[[Case], Graph]) -> str:
 class _Watch(casadi.Callback):
     """Show every iterate to the trace, and stop IPOPT when that is done."""
 
-    def __init__(self, size: int, trace: Trace) -> None:
+    def __init__(self, size: int, trace: CostTrace) -> None:
         casadi.Callback.__init__(self)
         self._size, self._trace = size, trace
         self.construct('watch', {})
@@ -83,14 +83,14 @@ class _Watch(casadi.Callback):
         return [int(self._trace.look(theta))]
 
 
-def _parameters(case: Case, theta: casadi.SX) -> list[casadi.SX]:
+def _parameters(case: PlanningCase, theta: casadi.SX) -> list[casadi.SX]:
     """Return W, b, V and A; casadi counts by columns, the layout by rows."""
     return [casadi.reshape(theta[at.start:at.stop], shape[::-1]).T if len(shape) == 2
             else theta[at.start:at.stop]
             for at, shape in zip(case.layout.slices, case.layout.shapes, strict=True)]
 
 
-def _lift(case: Case, theta: casadi.SX, x: Any, f: Any) -> tuple[casadi.SX, casadi.SX]:
+def _lift(case: PlanningCase, theta: casadi.SX, x: Any, f: Any) -> tuple[casadi.SX, casadi.SX]:
     """Return z (n_z, n) and the residual of the dynamics (n_z, n) at n samples (n_x, n)."""
     W, b, V, A = _parameters(case, theta)
     n = x.shape[1]
@@ -99,7 +99,7 @@ def _lift(case: Case, theta: casadi.SX, x: Any, f: Any) -> tuple[casadi.SX, casa
     return z, casadi.vertcat(f, V @ ((1 - t * t) * (W @ f))) - A @ z
 
 
-def _moments(case: Case) -> tuple[list[tuple[int, int]], casadi.DM, casadi.DM]:
+def _moments(case: PlanningCase) -> tuple[list[tuple[int, int]], casadi.DM, casadi.DM]:
     """Return the entries of E[z z'] - I that vary, their targets and their weights."""
     layout = case.layout
     entries = [(i, j) for j in range(layout.n_x, layout.n_z) for i in range(j + 1)]
@@ -107,7 +107,7 @@ def _moments(case: Case) -> tuple[list[tuple[int, int]], casadi.DM, casadi.DM]:
             casadi.DM([WHITENING * (1.0 if i == j else 2.0) for i, j in entries]))
 
 
-def _expanded_graph(case: Case) -> Graph:
+def _expanded_graph(case: PlanningCase) -> Graph:
     theta = casadi.SX.sym('theta', case.layout.size)
     N = len(case.x)
     x, f = (casadi.SX(casadi.DM(part.T)) for part in (case.x, case.f))
@@ -120,7 +120,7 @@ def _expanded_graph(case: Case) -> Graph:
     return {'x': theta, 'f': cost}, {}
 
 
-def _compiled_graph(case: Case) -> Graph:
+def _compiled_graph(case: PlanningCase) -> Graph:
     p, n_x, N = case.layout.size, case.layout.n_x, len(case.x)
     theta = casadi.SX.sym('theta', p)
     x, f = casadi.SX.sym('x', n_x), casadi.SX.sym('f', n_x)

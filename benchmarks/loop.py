@@ -48,7 +48,7 @@ _RETRY = 0.01  # s between measurements before the first answer
 
 
 @dataclass(frozen=True)
-class Plan:
+class LoopPlan:
     """One extent of the measurements."""
 
     rounds: int  #: of latency, fifty measurements of each side in one
@@ -58,11 +58,11 @@ class Plan:
     compiled: bool  #: whether the other solvers are compiled
 
 
-PLANS = {'quick': Plan(4, 2, 600.0, 80, False),
-         'default': Plan(30, 5, 3600.0, 800, True)}
+PLANS = {'quick': LoopPlan(4, 2, 600.0, 80, False),
+         'default': LoopPlan(30, 5, 3600.0, 800, True)}
 
 
-def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
+def measure(plan: LoopPlan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     """Measure plans and the loop, each beside its like."""
     figures['meaning'] = MEANING
     with tempfile.TemporaryDirectory() as name:
@@ -82,7 +82,7 @@ def _found(job: Any, *arguments: Any, folder: Path) -> dict[str, Any]:
     return {name: one for event in outcome.events for name, one in event.items()}
 
 
-def _plans(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
+def _plans(figures: dict[str, Any], plan: LoopPlan, folder: Path) -> str:
     found = _found(planning.compare_all, tuple(planning.SETPOINTS), plan.plans, plan.compiled,
                    folder=folder)
     quantiles = ('median', 'p99')

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from benchmarks.process import Tell
-from benchmarks.sqp import Problem, solver_of, Sqp
+from benchmarks.sqp import solver_of, Sqp, SqpProblem
 from koopman_ros.control import Controller, SetpointRequest, State
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.mpc import RecedingHorizon
@@ -135,7 +135,7 @@ def _course(case: PartialCase, controller: Controller, samples: int
     return calls, loop.commands, requested
 
 
-def _problem(case: PartialCase, controller: Controller) -> Problem:
+def _problem(case: PartialCase, controller: Controller) -> SqpProblem:
     """Return what the law plans, with the plant's own equations."""
     model, law = controller.model, controller.levels['mpc'].law
     assert isinstance(law, RecedingHorizon) and law.planner is not None
@@ -144,17 +144,17 @@ def _problem(case: PartialCase, controller: Controller) -> Problem:
     if len(lengths) != INTERVALS or not np.ptp(lengths) <= _UNIFORM * interval:
         raise ValueError(f'{case.plant}: the horizon has {len(lengths)} intervals of '
                          f'{lengths.min():g} to {lengths.max():g}, must be {INTERVALS} samples')
-    return Problem(EQUATIONS[case.plant], lengths, case.Q, case.R, case.cost_to_go, case.lower,
+    return SqpProblem(EQUATIONS[case.plant], lengths, case.Q, case.R, case.cost_to_go, case.lower,
                    case.upper, (model.states.scale, model.inputs.scale))
 
 
 def _sides(case: PartialCase, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
     """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
     # here, as whoever starts a comparison does without do-mpc
-    from studies.partly_measured.dompc import Planner
+    from studies.partly_measured.dompc import DoMpcPlanner
 
     model, law = controller.model, controller.levels['mpc'].law
-    planner, none = Planner(case), np.zeros(case.directions.shape[1])
+    planner, none = DoMpcPlanner(case), np.zeros(case.directions.shape[1])
     memory: object = None
 
     def own(y: Array, target: Target) -> Array:

@@ -28,7 +28,7 @@ SYSTEMS = {
 
 
 @dataclass(frozen=True)
-class Case:
+class PlanningCase:
     """One problem with its start, in numpy's arrays, which can be passed to other processes."""
 
     layout: Layout  #: sizes, identity coordinates and one tanh layer
@@ -65,7 +65,7 @@ class Case:
         return value if value == value else float('inf')
 
 
-def build(system: str, samples: int, hidden: int) -> Case:
+def build(system: str, samples: int, hidden: int) -> PlanningCase:
     """Build the start of the round in which the default recipe reaches n_z = 3."""
     plant, lower, upper, scale = SYSTEMS[system]
     # states from the box and their exact drift; time is scaled as in training: rates of order one
@@ -80,4 +80,4 @@ def build(system: str, samples: int, hidden: int) -> Case:
     for n_z in before:
         parent = growth.start(data, n_z, parent, _SEED)
     layout, theta = growth._extended(data, N_Z, parent, _SEED)
-    return Case(layout, x, f, theta.numpy())
+    return PlanningCase(layout, x, f, theta.numpy())

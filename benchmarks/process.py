@@ -19,7 +19,7 @@ Tell: TypeAlias = Callable[[dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ProcessResult:
     """What a job has told."""
 
     events: tuple[dict[str, Any], ...]  #: in their order
@@ -43,7 +43,7 @@ def processor_seconds(pid: int) -> float:
 
 
 def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: float,
-        children: bool = False, needed: Sequence[str] = ()) -> Outcome:
+        children: bool = False, needed: Sequence[str] = ()) -> ProcessResult:
     """
     Run a job in a process; what it had told stays when it is ended.
 
@@ -70,12 +70,12 @@ def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: floa
     finally:
         process.kill()
         process.join()
-    outcome = Outcome(tuple(events), '')
+    outcome = ProcessResult(tuple(events), '')
     failure = outcome.find('error') or ''
     if not failure and process.exitcode:
         failure = (outcome.find('too_long') if process.exitcode == -signal.SIGXCPU
                    else f'ended with status {process.exitcode}')
-    return Outcome(outcome.events, failure)
+    return ProcessResult(outcome.events, failure)
 
 
 def allow(tell: Tell, seconds: float, otherwise: str) -> None:

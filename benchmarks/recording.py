@@ -34,7 +34,7 @@ _TIMEOUT = 30.0  # s, until the trainer has everything
 
 
 @dataclass(frozen=True)
-class Plan:
+class RecordingPlan:
     """One extent of the measurements."""
 
     seconds: float  #: length of the steady stream
@@ -42,10 +42,10 @@ class Plan:
     runs: int  #: files by each writer
 
 
-PLANS = {'quick': Plan(10.0, 20_000, 2), 'default': Plan(60.0, 100_000, 3)}
+PLANS = {'quick': RecordingPlan(10.0, 20_000, 2), 'default': RecordingPlan(60.0, 100_000, 3)}
 
 
-def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
+def measure(plan: RecordingPlan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     """Measure a minute at 1 kHz, and the writers side by side."""
     with tempfile.TemporaryDirectory() as name:
         steady = figures['steady'] = _record(Path(name, 'steady'), _STEADY_RATE, plan.seconds)
@@ -105,7 +105,8 @@ def _publish(publisher: Publisher, rate: float, count: int) -> float:
     return time.monotonic() - begun
 
 
-def _compare(figures: dict[str, Any], messages: Sequence[BagMessage], plan: Plan, path: Path
+def _compare(figures: dict[str, Any], messages: Sequence[BagMessage], plan: RecordingPlan,
+             path: Path
              ) -> str:
     """Time the writers, of whose runs the quickest counts: other programs only slow them."""
     _tell(f'{plan.messages} messages from memory')

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.problems import Case, WHITENING
+from benchmarks.problems import PlanningCase, WHITENING
 from benchmarks.process import allow, Tell
 from koopman_ros.learning.lift.levenberg_marquardt import (
     minimise,
@@ -38,7 +38,7 @@ class Finished(Exception):  # noqa: N818 - an end, not an error
     """All targets are met, or the time is up."""
 
 
-class Trace:
+class CostTrace:
     """
     What a solver has reached when, by a clock that stands still while its iterates are judged.
 
@@ -46,7 +46,7 @@ class Trace:
     the wall is noted beside it. It ends at the last target for rw or at a limit in s.
     """
 
-    def __init__(self, tell: Tell, case: Case, targets: list[float], limit: float) -> None:
+    def __init__(self, tell: Tell, case: PlanningCase, targets: list[float], limit: float) -> None:
         self._tell, self._case, self._targets, self._limit = tell, case, targets, limit
         self._best = math.inf
         self._start = _now()
@@ -90,7 +90,7 @@ def _now() -> np.ndarray:
     return np.array([time.process_time(), time.perf_counter()])
 
 
-def solve(tell: Tell, solver: str, case: Case, targets: list[float], limit: float,
+def solve(tell: Tell, solver: str, case: PlanningCase, targets: list[float], limit: float,
           build_limit: float) -> None:
     """Run one solver on one case."""
     if solver.startswith('ipopt'):
@@ -102,13 +102,13 @@ def solve(tell: Tell, solver: str, case: Case, targets: list[float], limit: floa
     else:
         run = {'ours': ours, 'lbfgs': lbfgs, 'adam': adam}[solver]
     allow(tell, build_limit, f'not built after {build_limit:g} s')
-    trace = Trace(tell, case, targets, limit)
+    trace = CostTrace(tell, case, targets, limit)
     reason = run(case, trace)
     if not trace.done:
         trace.end(reason)
 
 
-def ours(case: Case, trace: Trace) -> str:
+def ours(case: PlanningCase, trace: CostTrace) -> str:
     """Run Levenberg-Marquardt with the hand-derived Jacobian."""
     problem, accepted = case.problem, case.theta
 
@@ -126,7 +126,7 @@ def ours(case: Case, trace: Trace) -> str:
     return minimum.status.value
 
 
-def lbfgs(case: Case, trace: Trace) -> str:
+def lbfgs(case: PlanningCase, trace: CostTrace) -> str:
     """Run torch's L-BFGS with strong Wolfe line search, each point of which counts as reached."""
     theta, objective = _warm(case)
     solver = torch.optim.LBFGS(
@@ -151,7 +151,7 @@ def lbfgs(case: Case, trace: Trace) -> str:
     return 'the line search finds no lower point'
 
 
-def adam(case: Case, trace: Trace) -> str:
+def adam(case: PlanningCase, trace: CostTrace) -> str:
     """Run torch's Adam on all samples, with a rate of 0.01 that halves every 5000 steps."""
     theta, objective = _warm(case)
     solver = torch.optim.Adam([theta], lr=_ADAM_RATE)
@@ -166,7 +166,7 @@ def adam(case: Case, trace: Trace) -> str:
             return ''
 
 
-def _warm(case: Case) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+def _warm(case: PlanningCase) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     """Return a leaf at the start and the objective in other units, both after a first call."""
     theta = case.theta.clone().requires_grad_(True)
     plain = differentiable(case)
@@ -178,7 +178,7 @@ def _warm(case: Case) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     return theta, objective
 
 
-def differentiable(case: Case) -> Callable[[Tensor], Tensor]:
+def differentiable(case: PlanningCase) -> Callable[[Tensor], Tensor]:
     """Write the objective for automatic differentiation, with as few operations as it takes."""
     layout, x, f = case.layout, case.data.x, case.data.f
     at_W, at_b, at_V, at_A = layout.slices

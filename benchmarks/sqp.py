@@ -27,7 +27,7 @@ _OPTIONS: dict[str, Any] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class SqpProblem:
     """What is planned at each sample: the least cost of the way to a target."""
 
     rates: Rates  #: of the state, per time unit
@@ -43,7 +43,7 @@ class Problem:
 class Sqp:
     """Multiple shooting, a Runge-Kutta step an interval; each plan begins with the one before."""
 
-    def __init__(self, problem: Problem, solver: Any) -> None:
+    def __init__(self, problem: SqpProblem, solver: Any) -> None:
         """Plan by what :func:`solver_of` returns, from nothing."""
         self._problem, self._solver = problem, solver
         n, n_u = (len(scale) for scale in problem.scale)
@@ -73,7 +73,7 @@ class Sqp:
         return np.asarray(plan[self._n:self._size] * unit_u)
 
 
-def solver_of(problem: Problem, folder: Path | None = None, compiler: str | None = None) -> Any:
+def solver_of(problem: SqpProblem, folder: Path | None = None, compiler: str | None = None) -> Any:
     """
     Return the solver of a problem: generated C, its quadratic programs in it, if compiled.
 
@@ -92,7 +92,7 @@ def solver_of(problem: Problem, folder: Path | None = None, compiler: str | None
     return casadi.external('sqp', str(library))
 
 
-def _program(problem: Problem) -> dict[str, Any]:
+def _program(problem: SqpProblem) -> dict[str, Any]:
     unit, unit_u = problem.scale
     n, n_u = len(unit), len(unit_u)
     given = casadi.SX.sym('given', 2 * n + n_u)

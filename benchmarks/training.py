@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from benchmarks import process, solvers
-from benchmarks.problems import build, Case, SYSTEMS
+from benchmarks.problems import build, PlanningCase, SYSTEMS
 from koopman_ros.core.plots import drawing, legend, table
 from koopman_ros.plants import describe
 from studies.general.learners import LEARNERS
@@ -47,7 +47,7 @@ _HELD_OUT = 40  # episodes that no training has seen
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """One extent of the comparison."""
 
     cases: tuple[tuple[int, int], ...]  #: (samples, hidden units), each for all systems
@@ -63,18 +63,18 @@ class Plan:
 
 
 PLANS = {
-    'quick': Plan(((300, 8),), 1.0, 10.0, 4e3, 1, learned=('two_tanks',)),
-    'default': Plan(((300, 8), (2000, 8), (2000, 16), (2000, 32)), 20.0, 60.0, 8e3, 3,
+    'quick': TrainingPlan(((300, 8),), 1.0, 10.0, 4e3, 1, learned=('two_tanks',)),
+    'default': TrainingPlan(((300, 8), (2000, 8), (2000, 16), (2000, 32)), 20.0, 60.0, 8e3, 3,
                     learned=('two_tanks', 'van_der_pol', 'pendulum', 'reactor_saddle')),
 }
 
 
-def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
+def measure(plan: TrainingPlan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     """Compare the solvers, and draw rw over time."""
     figures['machine']['threads'] = 1
     figures.update(limit_seconds=plan.limit, cases=[],
                    clock='processor time of one thread; wall_seconds are those on the wall')
-    outcomes: list[dict[str, process.Outcome]] = []  # by solver, for each case
+    outcomes: list[dict[str, process.ProcessResult]] = []  # by solver, for each case
     unbuilt: dict[str, tuple[int, int, str]] = {}  # samples, hidden units, reason, by solver
     with tempfile.TemporaryDirectory() as name:
         within = partial(process.run, folder=Path(name), megabytes=plan.megabytes, needed=_NEEDED)
@@ -86,8 +86,8 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
                     _tell(f'{system}, N = {samples}, {hidden} hidden units: {label}')
                     fewer, narrower, reason = unbuilt.get(solver, (math.inf, math.inf, ''))
                     if fewer <= samples and narrower <= hidden:
-                        found = process.Outcome((), f'left out, as N = {fewer}, {narrower} hidden '
-                                                    f'units {reason}')
+                        found = process.ProcessResult(
+                            (), f'left out, as N = {fewer}, {narrower} hidden units {reason}')
                     else:
                         found = _solve(within, plan, solver, case, [
                             TARGETS[name] for name in TARGETS if name not in NOT_ASKED[system]])
@@ -104,10 +104,10 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
             _draw(folder / 'training.png', outcomes, figures)
 
 
-def _solve(within: Callable[..., process.Outcome], plan: Plan, solver: str, case: Case,
-           targets: list[float]) -> process.Outcome:
+def _solve(within: Callable[..., process.ProcessResult], plan: TrainingPlan, solver: str,
+           case: PlanningCase, targets: list[float]) -> process.ProcessResult:
     """Run a solver on a case; where it is quick, as often as planned, and take the middle run."""
-    outcomes: list[process.Outcome] = []
+    outcomes: list[process.ProcessResult] = []
     while len(outcomes) < plan.runs:
         outcomes.append(within(solvers.solve, solver, case, targets, plan.limit, plan.build_limit))
         if _ended(outcomes[0]) + (outcomes[0].find('built') or 0.0) > _REPEATED:
@@ -119,16 +119,16 @@ def _tell(label: str) -> None:
     print(f'training: {label}', file=sys.stderr, flush=True)
 
 
-def _ended(outcome: process.Outcome) -> float:
+def _ended(outcome: process.ProcessResult) -> float:
     ended = outcome.find('ended')
     return math.inf if ended is None else float(ended)
 
 
-def _trace(outcome: process.Outcome) -> list[dict[str, float]]:
+def _trace(outcome: process.ProcessResult) -> list[dict[str, float]]:
     return [event for event in outcome.events if 'rw' in event]
 
 
-def _figures(system: str, outcomes: dict[str, process.Outcome]) -> dict[str, Any]:
+def _figures(system: str, outcomes: dict[str, process.ProcessResult]) -> dict[str, Any]:
     """Turn what the solvers have told into times by target."""
     def when(clock: str) -> dict[str, dict[str, float | None]]:
         return {name: {solver: next((event[clock] for event in _trace(outcome)
@@ -163,7 +163,8 @@ def _ratios(seconds: dict[str, dict[str, float | None]]) -> dict[str, dict[str, 
             for name, times in seconds.items()}
 
 
-def _models(figures: dict[str, Any], name: str, within: Callable[..., process.Outcome]) -> str:
+def _models(figures: dict[str, Any], name: str,
+            within: Callable[..., process.ProcessResult]) -> str:
     """Learn whole models of a plant by each class, SINDy of pysindy among them."""
     _tell(f'{name}: models of {len(LEARNERS)} classes')
     outcome = within(_learn, name)
@@ -202,7 +203,7 @@ def _table_of(case: dict[str, Any]) -> str:
             + table(('', *TARGETS, 'build [s]', ''), rows))
 
 
-def _draw(path: Path, outcomes: list[dict[str, process.Outcome]], figures: dict[str, Any]
+def _draw(path: Path, outcomes: list[dict[str, process.ProcessResult]], figures: dict[str, Any]
           ) -> None:
     """Draw rw over time for all solvers."""
     with drawing(path, 1, 2, size=(10.0, 5.0)) as (figure, axes):
@@ -225,7 +226,8 @@ def _width(solver: str) -> float:
     return 2.6 if solver == 'ours' else 1.6
 
 
-def _draw_traces(ax: Axes, outcomes: dict[str, process.Outcome], case: dict[str, Any]) -> None:
+def _draw_traces(ax: Axes, outcomes: dict[str, process.ProcessResult],
+                 case: dict[str, Any]) -> None:
     last, built = _FIRST, 0
     for solver, outcome in outcomes.items():
         if not (trace := _trace(outcome)):

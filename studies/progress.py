@@ -11,7 +11,7 @@ import time
 
 from tqdm import tqdm
 
-from koopman_ros.learning.lift.multistart import Progress, Watch
+from koopman_ros.learning.lift.multistart import MultistartProgress, Watch
 
 _LINE_PERIOD = 5.0  # s between plain lines
 
@@ -21,7 +21,7 @@ def training_progress(label: str) -> Iterator[Watch]:
     """Show the starts of a training; give what it yields to :func:`koopman_ros.learning.train`."""
     last_line = time.monotonic()
 
-    def watch(now: Progress) -> bool:
+    def watch(now: MultistartProgress) -> bool:
         nonlocal last_line
         text = f'{now.name}, ' * bool(now.name) + f'n_z {now.n_z}'
         if not math.isnan(now.rw):

@@ -15,7 +15,7 @@ import sys
 
 import numpy as np
 
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.learning.lift.multistart import Watch
@@ -86,7 +86,7 @@ def library_system(name: str) -> ControlAffineSystem:
     return system
 
 
-def lift_samples(name: str, seed: int) -> Samples:
+def lift_samples(name: str, seed: int) -> DriftSamples:
     """Simulate the episodes that the lift of a plant is learned from."""
     lift = LIFTS[name]
     return box_episodes(library_system(name), lift.design, lift.episodes, lift.duration, seed)

@@ -15,7 +15,7 @@ import numpy as np
 
 from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, Course, optimum, Task
@@ -61,7 +61,7 @@ STEPS = ((350.0, 345.0), (350.0, 355.0), (340.0, 350.0), (365.0, 350.0))
 PERIOD, SAMPLES = 1.0, 240  # of a loop, in s
 
 
-def samples(seed: int, episodes: int) -> Samples:
+def samples(seed: int, episodes: int) -> DriftSamples:
     """Simulate episodes from whose ends the coolant can bring the reactor back to the saddle."""
     return box_episodes(SYSTEM, DESIGN, episodes, DURATION, seed, keep_recoverable=True)
 

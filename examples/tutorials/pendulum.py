@@ -50,7 +50,7 @@ print(f'held horizontally it takes m g l = {heaviest:.2f} N m')
 # Many short episodes under random steps of the torque, each from another state in a box, a fifth
 # of them from its corners. They may leave that box by half of its width: there a loop from a
 # corner goes. `box_episodes` simulates them from the equation; states, rates and inputs of your
-# own make `Samples(...)` as well.
+# own make `DriftSamples(...)` as well.
 
 # %%
 corner = np.array([1.2, 4.0])  # rad, rad/s

@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
@@ -93,7 +93,8 @@ figure.savefig(OUT / 'two_tanks_record.png')
 
 # %%
 unknown = np.full(2, np.nan)
-plant = Plant('two tanks', LEVELS, ('m', 'm'), PUMPS, ('V', 'V'), 's', nominal_state=unknown,
+plant = PlantDescription('two tanks', LEVELS, ('m', 'm'), PUMPS, ('V', 'V'), 's',
+                         nominal_state=unknown,
               nominal_input=unknown, B=None)
 found = identify(plant, [episode], degrees=(1, 2, 3),
                  methods={'weak form': WeakForm(WeakFormParameters((20,)))})

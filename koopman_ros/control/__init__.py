@@ -16,12 +16,38 @@ from koopman_ros.control.events import (
 from koopman_ros.control.laws import averaged, Feedback, feedback, Form, LAWS, recentred, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.setpoint import Setpoint
-from koopman_ros.control.state import Arrival, Mode, Report, State
+from koopman_ros.control.state import Arrival, Mode, State, StepReport
 from koopman_ros.control.supervisor import HOLD, MANUAL, SAFE, Supervisor
 from koopman_ros.tuning import InputLimits, SensorLimits, Tuning
 
-__all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Controller', 'Event', 'Feedback', 'Form',
-           'Initialisation', 'InputLimits', 'ManualCommand', 'Measurement', 'Mode', 'ModeChange',
-           'Report', 'SensorLimits', 'Setpoint', 'SetpointRequest', 'Silence', 'State',
-           'Supervisor', 'Target', 'Tuning', 'Weights', 'averaged', 'feedback', 'recentred',
-           'steady_state_target']
+__all__ = [
+    'HOLD',
+    'LAWS',
+    'MANUAL',
+    'SAFE',
+    'Arrival',
+    'Controller',
+    'Event',
+    'Feedback',
+    'Form',
+    'Initialisation',
+    'InputLimits',
+    'ManualCommand',
+    'Measurement',
+    'Mode',
+    'ModeChange',
+    'SensorLimits',
+    'Setpoint',
+    'SetpointRequest',
+    'Silence',
+    'State',
+    'StepReport',
+    'Supervisor',
+    'Target',
+    'Tuning',
+    'Weights',
+    'averaged',
+    'feedback',
+    'recentred',
+    'steady_state_target',
+]

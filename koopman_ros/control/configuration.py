@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from koopman_ros.control.estimates import StateEstimation
-from koopman_ros.control.fallback import build_levels, Level
+from koopman_ros.control.fallback import build_levels, FallbackLevel
 from koopman_ros.control.supervisor import FallbackOrder
 from koopman_ros.core.arrays import Array, brief, kept
 from koopman_ros.core.signals import Outputs
@@ -47,7 +47,7 @@ class Configuration:
         return self.outputs or Outputs(states.names, states.units, np.eye(self.model.n_x))
 
     @cached_property
-    def levels(self) -> dict[str, Level]:
+    def levels(self) -> dict[str, FallbackLevel]:
         """The levels with a law, by name, best first."""
         return build_levels(self.model, self.measured, self.tuning)
 
@@ -59,7 +59,7 @@ class Configuration:
             self.tuning.hold_timeout, self.tuning.recovery_time)
 
     @cached_property
-    def best(self) -> Level:
+    def best(self) -> FallbackLevel:
         """The first level."""
         return next(iter(self.levels.values()))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import with_step
-from koopman_ros.control.fallback import Level
+from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.feasibility import Feasibility
 from koopman_ros.control.recovery import rest_under, RestState
 from koopman_ros.control.state import Mode, State
@@ -195,7 +195,7 @@ class Controller(ControlStep):
     # Questions about the loop.
 
     @cached_property
-    def usable(self) -> Level:
+    def usable(self) -> FallbackLevel:
         """The best level whose law can act at all, or the best one where none can."""
         return next((level for level in self.levels.values() if level.unusable is None), self.best)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.control.fallback import Level
+from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.state import State
 from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
@@ -50,9 +50,9 @@ class StateEstimation:
     model: LiftedModel  #: the lift
     outputs: Outputs  #: what is measured of its states
     tuning: Tuning  #: for these signals
-    levels: dict[str, Level]  #: by name, best first
+    levels: dict[str, FallbackLevel]  #: by name, best first
 
-    def level(self, supervisor: Supervisor) -> Level:
+    def level(self, supervisor: Supervisor) -> FallbackLevel:
         """Return the level in terms of whose model the estimate is: without a law, the last."""
         name = supervisor.settled
         if name is None:
@@ -188,7 +188,7 @@ class StateEstimation:
         return predicted if predicted is not None and predicted.finite else replace(
             state.estimate, covariance=None)
 
-    def rebase(self, estimate: Estimate, before: Level, now: Level) -> Estimate:
+    def rebase(self, estimate: Estimate, before: FallbackLevel, now: FallbackLevel) -> Estimate:
         """Transfer an estimate from the model of one level to that of another."""
         if before is now or not now.estimator.remembers:
             return estimate

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from koopman_ros.control.controller import Controller
-from koopman_ros.control.state import Mode, Report, State
+from koopman_ros.control.state import Mode, State, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import Code, Reason
 
@@ -73,32 +73,33 @@ Event: TypeAlias = (
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class EventOutcome:
     """What an event led to."""
 
     state: State  #: the new state; the old one when the event was refused
     #: (n_u,) in the model's units, or None where the event is not answered
     command: Array | None = None
-    report: Report | None = None  #: of the step, where there was one
+    report: StepReport | None = None  #: of the step, where there was one
     refused: Reason | None = None  #: why the event was refused, or None
 
 
-def apply(controller: Controller, state: State, event: Event) -> Outcome:
+def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
     """Apply an event to a controller's state; pure, as the controller is."""
     match event:
         case Measurement():
-            return Outcome(*controller.step(state, event.measured, event.stamp_ns, event.applied,
+            return EventOutcome(*controller.step(state, event.measured, event.stamp_ns,
+                                                 event.applied,
                                             event.seconds))
         case Silence():
-            return Outcome(*controller.hold(state, event.stamp_ns, event.cause))
+            return EventOutcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():
             state, refused = controller.request_setpoint(
                 state, event.value, event.stamp_ns, event.signals)
-            return Outcome(state, refused=refused)
+            return EventOutcome(state, refused=refused)
         case ManualCommand():
             state, refused = controller.request_manual_input(state, event.value)
-            return Outcome(state, refused=refused)
+            return EventOutcome(state, refused=refused)
         case ModeChange():
-            return Outcome(controller.set_mode(state, event.mode))
+            return EventOutcome(controller.set_mode(state, event.mode))
         case Initialisation():
-            return Outcome(controller.initialise(state, event.applied))
+            return EventOutcome(controller.initialise(state, event.applied))

@@ -19,7 +19,7 @@ _FOLLOWS_WITHIN = 1e-3  # of an input's range
 _COMES_NEARER = 1e-5  # likewise, less than any rate limit allows between two commands
 
 
-class Phase(Enum):
+class ExperimentPhase(Enum):
     """What an experiment is doing; the value is the word an operator reads."""
 
     RUNNING = 'running'
@@ -101,14 +101,14 @@ class Experiment:
 
 
 @dataclass(frozen=True, eq=False)
-class Progress:
+class ExperimentProgress:
     """How far an experiment is; it goes on commanding the way home when it is over."""
 
     start_ns: int  #: stamp of the measurement it started with
     time_ns: int  #: stamp of the last measurement
     command: Array  #: (m,) last values of the signals that are stepped
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
-    phase: Phase = Phase.RUNNING
+    phase: ExperimentPhase = ExperimentPhase.RUNNING
     reason: Reason | None = None  #: why it was aborted
 
     @property
@@ -117,24 +117,26 @@ class Progress:
         return (self.time_ns - self.start_ns) / NANOSECONDS
 
 
-def begin(experiment: Experiment, time_ns: int, start: Array | None = None) -> Progress:
+def begin(experiment: Experiment, time_ns: int, start: Array | None = None) -> ExperimentProgress:
     """
     Start at the stamp of the first measurement.
 
     :param start: (m,) present values of the signals; at home by default.
     """
-    return Progress(time_ns, time_ns, experiment.home if start is None else start)
+    return ExperimentProgress(time_ns, time_ns, experiment.home if start is None else start)
 
 
-def end(progress: Progress, phase: Phase, why: Reason | None = None) -> Progress:
+def end(progress: ExperimentProgress, phase: ExperimentPhase,
+        why: Reason | None = None) -> ExperimentProgress:
     """End the steps, unless they are over; the signals then go home."""
-    if progress.phase is not Phase.RUNNING:
+    if progress.phase is not ExperimentPhase.RUNNING:
         return progress
     return replace(progress, phase=phase, reason=why)
 
 
-def advance(experiment: Experiment, progress: Progress, measured: Array | None, time_ns: int
-            ) -> Progress:
+def advance(experiment: Experiment, progress: ExperimentProgress, measured: Array | None,
+            time_ns: int
+            ) -> ExperimentProgress:
     """
     Answer a measurement (n,), or the passing of time without one.
 
@@ -143,9 +145,9 @@ def advance(experiment: Experiment, progress: Progress, measured: Array | None, 
     """
     ahead = time_ns - progress.time_ns
     if measured is not None and (why := experiment.refusal(measured)):
-        progress = end(progress, Phase.ABORTED, why)
+        progress = end(progress, ExperimentPhase.ABORTED, why)
     if ahead < -LATE_NANOSECONDS:
-        progress = end(progress, Phase.ABORTED, reason(Code.CLOCK_WENT_BACK))
+        progress = end(progress, ExperimentPhase.ABORTED, reason(Code.CLOCK_WENT_BACK))
         return replace(progress, time_ns=time_ns)
     if ahead <= 0:
         return progress
@@ -153,15 +155,15 @@ def advance(experiment: Experiment, progress: Progress, measured: Array | None, 
     usual = 0.0 if np.isinf(progress.interval) else 0.5 * progress.interval
     progress = replace(progress, time_ns=time_ns, interval=max(seconds, usual))
     if progress.elapsed >= experiment.duration:
-        progress = end(progress, Phase.FINISHED)
+        progress = end(progress, ExperimentPhase.FINISHED)
     reach = experiment.rate * seconds
     change = level(experiment, progress) - progress.command
     return replace(progress, command=progress.command + np.clip(change, -reach, reach))
 
 
-def level(experiment: Experiment, progress: Progress) -> Array:
+def level(experiment: Experiment, progress: ExperimentProgress) -> Array:
     """Return where the signals go now (m,)."""
-    if progress.phase is not Phase.RUNNING:
+    if progress.phase is not ExperimentPhase.RUNNING:
         return experiment.home
     return np.array([levels[np.searchsorted(ends, progress.elapsed, side='right')]
                      for ends, levels in experiment.steps])

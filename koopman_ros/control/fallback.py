@@ -32,7 +32,7 @@ from koopman_ros.tuning import InputLimits, Tuning
 
 
 @dataclass(frozen=True)
-class Level:
+class FallbackLevel:
     """One level."""
 
     name: str  #: of its law
@@ -77,7 +77,7 @@ class Level:
         """Return the part (n_c,) of a state (n_x,) that has a set-point."""
         return x[self._indices]
 
-    def controlling(self, names: tuple[str, ...]) -> Level:
+    def controlling(self, names: tuple[str, ...]) -> FallbackLevel:
         """Return the level with set-points for these states alone."""
         return replace(self, controlled=names)
 
@@ -153,7 +153,7 @@ class Level:
             model.inputs.to_deviation(limits.upper)) or target
 
 
-def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[str, Level]:
+def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[str, FallbackLevel]:
     """
     Build the levels that a tuning names, best first.
 
@@ -167,5 +167,5 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
     for law_name in tuning.fallback_order:
         law = plug_in(law_name, 'law', LAWS, Law, model, tuning)
         estimator = plug_in(name, 'estimator', ESTIMATORS, Estimator, law.model, outputs, tuning)
-        levels[law_name] = Level(law_name, law, estimator, tuning.controlled)
+        levels[law_name] = FallbackLevel(law_name, law, estimator, tuning.controlled)
     return levels

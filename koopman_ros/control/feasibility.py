@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.control.fallback import Level
+from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.steady_state import nearest_steady_state, resting_state
 from koopman_ros.core.arrays import Array
@@ -31,7 +31,7 @@ _NEAR = 0.01
 class Feasibility:
     """Set-points that a level can hold under a disturbance."""
 
-    level: Level  #: whose model tells
+    level: FallbackLevel  #: whose model tells
     margin: float  #: distance outside the training box, in half-ranges, that is allowed
     w: Array  #: (n_x,) disturbance of the state's rate, scaled
     start: Array | None  #: (n_x + n_u,) where the steady state is looked for, in units

@@ -169,7 +169,7 @@ NO_COMMAND = CommandReport()
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class StepReport:
     """What a step did."""
 
     mode: Mode  #: who commanded

@@ -18,7 +18,7 @@ import numpy as np
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
 from koopman_ros.control.configuration import Configuration
-from koopman_ros.control.fallback import Level
+from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws.base import LawResult, Target
 from koopman_ros.control.recovery import moves_toward_nominal, SafeStateRecovery
 from koopman_ros.control.state import (
@@ -29,8 +29,8 @@ from koopman_ros.control.state import (
     Mode,
     NO_COMMAND,
     NOTHING_MEASURED,
-    Report,
     State,
+    StepReport,
     TargetReport,
     WITHOUT_LAW,
 )
@@ -49,7 +49,7 @@ class ControlStep(Configuration):
     """The step of a configured loop; every method is pure and returns a new state."""
 
     def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
-             countable: float | None = None) -> tuple[State, Array, Report]:
+             countable: float | None = None) -> tuple[State, Array, StepReport]:
         """
         Answer one measurement.
 
@@ -81,7 +81,7 @@ class ControlStep(Configuration):
             state = afresh(state)
         state, time, missed = time_of_measurement(state, time_ns, countable)
 
-        def calculate() -> tuple[State, Array, Report]:
+        def calculate() -> tuple[State, Array, StepReport]:
             u, follows = self.estimation.applied(state, applied)
             now, seen = self.estimation.observe(state, y, time_ns, time.elapsed, u)
             accepted = seen.verdict.fault is None
@@ -97,7 +97,7 @@ class ControlStep(Configuration):
                 Arrival.ACCEPTED, np.nan, missed=missed, clock_went_back=back), time, time_ns)
 
     def hold(self, state: State, time_ns: int, cause: Code | None = Code.NO_MEASUREMENT
-             ) -> tuple[State, Array | None, Report]:
+             ) -> tuple[State, Array | None, StepReport]:
         """
         Command without a measurement: hold, and later go to the safe input.
 
@@ -112,7 +112,7 @@ class ControlStep(Configuration):
             return state, None, self._report(state, None)
         time = time_of_silence(state, time_ns)
 
-        def calculate() -> tuple[State, Array, Report]:
+        def calculate() -> tuple[State, Array, StepReport]:
             now = replace(state, estimate=self.estimation.predict(
                 state, time.elapsed, self.estimation.applied(state)[0]))
             if cause is not None or state.mode is Mode.MANUAL:
@@ -128,14 +128,14 @@ class ControlStep(Configuration):
 
         return self._contained(calculate, state, NOTHING_MEASURED, time, state.time_ns)
 
-    def _contained(self, calculate: Callable[[], tuple[State, Array, Report]], before: State,
+    def _contained(self, calculate: Callable[[], tuple[State, Array, StepReport]], before: State,
                    measured: MeasurementReport, time: StepTime, time_ns: int | None
-                   ) -> tuple[State, Array, Report]:
+                   ) -> tuple[State, Array, StepReport]:
         """
         Return the result of a calculation; where it fails the command is held, later the safe one.
 
         This is the one place where a failure of an estimator, or of anything else that a step
-        calculates, is caught; that of a law is a reason for the next level (:class:`Level`).
+        calculates, is caught; that of a law is a reason for the next level (:class:`FallbackLevel`).
 
         :param before: the state to hold from; its estimate restarts from the next measurement.
         :param time_ns: stamp of the last measurement.
@@ -162,7 +162,7 @@ class ControlStep(Configuration):
             self.tuning.setpoint_filter_time))
 
     def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
-                 time: StepTime) -> tuple[State, Array, Report]:
+                 time: StepTime) -> tuple[State, Array, StepReport]:
         """Choose a level, and bring its input within the limits."""
         transfer = state.transfer and state.transfer.after(
             time.elapsed, self.tuning.bumpless_transfer_time)
@@ -223,7 +223,7 @@ class ControlStep(Configuration):
                 return supervisor, target, result
             requested = Requested(below, reason(Code.LOST_HERE, level=level.name))
 
-    def _failed(self, level: Level, why: Reason, passing: bool = False) -> Requested:
+    def _failed(self, level: FallbackLevel, why: Reason, passing: bool = False) -> Requested:
         return Requested(self.order.below(level.name), reason(
             Code.LAW_FAILED, level=level.name, cause=why), passing)
 
@@ -278,7 +278,7 @@ class ControlStep(Configuration):
 
     def _report(self, state: State, why: Reason | None,
                 measured: MeasurementReport = NOTHING_MEASURED, target: Target | None = None,
-                command: CommandReport = NO_COMMAND) -> Report:
+                command: CommandReport = NO_COMMAND) -> StepReport:
         active, manual = state.setpoint.active, state.mode is Mode.MANUAL
         depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
         known = None if state.estimate is None else EstimateReport.of(
@@ -288,5 +288,5 @@ class ControlStep(Configuration):
             self.model.inputs.to_physical(target.u))
         aim = None if active is None else TargetReport(
             active, self.controlled.violation(active), *steady)
-        return Report(state.mode, MANUAL if manual else self.order.levels[depth], depth, why,
+        return StepReport(state.mode, MANUAL if manual else self.order.levels[depth], depth, why,
                       measured, known, aim, command)

@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from koopman_ros.core.arrays import Array, brief, frozen
 from koopman_ros.core.units import check_time_unit
 
-__all__ = ['Episode', 'Plant', 'Samples', 'averaged', 'cut', 'split_by_episode', 'within']
+__all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
+           'split_by_episode', 'within']
 
 
 @dataclass(frozen=True)
-class Plant:
+class PlantDescription:
     """
     Names, units, nominal point and input matrix of a plant.
 
@@ -220,7 +221,7 @@ def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samp
 
 
 @dataclass(frozen=True)
-class Samples:
+class DriftSamples:
     """
     States, their derivatives and the inputs that acted, from one or more episodes.
 
@@ -270,13 +271,13 @@ class Samples:
     def __len__(self) -> int:
         return len(self.episode)
 
-    def take(self, episodes: np.ndarray) -> Samples:
+    def take(self, episodes: np.ndarray) -> DriftSamples:
         """Return the samples of some episodes."""
         return self.where(np.isin(self.episode, episodes))
 
-    def where(self, keep: NDArray[np.bool_]) -> Samples:
+    def where(self, keep: NDArray[np.bool_]) -> DriftSamples:
         """Return the samples that a mask (N,) keeps."""
-        return Samples(self.x[keep], self.dxdt[keep], self.u[keep], self.episode[keep],
+        return DriftSamples(self.x[keep], self.dxdt[keep], self.u[keep], self.episode[keep],
                        None if self.time is None else self.time[keep])
 
     def digest(self) -> str:
@@ -287,7 +288,8 @@ class Samples:
         return sha.hexdigest()
 
 
-def split_by_episode(samples: Samples, seed: int) -> tuple[Samples, Samples, Samples]:
+def split_by_episode(samples: DriftSamples, seed: int) -> tuple[DriftSamples, DriftSamples,
+                                                                DriftSamples]:
     """
     Split samples into training (three fifths), validation and test by whole episodes.
 

@@ -27,7 +27,7 @@ _AVERAGED = 600.0  # s over which an offset is averaged
 
 
 @dataclass(frozen=True)
-class Run:
+class DemoRun:
     """A recorded loop, possibly over several bags; times in s since the first measurement."""
 
     seconds: Array  #: (n,) of the measurements
@@ -59,7 +59,7 @@ class Run:
         return float(np.max(np.abs(np.diff(self.commanded[signal][rows]))))
 
 
-def read_run(wiring: Wiring, *bags: Path) -> Run:
+def read_run(wiring: Wiring, *bags: Path) -> DemoRun:
     """Read the bags of one run, in their order."""
     stamps: Array = np.empty(0)
 
@@ -77,7 +77,7 @@ def read_run(wiring: Wiring, *bags: Path) -> Run:
     measured = series(wiring.measured, wiring.signals.states)
     origin, seconds = stamps[0], (stamps - stamps[0]) / NANOSECONDS
     commanded = series(wiring.commands, wiring.signals.inputs)
-    return Run(seconds, measured, (stamps - origin) / NANOSECONDS, commanded)
+    return DemoRun(seconds, measured, (stamps - origin) / NANOSECONDS, commanded)
 
 
 def draw_phases(panels: Sequence[Axes], phases: Sequence[tuple[str, float]]) -> None:

@@ -22,7 +22,7 @@ from koopman_ros.core.units import to_celsius, ZERO_CELSIUS
 from koopman_ros.demo import reactor
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import Operator, running_loop
-from koopman_ros.demo.results import draw_phases, read_run, Run
+from koopman_ros.demo.results import DemoRun, draw_phases, read_run
 from koopman_ros.learning import roll_out
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.trainer import MANUAL
@@ -137,7 +137,7 @@ def _operate(operator: Operator, second_bag: Path, new_model: Path) -> list[tupl
     return operator.phases
 
 
-def _draw(path: Path, history: Run, phases: list[tuple[str, float]], setpoint: float,
+def _draw(path: Path, history: DemoRun, phases: list[tuple[str, float]], setpoint: float,
           models: dict[str, tuple[LiftedModel, str]]) -> None:
     """Draw temperature, coolant and error over plant time, phase by phase."""
     minutes = history.seconds / 60.0

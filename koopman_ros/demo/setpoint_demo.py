@@ -23,7 +23,7 @@ from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, legend, wr
 from koopman_ros.core.units import conversion, display_unit, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import run_loop, running_loop, Scenario
-from koopman_ros.demo.results import read_run, Run
+from koopman_ros.demo.results import DemoRun, read_run
 from koopman_ros.evaluation.optimal_cost import cost_along, Course, linear_law, optimum, Task
 from koopman_ros.model import load
 from koopman_ros.model.coordinates import Coordinates
@@ -44,7 +44,7 @@ _STYLES: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class _State:
+class _StateParameters:
     """The course of a state."""
 
     initial_offset: float = parameter(0.0, 'initial distance from the steady state', '{unit}')
@@ -59,7 +59,7 @@ class _Parameters:
     step_time: float = parameter(0.0, 'time of the set-point step', 's')
     duration: float = parameter(600.0, 'length of the run', 's')
     observer: bool = parameter(True, 'whether the controller estimates disturbances')
-    states: Mapping[str, _State] = per_signal(_State)
+    states: Mapping[str, _StateParameters] = per_signal(_StateParameters)
 
 
 def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
@@ -130,7 +130,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     return result
 
 
-def _draw(path: Path, title: str, run: Run, courses: Mapping[str, Course], signals: Signals,
+def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, Course], signals: Signals,
           scenario: Scenario, box: Coordinates, tuning: Tuning) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
     count = len(signals.states) + len(signals.inputs)

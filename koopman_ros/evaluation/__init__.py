@@ -4,7 +4,7 @@
 """Evaluation of controllers and models: simulated loops, comparisons, optimal cost; no ROS."""
 
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck
-from koopman_ros.evaluation.model_comparison import compare, Comparison, Recent, Windows
+from koopman_ros.evaluation.model_comparison import compare, ModelComparison, Recent, Windows
 from koopman_ros.evaluation.simulate import (
     at,
     Change,
@@ -21,6 +21,24 @@ from koopman_ros.evaluation.simulate import (
     Timed,
 )
 
-__all__ = ['Change', 'ClosedLoop', 'Comparison', 'LawCheck', 'Loop', 'Plant', 'Recent', 'Sensor',
-           'Simulation', 'Timed', 'Windows', 'at', 'check_law', 'compare', 'exchange', 'perfect',
-           'restart', 'run_closed_loop', 'simulate']
+__all__ = [
+    'Change',
+    'ClosedLoop',
+    'LawCheck',
+    'Loop',
+    'ModelComparison',
+    'Plant',
+    'Recent',
+    'Sensor',
+    'Simulation',
+    'Timed',
+    'Windows',
+    'at',
+    'check_law',
+    'compare',
+    'exchange',
+    'perfect',
+    'restart',
+    'run_closed_loop',
+    'simulate',
+]

@@ -201,7 +201,7 @@ def rms(squares: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ModelComparison:
     """How well two models predict what was measured lately."""
 
     seconds: float  #: how long that was
@@ -227,7 +227,8 @@ class Comparison:
         return bool(np.any((self.motion > self.negligible) & (self.present < 0.5 * self.motion)))
 
 
-def compare(present: Controller, candidate: Controller, windows: Windows) -> Comparison | None:
+def compare(present: Controller, candidate: Controller,
+            windows: Windows) -> ModelComparison | None:
     """
     Let the models of two controllers predict; None where the present one never can.
 
@@ -243,4 +244,4 @@ def compare(present: Controller, candidate: Controller, windows: Windows) -> Com
     known = np.isfinite(own).all(axis=1)
     if not known.any():
         return None
-    return Comparison(windows.seconds, rms(own[known]), rms(new[known]), motion, negligible)
+    return ModelComparison(windows.seconds, rms(own[known]), rms(new[known]), motion, negligible)

@@ -14,7 +14,7 @@ from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import apply, Event, Measurement, Silence
 from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
-from koopman_ros.control.state import Report, State
+from koopman_ros.control.state import State, StepReport
 from koopman_ros.control.steady_state import nearest_steady_state, partial_target
 from koopman_ros.core.arrays import Array, brief, frozen
 from koopman_ros.core.signals import per_signal
@@ -106,7 +106,7 @@ class Simulation:
     inputs: Array  #: (N, n_u) that acted when it was measured
     commands: Array  #: (N, n_u) answered; NaN before the first
     setpoints: Array  #: (N, n_c) active; NaN before the first
-    reports: tuple[Report, ...]  #: (N) of the controller
+    reports: tuple[StepReport, ...]  #: (N) of the controller
     failure: str  #: why the plant could not go on to the end; empty when it could
     loop: Loop  #: after the last sample, to go on from
 
@@ -123,7 +123,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
              noise: Array | None = None, seed: int = 0, sensor: Sensor = perfect,
              input_sensor: Sensor | None = None, state: State | None = None,
              stamp: Callable[[int], int] = after_a_second,
-             stop: Callable[[Array, Array, Report], bool] | None = None) -> Simulation:
+             stop: Callable[[Array, Array, StepReport], bool] | None = None) -> Simulation:
     """
     Run a controller and a plant, sampled at 0, period, 2 period, ... up to the duration.
 
@@ -201,7 +201,7 @@ def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[
     return outputs.of
 
 
-def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, Report | None]:
+def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, StepReport | None]:
     outcome = apply(loop.controller, loop.state, event)
     if outcome.refused is not None:
         model = loop.controller.model

@@ -30,7 +30,7 @@ class Alternative:
 
 
 @dataclass(frozen=True)
-class Sample:
+class ReplayedSample:
     """A command: recorded, replayed, and that of the alternative; all in the model's units."""
 
     stamp_ns: int  #: of the measurement that it answers, or of the silence
@@ -55,7 +55,7 @@ class Replay:
     """The result of a replay."""
 
     #: one for each command, in the order of the records
-    samples: list[Sample] = field(default_factory=list)
+    samples: list[ReplayedSample] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)  #: records that are missing
     runs: int = 0  #: how often the controller was started, as far as it shows
     begins_late: int = 0  #: runs whose first records are missing
@@ -68,7 +68,7 @@ class Replay:
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
-def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Build,
+def replay(recorded: Iterable[records.EventRecord], find_model: FindModel, build: Build,
            alternative: Alternative | None = None) -> Replay:
     """
     Apply recorded events again.
@@ -78,10 +78,10 @@ def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Bui
     records that cannot be replayed.
     """
     found = Replay()
-    runs: dict[str, _Run] = {}
+    runs: dict[str, _ReplayRun] = {}
     for record in recorded:
         if record.run not in runs:
-            runs[record.run] = _Run(found, find_model, build, alternative)
+            runs[record.run] = _ReplayRun(found, find_model, build, alternative)
             found.runs += 1
             found.begins_late += record.event != records.START
         try:
@@ -96,7 +96,7 @@ def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Bui
     return found
 
 
-class _Run:
+class _ReplayRun:
     """A run of a controller, and the alternative beside it."""
 
     def __init__(self, found: Replay, find_model: FindModel, build: Build,
@@ -110,7 +110,7 @@ class _Run:
         self._controller: Controller
         self._other_controller: Controller
 
-    def take(self, record: records.Record) -> None:
+    def take(self, record: records.EventRecord) -> None:
         """Replay the next record."""
         self._count(record)
         state = self._state
@@ -125,7 +125,7 @@ class _Run:
         else:
             self._apply(record, state)
 
-    def _count(self, record: records.Record) -> None:
+    def _count(self, record: records.EventRecord) -> None:
         """Forget the state behind a lost record."""
         if self._next is not None and record.number < self._next:
             raise records.RecordError(
@@ -136,7 +136,7 @@ class _Run:
             self._state = None
         self._next = record.number + 1
 
-    def _begin(self, record: records.Record) -> None:
+    def _begin(self, record: records.EventRecord) -> None:
         self._parameters = {}
         controller = self._put_in_force(record, None)
         self._state = records.state_of(record)
@@ -150,7 +150,7 @@ class _Run:
             self._other_controller = self._tuned(controller.model if same else self._other.model)
             self._other_state = self._other_controller.hand_over(controller, self._state)
 
-    def _exchange(self, record: records.Record, state: State) -> None:
+    def _exchange(self, record: records.EventRecord, state: State) -> None:
         """Put other parameters or another model in force."""
         before = self._controller
         self._state = self._put_in_force(record, before.model).hand_over(before, state)
@@ -159,7 +159,7 @@ class _Run:
             self._other_controller = self._tuned(before.model)
             self._other_state = self._other_controller.hand_over(before, self._other_state)
 
-    def _put_in_force(self, record: records.Record, model: LiftedModel | None) -> Controller:
+    def _put_in_force(self, record: records.EventRecord, model: LiftedModel | None) -> Controller:
         self._parameters |= record.fields.get('parameters', {})
         if model is None or 'model' in record.fields:
             name, digest = record.fields['model']['name'], record.fields['model']['digest']
@@ -174,7 +174,7 @@ class _Run:
         assert self._other is not None
         return self._build({**self._parameters, **self._other.parameters}, model)
 
-    def _apply(self, record: records.Record, state: State) -> None:
+    def _apply(self, record: records.EventRecord, state: State) -> None:
         event = records.event_of(record)
         outcome = apply(self._controller, state, event)
         self._state = outcome.state
@@ -191,11 +191,11 @@ class _Run:
             self._other_state, other = answered.state, answered.command
         self._keep(record, active, outcome.command, other)
 
-    def _keep(self, record: records.Record, setpoint: Array | None, replayed: Array | None,
+    def _keep(self, record: records.EventRecord, setpoint: Array | None, replayed: Array | None,
               other: Array | None) -> None:
         """Keep the command of a record, where it has one."""
         if (command := record.fields.get('command')) is not None:
             measured = record.fields.get('measured')
-            self._found.samples.append(Sample(
+            self._found.samples.append(ReplayedSample(
                 record.stamp_ns, None if measured is None else records.float_array(measured),
                 setpoint, records.float_array(command), replayed, other))

@@ -46,7 +46,7 @@ class RecordError(ValueError):
 
 
 @dataclass(frozen=True)
-class Record:
+class EventRecord:
     """One record."""
 
     run: str  #: of the controller, another one each time it is started
@@ -65,7 +65,7 @@ class Record:
         return int(self.fields.get('stamp_ns', 0))
 
 
-def parse(text: str) -> Record:
+def parse(text: str) -> EventRecord:
     """Read a record; raise RecordError for another text, or another version of the schema."""
     try:
         fields = json.loads(text)
@@ -74,7 +74,7 @@ def parse(text: str) -> Record:
             raise RecordError(
                 f'its records are of version {version!r}, this package reads {VERSION}: take the '
                 'package that recorded it')
-        record = Record(str(fields.pop('run')), int(fields.pop('number')),
+        record = EventRecord(str(fields.pop('run')), int(fields.pop('number')),
                         str(fields.pop('event')), fields)
         int(record.stamp_ns)
     except RecordError:
@@ -84,7 +84,7 @@ def parse(text: str) -> Record:
     return record
 
 
-def fields_of(event: events.Event, outcome: events.Outcome) -> tuple[str, dict[str, Any]]:
+def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, dict[str, Any]]:
     """Return the name of an event, and what is written of it and of what it led to."""
     name, report = _NAMES[type(event)], outcome.report
     written = {of: _written(getattr(event, of)) for of in _FIELDS[type(event)]}
@@ -100,7 +100,7 @@ def fields_of(event: events.Event, outcome: events.Outcome) -> tuple[str, dict[s
     return name, written
 
 
-def event_of(record: Record) -> events.Event:
+def event_of(record: EventRecord) -> events.Event:
     """Return the event of a record; raise KeyError, TypeError or ValueError where it has none."""
     if record.event not in EVENTS:
         raise ValueError(f'the event {record.event!r} is not known')
@@ -115,7 +115,7 @@ def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, st
             'state': encoded(state)}
 
 
-def state_of(record: Record) -> State:
+def state_of(record: EventRecord) -> State:
     """Return the state in a snapshot; raise KeyError, TypeError or ValueError for another."""
     state = decoded(record.fields['state'])
     if not isinstance(state, State):

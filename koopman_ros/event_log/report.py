@@ -17,7 +17,7 @@ from koopman_ros.model import Coordinates
 
 
 @dataclass(frozen=True)
-class Comparison:
+class CommandComparison:
     """How commands differ from the recorded ones."""
 
     #: (n, n_u) command minus recorded command in input units; NaN where there is none to be
@@ -62,9 +62,9 @@ class ReplayedBag:
     commands: Array = field(init=False)
     #: (n, n_u) commanded by the new model; NaN where it knows no state
     new_commands: Array = field(init=False)
-    check: Comparison = field(init=False)  #: the replay beside the record
+    check: CommandComparison = field(init=False)  #: the replay beside the record
     #: the new model beside the record, or None without one
-    new: Comparison | None = field(init=False)
+    new: CommandComparison | None = field(init=False)
 
     def __post_init__(self) -> None:
         samples = self.found.samples
@@ -99,10 +99,11 @@ class ReplayedBag:
         return int(np.count_nonzero(((self.setpoint < self.new_range.lower[kept])
                                      | (self.setpoint > self.new_range.upper[kept])).any(axis=1)))
 
-    def _compared(self, commands: Array) -> Comparison:
+    def _compared(self, commands: Array) -> CommandComparison:
         """Compare commands (n, n_u) with those recorded."""
         same = (commands.view(np.uint64) == self.recorded.view(np.uint64)).all(axis=1)
-        return Comparison(commands - self.recorded, int(np.count_nonzero(same)), self.tolerance)
+        return CommandComparison(commands - self.recorded, int(np.count_nonzero(same)),
+                                 self.tolerance)
 
 
 def _rows(values: list[Array | None], like: Array | None = None) -> Array:
@@ -144,7 +145,7 @@ def verdict(bag: ReplayedBag) -> str:
             f'{beyond} differ by more than {check.tolerance:g}; {_worst(bag, check)}')
 
 
-def _worst(bag: ReplayedBag, comparison: Comparison) -> str:
+def _worst(bag: ReplayedBag, comparison: CommandComparison) -> str:
     worst = comparison.worst
     if worst is None:
         return 'none differs'
@@ -213,7 +214,7 @@ def _figures(bag: ReplayedBag) -> dict[str, Any]:
     return figures
 
 
-def _comparison(bag: ReplayedBag, comparison: Comparison) -> dict[str, Any]:
+def _comparison(bag: ReplayedBag, comparison: CommandComparison) -> dict[str, Any]:
     worst = comparison.worst
     return {
         'compared': comparison.compared, 'identical': comparison.identical,

@@ -14,7 +14,7 @@ import numpy as np
 from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.event_log.loop import Alternative, Replay, replay
-from koopman_ros.event_log.records import Record, RecordError
+from koopman_ros.event_log.records import EventRecord, RecordError
 from koopman_ros.event_log.report import ReplayedBag, reproduced, verdict, write_report
 from koopman_ros.event_log.sources import lately, Models, read_records
 from koopman_ros.model import LiftedModel
@@ -90,7 +90,7 @@ def replayed_bag(path: str, parameters: ReplayParameters, topic: str = RECORDS,
                        None if alternative is None else alternative.model.states)
 
 
-def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
+def replay_records(records: Iterable[EventRecord], models: Sequence[Path] = (),
                    alternative: Alternative | None = None) -> Replay:
     """
     Replay records of this package's controller node, in the order of receipt.

@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.event_log.records import parse, Record, RecordError, SNAPSHOT, START
+from koopman_ros.event_log.records import EventRecord, parse, RecordError, SNAPSHOT, START
 from koopman_ros.model import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.records import BagMessage, BagReadError, read_messages, summary
 
@@ -18,7 +18,7 @@ RECORD_TYPE = 'std_msgs/msg/String'
 
 
 def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = False
-                 ) -> Iterator[Record]:
+                 ) -> Iterator[EventRecord]:
     """
     Iterate over the records on a topic of a bag, in the order of receipt.
 
@@ -40,9 +40,9 @@ def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = Fa
     return _parsed(path, messages)
 
 
-def lately(records: Iterable[Record], seconds: float) -> Iterator[Record]:
+def lately(records: Iterable[EventRecord], seconds: float) -> Iterator[EventRecord]:
     """Return those records that a replay of the last seconds needs, from a snapshot on."""
-    parts: deque[tuple[int, list[Record]]] = deque()
+    parts: deque[tuple[int, list[EventRecord]]] = deque()
     latest = 0
     for record in records:
         latest = max(latest, record.stamp_ns)
@@ -54,7 +54,7 @@ def lately(records: Iterable[Record], seconds: float) -> Iterator[Record]:
     return (record for _, part in parts for record in part)
 
 
-def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Iterator[Record]:
+def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Iterator[EventRecord]:
     for entry in messages:
         try:
             yield parse(entry.message.data)

@@ -9,7 +9,7 @@ Nodes start ``python -m koopman_ros.learning``.
 
 from koopman_ros.learning.acceptance import decide, Decision, Thresholds
 from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
-from koopman_ros.learning.fleet import Outcome, retrain_fleet
+from koopman_ros.learning.fleet import retrain_fleet, TrainingOutcome
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.edmd import Edmd, Linearisation
 from koopman_ros.learning.lift.incremental import Growth
@@ -21,18 +21,44 @@ from koopman_ros.learning.lift.metrics import (
     roll_out,
     rollout_rmse,
 )
-from koopman_ros.learning.lift.multistart import Progress
+from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
 from koopman_ros.learning.lift.training import NoUsefulLift, train, Trained
-from koopman_ros.learning.model_selection import compare, Comparison, Contender, Judge
+from koopman_ros.learning.model_selection import ClassComparison, compare, Judge, ModelCandidate
 from koopman_ros.learning.pipeline import retrain, Retrained
 from koopman_ros.learning.report import write_report
 from koopman_ros.learning.task import TrainingTask
 
 __all__ = [
-    'Algorithm1', 'Comparison', 'Contender', 'Decision', 'Edmd', 'Figures', 'Fit', 'Growth',
-    'Judge', 'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Outcome', 'Progress', 'Retrained',
-    'Thresholds', 'Trained', 'TrainingTask', 'compare', 'compare_classes', 'decide',
-    'drift_samples', 'evaluate', 'fit', 'learn_lift', 'retrain', 'retrain_fleet',
-    'roll_out', 'rollout_rmse', 'train', 'write_report',
+    'Algorithm1',
+    'ClassComparison',
+    'Decision',
+    'Edmd',
+    'Figures',
+    'Fit',
+    'Growth',
+    'Judge',
+    'Linearisation',
+    'ModelCandidate',
+    'MultistartProgress',
+    'NeuralDrift',
+    'NoUsefulLift',
+    'Retrained',
+    'Thresholds',
+    'Trained',
+    'TrainingOutcome',
+    'TrainingTask',
+    'compare',
+    'compare_classes',
+    'decide',
+    'drift_samples',
+    'evaluate',
+    'fit',
+    'learn_lift',
+    'retrain',
+    'retrain_fleet',
+    'roll_out',
+    'rollout_rmse',
+    'train',
+    'write_report',
 ]

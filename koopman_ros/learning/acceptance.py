@@ -23,7 +23,7 @@ from koopman_ros.learning.identification import (
 from koopman_ros.learning.identification.drift import prediction_error, Segments
 from koopman_ros.learning.lift.metrics import Figures, lifted_rate
 from koopman_ros.learning.lift.training import Trained
-from koopman_ros.learning.model_selection import Comparison
+from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import LINEAR
 
@@ -131,7 +131,7 @@ class Decision:
         return not self.reasons
 
 
-def decide(found: Identified, learned: Trained | Comparison, current: LiftedModel | None,
+def decide(found: Identified, learned: Trained | ClassComparison, current: LiftedModel | None,
            thresholds: Thresholds, *, loops: int = LOOPS,
            watch: Callable[[float], bool] = lambda _: False) -> Decision:
     """
@@ -145,7 +145,7 @@ def decide(found: Identified, learned: Trained | Comparison, current: LiftedMode
     model, held_out = learned.model, HeldOut(found, thresholds)
     rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
     current_rmse = None if current is None else held_out.rmse_of(current)
-    chosen = learned.chosen if isinstance(learned, Comparison) else None
+    chosen = learned.chosen if isinstance(learned, ClassComparison) else None
     law_check = chosen.law_check if chosen and chosen.excess is not None else None
     if law_check is None:
         law_check = held_out.law_check(model, loops, watch)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Episode, Plant, Samples
+from koopman_ros.core.datasets import DriftSamples, Episode, PlantDescription
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance import HeldOut, Thresholds
@@ -21,10 +21,10 @@ from koopman_ros.learning.lift.metrics import ROUNDING
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.learning.lift.training import train, Trained
 from koopman_ros.learning.model_selection import (
+    ClassComparison,
     compare,
-    Comparison,
-    Contender,
     Judge,
+    ModelCandidate,
     usual_recipes,
 )
 from koopman_ros.model import LiftedModel
@@ -38,7 +38,7 @@ _CELLS = 20
 _SHARES = 10
 
 
-def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> Samples:
+def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> DriftSamples:
     """
     Sample a drift along the paths that it predicts for some episodes, free of their noise.
 
@@ -58,7 +58,7 @@ def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> Samples:
     x, u = (np.swapaxes(a, 0, 1)[inside.T] for a in (path, segments.u))
     kept = _spread(drift.box.states.to_deviation(x))
     x, u = x[kept], u[kept]
-    return Samples(x, drift.rate(x, u), u, np.arange(len(x)) % _SHARES)
+    return DriftSamples(x, drift.rate(x, u), u, np.arange(len(x)) % _SHARES)
 
 
 def _spread(xi: Array) -> NDArray[np.int64]:
@@ -97,7 +97,7 @@ def _quota(sizes: NDArray[np.int64], total: int) -> int:
     return low
 
 
-def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: int,
+def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: int, starts: int,
                watch: Watch | None = None) -> Trained:
     """
     Learn a lift of an estimated drift; the arguments are those of :func:`learning.train`.
@@ -112,7 +112,8 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
                  loops=0)
 
 
-def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
+def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescription,
+                                                                    DriftSamples]:
     """Return the plant with its estimated nominal point and B, and samples of the drift."""
     samples = drift_samples(found.drift, found.fitted)
     lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
@@ -127,12 +128,12 @@ def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
                        drift.input_matrix)), samples
 
 
-def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
+def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thresholds, *,
                     model_class: str = BEST, n_z: int, seed: int, starts: int, loops: int = LOOPS,
                     watch: Watch | None = None,
                     judging: Callable[[str, float], bool] = lambda *_: False,
                     device: str = 'cpu', backend: Backend | None = None,
-                    begin: LiftedModel | None = None) -> Comparison:
+                    begin: LiftedModel | None = None) -> ClassComparison:
     """
     Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
 
@@ -154,7 +155,7 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
     held_out = HeldOut(found, thresholds)
     noise = np.minimum(found.noise, held_out.rmse(found.drift.rate)) / held_out.scale
 
-    def judged(one: Contender) -> Contender:
+    def judged(one: ModelCandidate) -> ModelCandidate:
         assert one.model is not None
         assert one.figures is not None
         rmse = held_out.rmse_of(one.model)

@@ -35,7 +35,7 @@ OnPlant = Callable[[str, float, str], bool]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainingOutcome:
     """How the retraining of one plant of a fleet ended."""
 
     summary: Mapping[str, Any] | None  #: as :meth:`Retrained.summary`, None where it failed
@@ -51,7 +51,7 @@ class Outcome:
 
 def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
                   on_progress: OnPlant = lambda *_: False
-                  ) -> Generator[tuple[str, Outcome]]:
+                  ) -> Generator[tuple[str, TrainingOutcome]]:
     """
     Retrain plants side by side, and yield each with its outcome.
 
@@ -83,7 +83,7 @@ def kind_of(task: TrainingTask) -> tuple[object, ...]:
 
 
 def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnPlant
-            ) -> Generator[tuple[str, Outcome]]:
+            ) -> Generator[tuple[str, TrainingOutcome]]:
     first: dict[tuple[object, ...], str] = {}  # the file of the first lift of a kind
     stopped = False
 
@@ -107,25 +107,25 @@ def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnP
         with contextlib.closing(backend.run(_retrained, now, watch=watch, apart=True)) as found:
             for name, outcome in found:
                 task = waiting.pop(name)
-                one = outcome if isinstance(outcome, Outcome) else _failed(outcome)
+                one = outcome if isinstance(outcome, TrainingOutcome) else _failed(outcome)
                 if one.accepted and one.summary is not None:
                     first.setdefault(kind_of(task), str(one.summary['model_file']))
                 yield name, one
     for name in waiting:
-        yield name, Outcome(None, stopped=True)
+        yield name, TrainingOutcome(None, stopped=True)
 
 
-def _retrained(_: None, task: TrainingTask, tell: Tell) -> Outcome:
+def _retrained(_: None, task: TrainingTask, tell: Tell) -> TrainingOutcome:
     """Retrain one plant, wherever that is."""
     checked_device(task.device)
     retrained = retrain_by(Serial(), task, lambda share, text: tell((share, text)))
-    return Outcome(*reported(retrained))
+    return TrainingOutcome(*reported(retrained))
 
 
-def _failed(error: BaseException) -> Outcome:
+def _failed(error: BaseException) -> TrainingOutcome:
     if isinstance(error, Stopped):
-        return Outcome(None, stopped=True)
-    return Outcome(None, error=one_line(error))
+        return TrainingOutcome(None, stopped=True)
+    return TrainingOutcome(None, error=one_line(error))
 
 
 def one_line(error: BaseException) -> str:

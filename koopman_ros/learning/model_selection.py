@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 
-from koopman_ros.core.datasets import Plant, Samples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS
 from koopman_ros.execution import Backend
@@ -21,7 +21,7 @@ from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rat
 from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import Growth
 from koopman_ros.learning.lift.metrics import evaluate, Figures, fit, ROUNDING
-from koopman_ros.learning.lift.multistart import Progress, Recipe, Watch
+from koopman_ros.learning.lift.multistart import MultistartProgress, Recipe, Watch
 from koopman_ros.learning.lift.neural_drift import NeuralDrift, with_readout, with_units_of
 from koopman_ros.learning.lift.training import (
     NoUsefulLift,
@@ -38,7 +38,7 @@ _FACTOR = 2.0
 
 
 @dataclass(frozen=True)
-class Contender:
+class ModelCandidate:
     """A model of one class with its figures, or the reason why there is none."""
 
     name: str  #: of the class
@@ -64,16 +64,16 @@ class Judge:
     """Judgement of models in place of that by validation episodes and their polynomials."""
 
     #: completes a contender that has no law check, no `excess` and no refusal yet
-    judged: Callable[[Contender], Contender]
+    judged: Callable[[ModelCandidate], ModelCandidate]
     resolution: float  #: errors below it count as equal
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ClassComparison:
     """The result of :func:`compare`; as text a table in Markdown."""
 
-    contenders: tuple[Contender, ...]  #: the plainest first
-    chosen: Contender  #: by the rule, or as it was asked for
+    contenders: tuple[ModelCandidate, ...]  #: the plainest first
+    chosen: ModelCandidate  #: by the rule, or as it was asked for
     state_names: tuple[str, ...]  #: of the states, with their units
     state_units: tuple[str, ...]
 
@@ -89,7 +89,7 @@ class Comparison:
         assert self.chosen.figures is not None
         return self.chosen.figures
 
-    def with_model(self, model: LiftedModel) -> Comparison:
+    def with_model(self, model: LiftedModel) -> ClassComparison:
         """Return the same with another model of the chosen class."""
         chosen = replace(self.chosen, model=model)
         return replace(self, chosen=chosen, contenders=tuple(
@@ -128,11 +128,12 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
         FREE_LIFT: Growth(n_x, identity=False, hidden_first=units, max_iterations=300)}
 
 
-def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None = None, *,
+def compare(plant: PlantDescription, samples: DriftSamples,
+            recipes: Mapping[str, Recipe] | None = None, *,
             degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
             seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
             loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
-            backend: Backend | None = None, begin: LiftedModel | None = None) -> Comparison:
+            backend: Backend | None = None, begin: LiftedModel | None = None) -> ClassComparison:
     """
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
@@ -172,7 +173,7 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
     learner = _Learner(plant, samples, split_seed)
     judge = judge or learner.judge(loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
-    found: list[Contender] = []
+    found: list[ModelCandidate] = []
     drift: LiftedModel | None = None
     for name in names:
         since, steps = time.perf_counter(), 0
@@ -195,13 +196,13 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
         except (ValueError, np.linalg.LinAlgError) as refusal:
             if name == choose:
                 raise
-            found.append(Contender(name, None, math.inf, None, None,
+            found.append(ModelCandidate(name, None, math.inf, None, None,
                                    time.perf_counter() - since, str(refusal)))
     chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
-    return Comparison(tuple(found), chosen, plant.state_names, plant.state_units)
+    return ClassComparison(tuple(found), chosen, plant.state_names, plant.state_units)
 
 
-def plainest(contenders: Sequence[Contender], resolution: float = ROUNDING) -> Contender:
+def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING) -> ModelCandidate:
     """
     Return of those that pass the first whose error is at most twice the smallest.
 
@@ -240,7 +241,7 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
         return None
     before = sum(counts[other] for other in list(counts)[:list(counts).index(name)])
 
-    def told(now: Progress) -> bool:
+    def told(now: MultistartProgress) -> bool:
         return watch(replace(now, name=name, finished=before + now.finished,
                              total=sum(counts.values())))
 
@@ -250,7 +251,7 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
 class _Learner:
     """The samples that all contenders are learned from, and judged by without a record."""
 
-    def __init__(self, plant: Plant, samples: Samples, split_seed: int) -> None:
+    def __init__(self, plant: PlantDescription, samples: DriftSamples, split_seed: int) -> None:
         self._plant = plant
         self._parts = split_by_episode(samples, split_seed)
         self._training, self._validation, self._test = self._parts
@@ -275,7 +276,7 @@ class _Learner:
             try:
                 model = Edmd(degree).learn(self._plant, self._training, self._box)
                 model_file.check(model)
-                tried.append(Contender(POLYNOMIAL, model, self.rx(model), None, None, 0.0))
+                tried.append(ModelCandidate(POLYNOMIAL, model, self.rx(model), None, None, 0.0))
             except (ValueError, np.linalg.LinAlgError) as error:
                 refusal = str(error)
         best = plainest(tried).model if tried else None
@@ -292,10 +293,11 @@ class _Learner:
             return lift
         return min((lift, joined), key=self.rx)
 
-    def contender(self, name: str, model: LiftedModel, seconds: float, judge: Judge) -> Contender:
+    def contender(self, name: str, model: LiftedModel, seconds: float,
+                  judge: Judge) -> ModelCandidate:
         """Judge a model, and note its figures in it."""
         model = replace(model, training_states=self._known)
-        one = judge.judged(Contender(name, model, self.rx(model), evaluate(model, self._test),
+        one = judge.judged(ModelCandidate(name, model, self.rx(model), evaluate(model, self._test),
                                      None, seconds))
         assert one.figures is not None
         return replace(one, model=replace(
@@ -305,7 +307,7 @@ class _Learner:
 
     def judge(self, loops: int, backend: Backend | None) -> Judge:
         """Return the judge by closed loops on the drift that predicts validation episodes best."""
-        def judged(one: Contender) -> Contender:
+        def judged(one: ModelCandidate) -> ModelCandidate:
             model = one.model
             if not loops or model is None or not model.n_u:
                 return one

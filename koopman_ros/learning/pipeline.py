@@ -15,7 +15,7 @@ import shutil
 import numpy as np
 
 from koopman_ros.core.arrays import Array, brief
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import predecessor
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
@@ -32,11 +32,11 @@ from koopman_ros.learning.identification import (
     methods_of,
     Stopped,
 )
-from koopman_ros.learning.lift.multistart import Progress
+from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.lift.training import NoUsefulLift
-from koopman_ros.learning.model_selection import Comparison, Contender
-from koopman_ros.learning.record import read_record, Reduction, Source
+from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
+from koopman_ros.learning.record import read_record, RecordSource, Reduction
 from koopman_ros.learning.task import FIRST, known, TrainingTask
 from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
@@ -64,12 +64,12 @@ class Retrained:
     account: Account  #: counts of used and dropped measurements
     found: Identified  #: the estimated drift
     #: the classes that were learned, None when there is no model worth judging
-    learned: Comparison | None
+    learned: ClassComparison | None
     decision: Decision | None  #: its figures, None without a lift
     reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
     #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
     coverage: Mapping[tuple[str, str], float]
-    plant: Plant  #: names, units and nominal point; its time unit is that of the drift
+    plant: PlantDescription  #: names, units and nominal point; its time unit is that of the drift
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
     reduction: Reduction | None = None  #: the part of a long record that is used
@@ -90,7 +90,7 @@ class Retrained:
         def by_state(values: Array) -> dict[str, float | None]:
             return {name: _finite(value) for name, value in zip(states.names, values, strict=True)}
 
-        def of_class(one: Contender) -> dict[str, object]:
+        def of_class(one: ModelCandidate) -> dict[str, object]:
             said: dict[str, object] = {
                 'chosen': self.learned is not None and one is self.learned.chosen,
                 'refusal': one.refusal, 'seconds': one.seconds, 'steps': one.steps}
@@ -196,7 +196,7 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
-    source = Source(
+    source = RecordSource(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
     _stop_if(on_progress(0.0, 'reading bags'))
@@ -257,7 +257,7 @@ def _checked(task: TrainingTask) -> Thresholds:
     return Thresholds(task.margin, task.condition)
 
 
-def _estimate(task: TrainingTask, plant: Plant, episodes: list[Episode],
+def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episode],
               methods: Mapping[str, IdentificationMethod], on_progress: OnProgress,
               backend: Backend) -> Identified:
     """Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations."""
@@ -276,14 +276,14 @@ def _estimate(task: TrainingTask, plant: Plant, episodes: list[Episode],
 
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
            on_progress: OnProgress, backend: Backend
-           ) -> tuple[Comparison | None, Decision | None, tuple[str, ...]]:
+           ) -> tuple[ClassComparison | None, Decision | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
     task, found = bare.task, bare.found
     reasons: tuple[str, ...] = ()
     warnings: list[str] = []
     for begin in (None,) if sibling is None else (sibling, None):
         course = _Course(on_progress)
-        learned: Comparison | None = None
+        learned: ClassComparison | None = None
         decision: Decision | None = None
         try:
             learned = compare_classes(
@@ -314,7 +314,7 @@ def _stop_if(stop: bool) -> None:
         raise Stopped
 
 
-def _reading(on_progress: OnProgress, source: Source) -> Callable[[int], None]:
+def _reading(on_progress: OnProgress, source: RecordSource) -> Callable[[int], None]:
     """Return a tick that reports the share read of a record, twice; it may raise Stopped."""
     total, read = 2 * source.size(), 0
 
@@ -332,7 +332,7 @@ class _Course:
     def __init__(self, on_progress: OnProgress) -> None:
         self._on_progress, self._share = on_progress, 0.0
 
-    def learning(self, now: Progress) -> bool:
+    def learning(self, now: MultistartProgress) -> bool:
         """Report the starts, as :func:`learning.compare` tells of them."""
         self._share = now.finished / now.total
         rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'

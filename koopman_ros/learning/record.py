@@ -36,7 +36,7 @@ Tick = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class Source:
+class RecordSource:
     """Bags, and the signals to read from them."""
 
     bags: tuple[str, ...]
@@ -72,7 +72,7 @@ class Reduction:
 
 
 @dataclass(frozen=True)
-class Record:
+class TrainingRecord:
     """Episodes to learn from and to judge by."""
 
     episodes: list[Episode]
@@ -80,8 +80,8 @@ class Record:
     reduction: Reduction | None = None  #: None where they are all that there are
 
 
-def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
-                tick: Tick = lambda _: None, backend: Backend | None = None) -> Record:
+def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = False,
+                tick: Tick = lambda _: None, backend: Backend | None = None) -> TrainingRecord:
     """
     Read the episodes of some bags: all of them, or a selection where they are many.
 
@@ -95,7 +95,7 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
     :raises BagReadError: for bags that cannot be used.
     """
     if source.size() <= most:
-        return Record(*loop_episodes(source.bags, source.states, source.inputs,
+        return TrainingRecord(*loop_episodes(source.bags, source.states, source.inputs,
                                      tolerance_ns=source.tolerance_ns,
                                      least_jumps=source.least_jumps))
     account = Account()
@@ -126,12 +126,12 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
         survey = survey.merged(part)
         account.add(own)
     if not survey.count:
-        return Record([], account)
+        return TrainingRecord([], account)
     start = Selection(survey.lower, survey.upper, survey.group(most), most,
                       SEGMENT * (_LONGER if hidden else 1))
     found = reduce(Selection.merged, each(partial(_selected, source, start, seed)))
     episodes = found.episodes()
-    return Record(episodes, account, Reduction(
+    return TrainingRecord(episodes, account, Reduction(
         survey.count, start.group, found.offered, len(episodes),
         start.group * sum(map(len, episodes))))
 
@@ -148,7 +148,7 @@ def _told(function: Callable[[_Numbered, Tick], Any], bag: _Numbered, tell: Tell
     return function(bag, tick)
 
 
-def _streamed(source: Source, bag: str, account: Account, tick: Tick) -> Iterable[Episode]:
+def _streamed(source: RecordSource, bag: str, account: Account, tick: Tick) -> Iterable[Episode]:
     for episode in stream_episodes([bag], source.states, source.inputs, account,
                                    tolerance_ns=source.tolerance_ns,
                                    least_jumps=source.least_jumps):
@@ -156,7 +156,8 @@ def _streamed(source: Source, bag: str, account: Account, tick: Tick) -> Iterabl
         yield episode
 
 
-def _surveyed(source: Source, numbered: _Numbered, tick: Tick) -> tuple[RecordStatistics, Account]:
+def _surveyed(source: RecordSource, numbered: _Numbered, tick: Tick) -> tuple[RecordStatistics,
+                                                                              Account]:
     """Look through one bag."""
     account, survey = Account(), RecordStatistics.empty(len(source.states), len(source.inputs))
     for episode in _streamed(source, numbered[1], account, tick):
@@ -164,7 +165,7 @@ def _surveyed(source: Source, numbered: _Numbered, tick: Tick) -> tuple[RecordSt
     return survey, account
 
 
-def _selected(source: Source, start: Selection, seed: int, numbered: _Numbered,
+def _selected(source: RecordSource, start: Selection, seed: int, numbered: _Numbered,
               tick: Tick) -> Selection:
     """Choose segments of one bag."""
     number, bag = numbered

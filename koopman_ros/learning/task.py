@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.message_fields import Place
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.model import Coordinates, LiftedModel
@@ -93,7 +93,7 @@ class TrainingTask:
 
 
 def known(task: TrainingTask, current: LiftedModel | None
-          ) -> tuple[Plant, Sequence[RecordedState], Sequence[RecordedInput]]:
+          ) -> tuple[PlantDescription, Sequence[RecordedState], Sequence[RecordedInput]]:
     """
     Return the plant as far as the task describes it, and its signals in order.
 
@@ -143,16 +143,16 @@ def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: st
     return [by_name[name] for name in wanted.names]
 
 
-def _unknown(task: TrainingTask) -> Plant:
+def _unknown(task: TrainingTask) -> PlantDescription:
     """Return the plant of a task without a lift; its nominal point is unknown."""
     states, inputs = task.states, task.inputs
-    return Plant(task.plant, tuple(signal.name for signal in states),
+    return PlantDescription(task.plant, tuple(signal.name for signal in states),
                  tuple(signal.unit for signal in states), tuple(signal.name for signal in inputs),
                  tuple(signal.unit for signal in inputs), 's', np.full(len(states), np.nan),
                  np.full(len(inputs), np.nan), None)
 
 
-def _known_gain(task: TrainingTask, plant: Plant) -> Array | None:
+def _known_gain(task: TrainingTask, plant: PlantDescription) -> Array | None:
     """Return B (n_x, n_u) of a task per time unit of a plant, None to learn it."""
     if not task.input_gain:
         return None

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, brief, frozen
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Box:
     __repr__ = brief
 
     @staticmethod
-    def of(plant: Plant, x: Array, u: Array, *, nominal: bool = True) -> Box:
+    def of(plant: PlantDescription, x: Array, u: Array, *, nominal: bool = True) -> Box:
         """
         Return the range of some values.
 

@@ -14,7 +14,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, brief, frozen
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import check_time_unit, SECONDS_PER_TIME_UNIT
 from koopman_ros.model.coordinates import Coordinates
 from koopman_ros.model.input_matrix import InputTerms
@@ -158,9 +158,9 @@ class LiftedModel:
         return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
 
     @property
-    def plant(self) -> Plant:
+    def plant(self) -> PlantDescription:
         """The names, units and nominal point of its plant, without B."""
-        return Plant(self.provenance.plant, self.states.names, self.states.units,
+        return PlantDescription(self.provenance.plant, self.states.names, self.states.units,
                      self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
                      self.inputs.center, None, self.input_matrix_degree)
 

@@ -16,7 +16,7 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import Trigger
 
-from koopman_ros.control import events, MANUAL, Mode, Report
+from koopman_ros.control import events, MANUAL, Mode, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import stem
 from koopman_ros.core.status import level_words
@@ -28,8 +28,8 @@ from koopman_ros.parameters.controller import built, ControllerParameters, table
 from koopman_ros.parameters.model_checks import (
     load_suitable,
     LoadedModel,
+    ModelCheckContext,
     rests_outside,
-    Situation,
 )
 from koopman_ros.parameters.signal_topics import (
     preset,
@@ -45,7 +45,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.control_loop import Commanded, ControlLoop
 from koopman_ros.ros.controller_messages import RecordPublisher, ReportPublisher
-from koopman_ros.ros.diagnostics import Status
+from koopman_ros.ros.diagnostics import TaskReport
 from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
@@ -109,7 +109,7 @@ class ControllerNode(ManagedNode):
                 command, stamp_message(stamp_ns), self._measurements.frame_id),
             lambda event, outcome: self._records.publish_event(event, outcome))
         self._telling = threading.Lock()
-        self._report = self._logged = Report(
+        self._report = self._logged = StepReport(
             Mode.AUTOMATIC, next(iter(self._loop.controller.levels)))
         self._rests_outside = ''
         # until when a status is not looked at again while level and whether there is a reason stay
@@ -277,14 +277,14 @@ class ControllerNode(ManagedNode):
         if not self._untold:
             self._say(report, now)
 
-    def _say(self, report: Report, now: float) -> None:
+    def _say(self, report: StepReport, now: float) -> None:
         self._told = now + PERIOD, report.level, report.reason is None
         self._untold = False
         self._diagnostics.publish_if_changed()
 
-    def _statuses(self) -> dict[str, Status]:
+    def _statuses(self) -> dict[str, TaskReport]:
         loop = self._loop
-        situation = status.Situation(
+        situation = status.StatusContext(
             loop.controller, self._settings, self._signals, loop.state, self._report,
             self._counts, self._timing, self._measurements.assembler, self._measured,
             complaint=self._matching.complaint or self._measurements.complaint,
@@ -298,8 +298,8 @@ class ControllerNode(ManagedNode):
                            'safe input': self._rests_outside or 'within reach'})
         return status.statuses(situation) if self.active else status.inactive(situation)
 
-    def _model_situation(self) -> Situation:
-        return Situation(self._settings, self._loop.state, self._measured,
+    def _model_situation(self) -> ModelCheckContext:
+        return ModelCheckContext(self._settings, self._loop.state, self._measured,
                          self._recent.windows(self._settings.model_check_length))
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:

@@ -51,7 +51,7 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
@@ -371,8 +371,8 @@ class PanelNode(LoopNode):
         to_read = conversion(self._signals.states[name], read)
         return f'outside {to_read(low):.6g} to {to_read(high):.6g} {read}, the trained range'
 
-    def _status(self) -> Status:
-        return Status(Level.OK, f'{self._server.pages} pages open', {
+    def _status(self) -> TaskReport:
+        return TaskReport(Severity.OK, f'{self._server.pages} pages open', {
             'address': self._server.address, 'pages': self._server.pages})
 
 

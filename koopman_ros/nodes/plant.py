@@ -27,7 +27,7 @@ from koopman_ros.parameters.plant import PlantParameters, PlantTable
 from koopman_ros.parameters.signal_topics import PLANT_KINDS, SIGNALS, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
@@ -40,7 +40,7 @@ _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
 _SILENCE = 3.0  # s without a command, and five periods, after which somebody should know
 
 
-class Phase(Enum):
+class RunPhase(Enum):
     """What the plant is doing; the value is the sentence an operator reads."""
 
     WAITING = 'waiting for the loop: no controller yet'
@@ -71,7 +71,7 @@ class PlantNode(ManagedNode):
         self._plant = SimulatedPlant(table, parameters, self._start_ns)
         if self._plant.note:
             self.get_logger().warning(self._plant.note)
-        self._phase, self._trip = Phase.WAITING if parameters.lockstep else Phase.RUNNING, ''
+        self._phase, self._trip = RunPhase.WAITING if parameters.lockstep else RunPhase.RUNNING, ''
         self._sample = 0  # number of the next measurement
         self._answered = True  # whether the last measurement has its command
         self._commands = self._rejected = self._missed = self._foreign = 0
@@ -154,7 +154,7 @@ class PlantNode(ManagedNode):
             if self._real_time:
                 self._start_ns = time.time_ns()
                 self._plant.skip_to(self._start_ns)
-        if self._phase is not Phase.RUNNING:
+        if self._phase is not RunPhase.RUNNING:
             return
         if self._settings.speed:
             # a timer skips the periods that it missed, and so do the samples
@@ -166,16 +166,16 @@ class PlantNode(ManagedNode):
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
         if not self.active:
             return
-        if self._phase is Phase.WAITING:
+        if self._phase is RunPhase.WAITING:
             listeners = min(publisher.get_subscription_count() for publisher in self._counted)
             if listeners >= self._settings.lockstep_subscribers and all(
                     self.count_publishers(heard.topic_name) > 0
                     for heard in self._command_inlet.subscriptions):
-                self._phase = Phase.RUNNING
+                self._phase = RunPhase.RUNNING
                 self._measure()
             return
         waited = time.monotonic() - self._wall_published
-        if (self._phase is Phase.RUNNING and not self._answered
+        if (self._phase is RunPhase.RUNNING and not self._answered
                 and waited > self._settings.lockstep_timeout):
             self._missed += 1
             self._answered = self._waiting_in_vain = True
@@ -186,7 +186,7 @@ class PlantNode(ManagedNode):
             self._continue_lockstep()
 
     def _step_in_lockstep(self) -> None:
-        if self.active and self._phase is Phase.RUNNING and self._answered:
+        if self.active and self._phase is RunPhase.RUNNING and self._answered:
             self._measure()
 
     def _continue_lockstep(self) -> None:
@@ -199,9 +199,9 @@ class PlantNode(ManagedNode):
         instant = self._start_ns + self._sample * self._period_ns
         duration_ns = round(self._settings.duration * NANOSECONDS)
         if duration_ns and instant > self._start_ns + duration_ns:
-            self._phase = Phase.FINISHED
+            self._phase = RunPhase.FINISHED
         elif instant > _LAST_STAMP_NS:
-            self._phase = Phase.OUT_OF_STAMPS
+            self._phase = RunPhase.OUT_OF_STAMPS
             self.get_logger().error(self._phase.value)
         elif self._advance(instant):
             sample, self._sample = self._sample, self._sample + 1
@@ -225,7 +225,7 @@ class PlantNode(ManagedNode):
         try:
             self._plant.advance(time_ns)
         except plants.IntegrationError as error:
-            self._phase, self._trip = Phase.TRIPPED, str(error)
+            self._phase, self._trip = RunPhase.TRIPPED, str(error)
             self.get_logger().error(f'{error}; call ~/reset to start again')
             self._diagnostics.publish_if_changed()
             return False
@@ -262,12 +262,12 @@ class PlantNode(ManagedNode):
             self._diagnostics.publish_if_changed()
         if not lockstep:
             self._heard = {}
-        elif self._phase is Phase.RUNNING and not self._answered:
+        elif self._phase is RunPhase.RUNNING and not self._answered:
             self._answered, self._waiting_in_vain = True, False
             self._continue_lockstep()
 
     def _advance_to_now(self) -> bool:
-        if self._phase is not Phase.RUNNING or not self.active:
+        if self._phase is not RunPhase.RUNNING or not self.active:
             return False
         # never past the next sample, which is measured under the command of its time
         ahead = self._start_ns + self._sample * self._period_ns
@@ -276,14 +276,14 @@ class PlantNode(ManagedNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Put the plant back to its initial state; time goes on."""
-        if self._phase in (Phase.FINISHED, Phase.OUT_OF_STAMPS):
+        if self._phase in (RunPhase.FINISHED, RunPhase.OUT_OF_STAMPS):
             response.message = ('the duration is over: start the plant again'
-                                if self._phase is Phase.FINISHED else self._phase.value)
+                                if self._phase is RunPhase.FINISHED else self._phase.value)
             return response
         response.success = True
         self._plant.reset()
-        if self._phase is Phase.TRIPPED:
-            self._phase, self._trip = Phase.RUNNING, ''
+        if self._phase is RunPhase.TRIPPED:
+            self._phase, self._trip = RunPhase.RUNNING, ''
             self._resynchronise()
         response.message = 'reset to ' + ', '.join(
             f'{name} {value:.6g} {unit[1:-1]}' for (name, unit), value in (
@@ -308,25 +308,25 @@ class PlantNode(ManagedNode):
         self._settings = parameters
         self._plant.tune(parameters)
 
-    def _status(self) -> Status:
-        level, message = Level.OK, self._phase.value
+    def _status(self) -> TaskReport:
+        level, message = Severity.OK, self._phase.value
         if not self.active:
             message = 'inactive'
-        elif self._phase is Phase.TRIPPED:
-            level, message = Level.ERROR, f'stopped: {self._trip}; call ~/reset'
-        elif self._phase is Phase.OUT_OF_STAMPS:
-            level = Level.ERROR
+        elif self._phase is RunPhase.TRIPPED:
+            level, message = Severity.ERROR, f'stopped: {self._trip}; call ~/reset'
+        elif self._phase is RunPhase.OUT_OF_STAMPS:
+            level = Severity.ERROR
         elif self._rejection:
-            level, message = Level.WARN, self._rejection
+            level, message = Severity.WARN, self._rejection
         elif complaint := self._matching.complaint:
-            level, message = Level.WARN, complaint
-        elif self._phase is Phase.WAITING:
-            level = Level.WARN
+            level, message = Severity.WARN, complaint
+        elif self._phase is RunPhase.WAITING:
+            level = Severity.WARN
         elif self._unanswered():
-            level, message = Level.WARN, (
+            level, message = Severity.WARN, (
                 'running, but no command arrives: the last one is held; check that the controller '
                 'is active, and its topics and domain')
-        return Status(level, message, lambda: {
+        return TaskReport(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
             **self._plant.figures(),
             **{f'{stem(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
@@ -341,7 +341,7 @@ class PlantNode(ManagedNode):
 
     def _unanswered(self) -> bool:
         """Tell whether no command arrives of an input, be it from the start or for some time."""
-        if self._phase is not Phase.RUNNING or self._settings.lockstep:
+        if self._phase is not RunPhase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
         period = self._settings.sample_period / (self._settings.speed or math.inf)
         silence = time.monotonic() - min(self._commanded.values())

@@ -15,7 +15,7 @@ from koopman_ros.panel.snapshot import (
     PLANT,
     REQUESTS,
     ROLES,
-    Silence,
+    SilentTopic,
     TaskStatus,
     TRAINER,
 )
@@ -108,12 +108,12 @@ class Conditions:
                                Priority.LOW if role == TRAINER else Priority.HIGH, text, now)
         self.alarms.advance(now)
 
-    def silences(self, now: float) -> tuple[Silence, ...]:
+    def silences(self, now: float) -> tuple[SilentTopic, ...]:
         """Return the silent nodes."""
         found = []
         for role in self._watched:
             patience = max(_SILENT, _PERIODS * self._period) if role == PLANT else _SILENT
             last = self._last.get(role, self._start)
             if now - last > patience:
-                found.append(Silence(role, last, role in self._last))
+                found.append(SilentTopic(role, last, role in self._last))
         return tuple(found)

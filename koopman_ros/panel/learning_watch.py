@@ -17,10 +17,10 @@ import yaml
 from koopman_ros.execution.job import ReplayJob
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.training_report import (
-    Comparison,
     Learning,
     read_comparison,
     read_report,
+    ReplayComparison,
     report_base,
     report_time,
 )
@@ -97,7 +97,7 @@ class LearningWatch:
             self._folder.cleanup()
             return Answer(False, f'the replay cannot be started: {error}')
         self._cancelled = False
-        self.learning.comparison = Comparison(model=new, since=time.time(), running=True)
+        self.learning.comparison = ReplayComparison(model=new, since=time.time(), running=True)
         return Answer(True, f'comparing {new} on {self._bag}')
 
     def cancel(self) -> Answer:
@@ -113,7 +113,7 @@ class LearningWatch:
         if self._job is None or self._job.running or self._folder is None:
             return
         now = self.learning.comparison
-        self.learning.comparison = Comparison(
+        self.learning.comparison = ReplayComparison(
             'cancelled', model=now.model, since=now.since) if self._cancelled else read_comparison(
                 Path(self._folder.name), now.model, now.since, self._job.said)
         self._job = None

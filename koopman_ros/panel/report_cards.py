@@ -22,7 +22,7 @@ from koopman_ros.panel.layout import (
     show_if,
 )
 from koopman_ros.panel.snapshot import Snapshot, TRAINING
-from koopman_ros.panel.training_report import Comparison, Findings, Report
+from koopman_ros.panel.training_report import Findings, ReplayComparison, TrainingReport
 
 
 def _findings(name: str, about: str) -> Callable[[Findings], None]:
@@ -51,7 +51,7 @@ def report_card(page: PageLayout) -> None:
         verdict, when = label('div', '', 'value'), label('div', '', 'quiet')
         problem = label('div', '')
         show_findings = _findings('training', 'Data, drift and prediction')
-    shown: list[Report | None] = [None]
+    shown: list[TrainingReport | None] = [None]
 
     def show(_: Snapshot) -> None:
         found = page.source.learning.report
@@ -88,7 +88,7 @@ def comparison_card(page: PageLayout) -> None:
         answer = AnswerLine()
         state = label('div', '').props('role=status')
         show_findings = _findings('comparison', 'Recorded commands and those of the new model')
-    shown = [Comparison()]
+    shown = [ReplayComparison()]
 
     def model() -> str:
         report = page.source.learning.report

@@ -34,7 +34,7 @@ class TaskStatus:
 
 
 @dataclass(frozen=True)
-class Silence:
+class SilentTopic:
     """A node without messages."""
 
     role: str
@@ -59,7 +59,7 @@ class Snapshot:
     statuses: Mapping[str, TaskStatus]
     standing: tuple[Alarm, ...]  #: alarms, the most urgent first
     shelved: tuple[Alarm, ...]
-    silences: tuple[Silence, ...]
+    silences: tuple[SilentTopic, ...]
     parameters: Mapping[str, Mapping[str, ParameterDescription]]  #: by role
     model: Mapping[str, str]  #: origin and held-out figures of the active model
     previous_model: str  #: active before, or empty

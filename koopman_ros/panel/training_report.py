@@ -36,7 +36,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Report(Findings):
+class TrainingReport(Findings):
     """Report of a training; its lines are reasons and warnings."""
 
     written: float = 0.0  #: wall time
@@ -45,7 +45,7 @@ class Report(Findings):
 
 
 @dataclass(frozen=True)
-class Comparison(Findings):
+class ReplayComparison(Findings):
     """Replay with a new model, compared with the recorded commands."""
 
     model: str = ''  #: the new one, or empty before the first comparison
@@ -57,8 +57,8 @@ class Comparison(Findings):
 class Learning:
     """The last training and comparison; each is replaced as a whole, from any thread."""
 
-    report: Report | None = None  #: None before the first training
-    comparison: Comparison = Comparison()
+    report: TrainingReport | None = None  #: None before the first training
+    comparison: ReplayComparison = ReplayComparison()
 
     def picture(self, name: str) -> bytes:
         """Return the picture of a training or a comparison; empty for none."""
@@ -83,7 +83,7 @@ def report_time(base: Path) -> int:
     return max(times)
 
 
-def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -> Report:
+def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -> TrainingReport:
     """
     Return the report beside a model.
 
@@ -93,11 +93,11 @@ def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -
     try:
         figures = _figures_of(path)
     except (OSError, ValueError) as error:
-        return Report('the panel cannot read the report, perhaps it is on another machine: '
-                      f'{sanitize_text(str(error), _MAX_LINE)}')
+        return TrainingReport('the panel cannot read the report, perhaps it is on another '
+                              f'machine: {sanitize_text(str(error), _MAX_LINE)}')
     if any(name in trained and trained[name] != str(figures.get(name)) for name in _IDENTIFYING):
-        return Report(f'the panel cannot read the report: {path} is of another training')
-    return Report(
+        return TrainingReport(f'the panel cannot read the report: {path} is of another training')
+    return TrainingReport(
         lines=(*_texts(figures.get('reasons')),
                *(f'Warning: {text}' for text in _texts(figures.get('warnings')))),
         text=_read_text(Path(f'{base}.md')), picture=_read_picture(Path(f'{base}.png')),
@@ -105,7 +105,7 @@ def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -
         model_file=str(figures.get('model_file') or ''))
 
 
-def read_comparison(folder: Path, model: str, since: float, output: str) -> Comparison:
+def read_comparison(folder: Path, model: str, since: float, output: str) -> ReplayComparison:
     """Return the result of a replay; without one, the last lines of its output."""
     try:
         (bag,) = _figures_of(folder / 'summary.json')['bags']
@@ -117,9 +117,9 @@ def read_comparison(folder: Path, model: str, since: float, output: str) -> Comp
                           'model differ from the recorded ones.', _MAX_LINE))
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         last = ' '.join([line for line in output.splitlines() if line.strip()][-3:])
-        return Comparison('the replay failed: ' + (
+        return ReplayComparison('the replay failed: ' + (
             sanitize_text(last, _MAX_LINE) or 'it has no output'), model=model, since=since)
-    return Comparison('', lines, _read_text(folder / 'report.md'),
+    return ReplayComparison('', lines, _read_text(folder / 'report.md'),
                       _read_picture(folder / 'replay.png'), model, since)
 
 

@@ -33,7 +33,7 @@ class Mark:
     text: str
 
 
-class _Pen:
+class _RecordedPen:
     """Rising times with a value at each, in arrays with room at their end."""
 
     def __init__(self, span: float, points: int) -> None:
@@ -104,7 +104,7 @@ class Trends:
 
     def __init__(self, span: float = 8 * 3600.0, points: int = 600_000) -> None:
         self._span, self._points = span, points
-        self._pens: dict[str, _Pen] = {}
+        self._pens: dict[str, _RecordedPen] = {}
         self._marks: dict[str, list[Mark]] = {}
         self._lock = threading.Lock()
 
@@ -174,8 +174,8 @@ class Trends:
             last = max((pen.last for pen in self._pens.values()), default=-math.inf)
         return last if math.isfinite(last) else None
 
-    def _pen(self, name: str) -> _Pen:
-        return self._pens.setdefault(name, _Pen(self._span, self._points))
+    def _pen(self, name: str) -> _RecordedPen:
+        return self._pens.setdefault(name, _RecordedPen(self._span, self._points))
 
 
 def _time(mark: Mark) -> float:

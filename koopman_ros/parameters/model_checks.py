@@ -52,7 +52,7 @@ class LoadedModel:
 
 
 @dataclass(frozen=True)
-class Situation:
+class ModelCheckContext:
     """What a new model has to cope with."""
 
     parameters: ControllerParameters
@@ -136,14 +136,14 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
             f'{model.n_z})')
 
 
-def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
+def refuse_setpoints(model: LiftedModel, situation: ModelCheckContext) -> None:
     """Raise ModelFileError for a model that cannot track what the operator asked for."""
     controller = situation.controller(model)
     if (refusal := controller.untrained(situation.state.setpoint)) is not None:
         raise ModelFileError(words_of(signals_of(model))(refusal))
 
 
-def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
+def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None:
     """Raise ModelFileError for a model without a law where the plant is or shall go."""
     controller, asked = situation.controller(model), situation.state.setpoint
     margin = controller.usable.law.margin
@@ -163,7 +163,7 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
                                      f'{tried}: train it again, or change the weights')
 
 
-def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation) -> str:
+def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheckContext) -> str:
     """
     Raise ModelFileError for a model that predicts what was measured lately much worse.
 

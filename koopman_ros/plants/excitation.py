@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Episode, Samples
+from koopman_ros.core.datasets import DriftSamples, Episode
 from koopman_ros.plants.recovery import recoverable
 from koopman_ros.plants.simulation import (
     integration_limits,
@@ -133,7 +133,7 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
 
 def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,
                  duration: float, seed: int, starts: tuple[Array, Array] | None = None, *,
-                 keep_recoverable: bool = False) -> Samples:
+                 keep_recoverable: bool = False) -> DriftSamples:
     """
     Simulate short episodes of random input steps from random states within a box.
 

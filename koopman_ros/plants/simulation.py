@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import DOP853
 
 from koopman_ros.core.arrays import Array, frozen
-from koopman_ros.core.datasets import Episode, Samples
+from koopman_ros.core.datasets import DriftSamples, Episode
 from koopman_ros.plants.system import ControlAffineSystem
 
 LOOSEST_RTOL = 1e-9
@@ -217,9 +217,9 @@ def simulate(system: ControlAffineSystem, x0: ArrayLike, inputs: ArrayLike, samp
     return Episode(times, states, times[:-1], held)
 
 
-def sample_derivatives(system: ControlAffineSystem, episodes: Sequence[Episode]) -> Samples:
+def sample_derivatives(system: ControlAffineSystem, episodes: Sequence[Episode]) -> DriftSamples:
     """Evaluate dx/dt exactly at the samples of episodes by :func:`simulate`, but the last."""
-    return Samples(
+    return DriftSamples(
         np.concatenate([episode.x[:-1] for episode in episodes]),
         np.concatenate([system.derivative(episode.x[:-1], episode.u) for episode in episodes]),
         np.concatenate([episode.u for episode in episodes]),

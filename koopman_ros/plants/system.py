@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, brief, frozen
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
@@ -167,9 +167,10 @@ class ControlAffineSystem:
             for name, value, unit in zip(self.state_names, x, self.state_units, strict=True))
 
 
-def describe(system: ControlAffineSystem) -> Plant:
+def describe(system: ControlAffineSystem) -> PlantDescription:
     """Return what training may know of a plant beside its data: all but the drift."""
-    return Plant(system.name, system.state_names, system.state_units, system.input_names,
+    return PlantDescription(system.name, system.state_names, system.state_units,
+                            system.input_names,
                  system.input_units, system.time_unit, system.nominal_state,
                  system.nominal_input, system.B)
 

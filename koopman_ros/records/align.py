@@ -17,7 +17,7 @@ from koopman_ros.records.segments import Clock, Segment, Times
 
 
 @dataclass(frozen=True)
-class Samples:
+class AlignedSamples:
     """Measurements of all states at one time each."""
 
     stamps: Times  #: (N,) rising, in ns
@@ -27,7 +27,7 @@ class Samples:
 
 
 def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[RecordedState],
-                       tolerance_ns: int, dropped: Counter[str]) -> Samples:
+                       tolerance_ns: int, dropped: Counter[str]) -> AlignedSamples:
     """Align the measurements of a segment by stamp; count those without a partner."""
     parts = []
     for signal in states:
@@ -51,7 +51,7 @@ def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[Recorded
     logs = np.max([part.log_ns[row] for part, row in zip(parts, rows, strict=True)], axis=0)
     every = np.column_stack([own[row] for own, row in zip(times, rows, strict=True)])
     stamps, last = np.unique(every.ravel()[::-1], return_index=True)
-    return Samples(base[whole], x, (stamps, np.repeat(logs, len(states))[::-1][last]))
+    return AlignedSamples(base[whole], x, (stamps, np.repeat(logs, len(states))[::-1][last]))
 
 
 def named(states: Sequence[RecordedState], state: RecordedState, text: str) -> str:

@@ -16,7 +16,7 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import Place
 from koopman_ros.core.units import Conversion, conversion, NANOSECONDS
 from koopman_ros.records import applied_inputs, segments
-from koopman_ros.records.align import align_by_timestamp, named, Samples
+from koopman_ros.records.align import align_by_timestamp, AlignedSamples, named
 from koopman_ros.records.applied_inputs import Applied
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.import_spec import (
@@ -291,8 +291,8 @@ class _Loop:
         spikes, jumps = zip(*found, strict=True)
         return np.column_stack(spikes), np.column_stack(jumps)
 
-    def _commands(self, segment: Segment, signal: RecordedInput, samples: Samples, clock: Clock,
-                  period: float) -> tuple[Times, Array]:
+    def _commands(self, segment: Segment, signal: RecordedInput, samples: AlignedSamples,
+                  clock: Clock, period: float) -> tuple[Times, Array]:
         """Return the times at which commands began to act, and these, in the signal's unit."""
         times, values = applied_inputs.commanded(segment.of(signal.command), clock,
                                                  samples.received, period)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from koopman_ros.control import Controller, events, HOLD, Mode, Report, SAFE, Setpoint, State
-from koopman_ros.control.events import Event, Measurement, Outcome, Silence
+from koopman_ros.control import Controller, events, HOLD, Mode, SAFE, Setpoint, State, StepReport
+from koopman_ros.control.events import Event, EventOutcome, Measurement, Silence
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import Code
 from koopman_ros.core.time_base import Advance
@@ -30,7 +30,7 @@ _ATTEMPTS = 2
 class Commanded(NamedTuple):
     """A command without a measurement."""
 
-    report: Report
+    report: StepReport
     stamp_ns: int
 
 
@@ -48,7 +48,7 @@ class ControlLoop:
     """
 
     def __init__(self, controller: Controller, timing: Timing, timeout: float,
-                 send: Callable[[Array, int], None], record: Callable[[Event, Outcome], None]
+                 send: Callable[[Array, int], None], record: Callable[[Event, EventOutcome], None]
                  ) -> None:
         self.controller, self.timing, self.timeout = controller, timing, timeout
         self._send, self._record = send, record
@@ -64,7 +64,7 @@ class ControlLoop:
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True
 
     def answer(self, event: Measurement, present: Array | None, arrived: tuple[float, int, int],
-               news: bool) -> Outcome | None:
+               news: bool) -> EventOutcome | None:
         """
         Answer a measurement; None where each step was overtaken by the watchdog.
 
@@ -73,7 +73,7 @@ class ControlLoop:
         """
         for _ in range(_ATTEMPTS):
             before = state = self.state
-            done: list[tuple[Event, Outcome]] = []
+            done: list[tuple[Event, EventOutcome]] = []
             if state.command is None and present is not None:
                 initial = events.Initialisation(present)
                 done.append((initial, events.apply(self.controller, state, initial)))
@@ -118,7 +118,7 @@ class ControlLoop:
                 return self._command(silence, None)
             return None
 
-    def change(self, event: Event) -> Outcome:
+    def change(self, event: Event) -> EventOutcome:
         """Apply an event without a command."""
         with self.lock:
             outcome = events.apply(self.controller, self.state, event)

@@ -18,11 +18,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from koopman_ros.control import events, Report
+from koopman_ros.control import events, StepReport
 from koopman_ros.control.laws.base import Plan
 from koopman_ros.core.arrays import along_last, Array
 from koopman_ros.core.units import display_unit, NANOSECONDS, shown
-from koopman_ros.event_log.records import fields_of, Record, SNAPSHOT, START
+from koopman_ros.event_log.records import EventRecord, fields_of, SNAPSHOT, START
 from koopman_ros.parameters.signal_topics import Signals, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import Outlet
@@ -53,7 +53,7 @@ def _labels(signals: tuple[tuple[str, str], ...], text: str, difference: bool) -
                  for label, (_, unit) in zip(labelled(dict(signals), text), signals, strict=True))
 
 
-def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> JointState:
+def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> JointState:
     """Return what a person would plot beside the signals, under names with units."""
     law, estimate = report.command.law, report.estimate
     inputs, target = signals.inputs, report.target
@@ -149,7 +149,7 @@ class ReportPublisher:
         self._active_limits = matching.publish(topics.ACTIVE_CONSTRAINTS)
         self._published: Array | None = None  # (n_c,) set-points
 
-    def publish(self, signals: Signals, report: Report, stamp: Time, frame_id: str) -> None:
+    def publish(self, signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> None:
         """Publish a report; the set-points where they are others."""
         target, predicted, plan = report.target, report.measurement.predicted, report.command.plan
         if target is not None and (self._published is None
@@ -203,7 +203,7 @@ class RecordPublisher:
         self._publish(event, self._snapshot())
         self._due = time.monotonic() + _SNAPSHOT_PERIOD
 
-    def publish_event(self, event: events.Event, outcome: events.Outcome) -> None:
+    def publish_event(self, event: events.Event, outcome: events.EventOutcome) -> None:
         """Publish an event and what it led to."""
         if topics.heard(self._publisher):
             self.publish(*fields_of(event, outcome))
@@ -221,4 +221,5 @@ class RecordPublisher:
         number, self._number = self._number, self._number + 1
         # who comes later begins at a snapshot
         if topics.heard(self._publisher):
-            self._publisher.publish(String(data=Record(self._run, number, event, fields).text()))
+            self._publisher.publish(String(data=EventRecord(self._run, number, event,
+                                                            fields).text()))

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.control import Arrival, Controller, HOLD, Mode, Report, SAFE, State
+from koopman_ros.control import Arrival, Controller, HOLD, Mode, SAFE, State, StepReport
 from koopman_ros.control.state import TargetReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import stem
@@ -20,7 +20,7 @@ from koopman_ros.core.units import display_unit, shown
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.signal_topics import Signals, words_of
 from koopman_ros.ros.controller_messages import by_label
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.timing import PAUSED, Timing
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
@@ -47,7 +47,7 @@ class Counts:
     late_plans: int = 0
     unsolved_plans: int = 0
 
-    def take(self, report: Report) -> None:
+    def take(self, report: StepReport) -> None:
         """Count an answered measurement."""
         self.measurements += 1
         self.late += report.measurement.arrival is Arrival.LATE
@@ -59,14 +59,14 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Situation:
+class StatusContext:
     """What the statuses are made of."""
 
     controller: Controller
     parameters: ControllerParameters
     signals: Signals
     state: State
-    report: Report
+    report: StepReport
     counts: Counts
     timing: Timing
     assembler: Assembler  #: of the measurements
@@ -102,37 +102,38 @@ class Situation:
                                            strict=True))
 
 
-def statuses(now: Situation) -> dict[str, Status]:
+def statuses(now: StatusContext) -> dict[str, TaskReport]:
     """Return the status of each of :data:`TASKS`."""
     warnings = list(_warnings(now))
     found = {CONTROL: _control_status(now, warnings)}
     for condition in CONDITIONS:
         sentences = [sentence for of, sentence in warnings if of == condition]
-        found[condition] = Status(Level.WARN, '; '.join(sentences)) if sentences else Status(
-            Level.OK, 'in order')
+        found[condition] = TaskReport(Severity.WARN,
+                                      '; '.join(sentences)) if sentences else TaskReport(
+            Severity.OK, 'in order')
     return found
 
 
-def inactive(now: Situation) -> dict[str, Status]:
+def inactive(now: StatusContext) -> dict[str, TaskReport]:
     """Return the statuses of a node that answers no measurement."""
-    return {**dict.fromkeys(CONDITIONS, Status(Level.OK, _INACTIVE)),
-            CONTROL: Status(Level.OK, _INACTIVE, lambda: _figures(now, CONTROL))}
+    return {**dict.fromkeys(CONDITIONS, TaskReport(Severity.OK, _INACTIVE)),
+            CONTROL: TaskReport(Severity.OK, _INACTIVE, lambda: _figures(now, CONTROL))}
 
 
-def _control_status(now: Situation, warnings: Sequence[tuple[str, str]]) -> Status:
+def _control_status(now: StatusContext, warnings: Sequence[tuple[str, str]]) -> TaskReport:
     level, message = _control(now)
     condition = CONTROL
     if not message and warnings:
-        level, message = Level.WARN, '; '.join(warning for _, warning in warnings)
+        level, message = Severity.WARN, '; '.join(warning for _, warning in warnings)
         condition = warnings[0][0]
     elif not message:
         message = _in_order(now)
     if now.complaint and now.timing.no_news(_PATIENCE) is Advance.TWO_SOURCES:
         message += f'; {now.complaint}'
-    return Status(level, message, lambda: _figures(now, condition))
+    return TaskReport(level, message, lambda: _figures(now, condition))
 
 
-def _in_order(now: Situation) -> str:
+def _in_order(now: StatusContext) -> str:
     mode, command = now.state.mode, now.report.command
     if mode is Mode.AUTOMATIC and not now.setpoint_received:
         return f'{mode.value}, no set-point yet: what was first measured is held'
@@ -141,7 +142,7 @@ def _in_order(now: Situation) -> str:
     return f'{mode.value}, {now.input} at a rate limit' if command.at_rate else mode.value
 
 
-def _control(now: Situation) -> tuple[Level, str]:
+def _control(now: StatusContext) -> tuple[Severity, str]:
     """Return what keeps the best law from acting, or an empty sentence."""
     report, mode = now.report, now.state.mode
     timeout = now.parameters.measurement_timeout
@@ -149,7 +150,7 @@ def _control(now: Situation) -> tuple[Level, str]:
         waiting = f'waiting for the first measurement{now.awaited}'
         if mode is Mode.MANUAL and now.state.command is None:
             waiting += f': the applied {now.input} is not known, and no manual command goes out'
-        return Level.WARN, now.complaint or waiting
+        return Severity.WARN, now.complaint or waiting
     silence = now.timing.silence
     # /clock is not read meanwhile
     if timeout and (silence > timeout or (
@@ -159,30 +160,30 @@ def _control(now: Situation) -> tuple[Level, str]:
         action = 'manual mode' if mode is Mode.MANUAL else (
             _ACTIONS[HOLD] if report.depth == 0 else _action(now))
         if now.timing.busy:
-            return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
+            return Severity.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
                                  f'node is busy: {action}{doing}; ask for less at once')
         if (why := now.timing.no_news(timeout)) is not None:
             what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
                     else 'two sources have published the measurement in turn')
-            return Level.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
+            return Severity.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
                                  'the clock of the sensor, and that it has one publisher')
-        return Level.ERROR, (f'no measurement{now.awaited} for more than {timeout:g} s: '
+        return Severity.ERROR, (f'no measurement{now.awaited} for more than {timeout:g} s: '
                              f'{action}{doing}; check sensor and plant')
     if report.reason is not None and mode is Mode.MANUAL:
-        return Level.ERROR, f'{mode.value}: {now.reason}'
+        return Severity.ERROR, f'{mode.value}: {now.reason}'
     if mode is Mode.AUTOMATIC and report.depth > 0:
-        level = Level.ERROR if report.level in _ACTIONS else Level.WARN
+        level = Severity.ERROR if report.level in _ACTIONS else Severity.WARN
         action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
         return level, f'{action}: {now.reason}'
-    return Level.OK, ''
+    return Severity.OK, ''
 
 
-def _action(now: Situation) -> str:
+def _action(now: StatusContext) -> str:
     level = now.report.level
     return _ACTIONS.get(level, '').format(now.input) or level_words(level)
 
 
-def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
+def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
     """Yield every warning with the name of its condition, the most urgent first."""
     report, states, tuning = now.report, now.controller.model.states, now.controller.tuning
     age, oldest = now.timing.age, now.parameters.max_measurement_age
@@ -246,7 +247,7 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
             'model; retrain')
 
 
-def _out_of_reach(now: Situation, target: TargetReport) -> str:
+def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
     """Say that the inputs do not suffice for the set-point as things are, or return ''."""
     if target.state is None or target.input is None:
         return ''
@@ -271,12 +272,12 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     return ''
 
 
-def _listed(now: Situation, values: Array) -> str:
+def _listed(now: StatusContext, values: Array) -> str:
     return ', '.join(f'{value:g} {unit}' for value, unit in zip(
         values.tolist(), now.signals.inputs.values(), strict=True))
 
 
-def _figures(now: Situation, condition: str) -> dict[str, object]:
+def _figures(now: StatusContext, condition: str) -> dict[str, object]:
     report, state, timing, signals = now.report, now.state, now.timing, now.signals
     target, law, estimate = report.target, report.command.law, report.estimate
     transfer = np.zeros(len(signals.inputs)) if report.command.transfer is None else (
@@ -327,7 +328,7 @@ def _figures(now: Situation, condition: str) -> dict[str, object]:
     }
 
 
-def _estimated(now: Situation) -> dict[str, object]:
+def _estimated(now: StatusContext) -> dict[str, object]:
     """Return what is estimated of states that are not measured, and how well it fits."""
     estimate, states = now.report.estimate, now.controller.model.states
     found: dict[str, object] = {}

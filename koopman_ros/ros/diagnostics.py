@@ -20,7 +20,7 @@ from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.hosted import HostedNode, wall_timer
 
 
-class Level(Enum):
+class Severity(Enum):
     """Severity of a status, as one byte."""
 
     OK = DiagnosticStatus.OK
@@ -29,10 +29,10 @@ class Level(Enum):
 
 
 @dataclass(frozen=True)
-class Status:
+class TaskReport:
     """What a node says of itself: a sentence, and figures with their units in the key."""
 
-    level: Level
+    level: Severity
     message: str
     #: or a function, which is called only when they are published
     values: Mapping[str, object] | Callable[[], Mapping[str, object]] = field(
@@ -57,11 +57,11 @@ class Diagnostics:
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         wall_timer(node, 1.0, self._publish_all)
 
-    def add(self, task: str, collect: Callable[[], Status]) -> DiagnosticTask:
+    def add(self, task: str, collect: Callable[[], TaskReport]) -> DiagnosticTask:
         """Report a further task under the name ``<node>: <task>``."""
         return self.add_group(lambda: {task: collect()}, (task,))
 
-    def add_group(self, collect: Callable[[], Mapping[str, Status]], tasks: Sequence[str]
+    def add_group(self, collect: Callable[[], Mapping[str, TaskReport]], tasks: Sequence[str]
                   ) -> DiagnosticTask:
         """Report some tasks, whose statuses are collected together."""
         self.tasks.append(DiagnosticTask(self, tasks, collect))
@@ -74,7 +74,7 @@ class Diagnostics:
     def _publish_all(self) -> None:
         self.publish([status for task in self.tasks for status in task.collect().items()])
 
-    def publish(self, statuses: Sequence[tuple[str, Status]]) -> None:
+    def publish(self, statuses: Sequence[tuple[str, TaskReport]]) -> None:
         """Publish the status of some tasks in one message."""
         if not statuses:
             return
@@ -84,7 +84,7 @@ class Diagnostics:
         message.header.stamp = stamp_message(time.time_ns())
         self._publisher.publish(message)
 
-    def _message(self, name: str, status: Status) -> DiagnosticStatus:
+    def _message(self, name: str, status: TaskReport) -> DiagnosticStatus:
         try:
             values = status.values() if callable(status.values) else status.values
         except Exception as error:
@@ -100,11 +100,11 @@ class DiagnosticTask:
     """One task of a node, or some whose statuses are collected together."""
 
     def __init__(self, diagnostics: Diagnostics, names: Sequence[str],
-                 collect: Callable[[], Mapping[str, Status]]) -> None:
+                 collect: Callable[[], Mapping[str, TaskReport]]) -> None:
         self._diagnostics, self._names, self._collect = diagnostics, names, collect
-        self._last: dict[str, tuple[Level, str]] = {}
+        self._last: dict[str, tuple[Severity, str]] = {}
 
-    def collect(self) -> dict[str, Status]:
+    def collect(self) -> dict[str, TaskReport]:
         """Return the present status of each task."""
         # a failure of a report does not end the loop that it reports on
         try:
@@ -129,5 +129,5 @@ class DiagnosticTask:
         self._diagnostics.tasks.remove(self)
 
 
-def _failed(error: Exception) -> Status:
-    return Status(Level.ERROR, f'the status cannot be collected ({contained(error)})')
+def _failed(error: Exception) -> TaskReport:
+    return TaskReport(Severity.ERROR, f'the status cannot be collected ({contained(error)})')

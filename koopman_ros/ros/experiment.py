@@ -10,12 +10,12 @@ import math
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import SetBool
 
-from koopman_ros.control.experiment import level, Phase
+from koopman_ros.control.experiment import ExperimentPhase, level
 from koopman_ros.core.status import Code, Reason, reason
 from koopman_ros.parameters.signal_topics import Wiring, words_of
 from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.ros import topics
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.experiment_run import ExperimentRun, other_publishers, stepped
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import Owned
@@ -39,7 +39,7 @@ class PlantExperiment:
         self._node, self._wiring = node, wiring
         self._words = words_of(wiring.signals)
         self._run: ExperimentRun | None = None
-        self._outcome = Status(Level.OK, 'no experiment')
+        self._outcome = TaskReport(Severity.OK, 'no experiment')
         self._diagnostics = node.diagnostics.add('experiment', self._status)
         # a group of its own: the service waits for the first measurement
         self._owned = Owned(node)
@@ -56,7 +56,7 @@ class PlantExperiment:
         """Bring the inputs back as far as the rate limit allows in 2 s, and let go."""
         run = self._run
         if run is not None:
-            run.stop(Phase.ENDED)
+            run.stop(ExperimentPhase.ENDED)
             run.farewell()
             self._let_go(self._verdict(run))
 
@@ -86,7 +86,7 @@ class PlantExperiment:
             response.message = f'refused: {reason}' if reason else (
                 f'running on {self._run.topics if self._run else ""}')
             if reason:
-                self._let_go(Status(Level.WARN, response.message))
+                self._let_go(TaskReport(Severity.WARN, response.message))
         self._say(response.message)
         return response
 
@@ -118,7 +118,7 @@ class PlantExperiment:
         if self._run is None:
             return False, 'no experiment is running'
         if self._run.running:
-            self._run.stop(Phase.ENDED)
+            self._run.stop(ExperimentPhase.ENDED)
             return True, f'ended: {self._run.going_home}; call again to let go'
         self._let_go(self._verdict(self._run))
         return True, 'the trainer does not command any more'
@@ -131,11 +131,11 @@ class PlantExperiment:
             self._say(self._verdict(run).message)
             return
         # an experiment that was over is over as it was
-        run.stop(Phase.ABORTED, why)
+        run.stop(ExperimentPhase.ABORTED, why)
         self._let_go(self._verdict(run))
         self._say(f'the trainer does not command any more: {self._words(why)}')
 
-    def _let_go(self, outcome: Status) -> None:
+    def _let_go(self, outcome: TaskReport) -> None:
         run, self._run = self._run, None
         self._outcome = outcome
         if run is not None:
@@ -145,20 +145,20 @@ class PlantExperiment:
 
     def _say(self, sentence: str) -> None:
         # two lines, because rclpy allows one severity a line
-        if self._status().level is Level.OK:
+        if self._status().level is Severity.OK:
             self._node.get_logger().info(f'experiment: {sentence}')
         else:
             self._node.get_logger().warning(f'experiment: {sentence}')
         self._diagnostics.publish_if_changed()
 
-    def _verdict(self, run: ExperimentRun) -> Status:
+    def _verdict(self, run: ExperimentRun) -> TaskReport:
         if run.progress is None:
-            return Status(Level.OK, 'waiting for the first measurement')
-        if run.progress.phase is Phase.ABORTED:
-            return Status(Level.ERROR, f'aborted: {self._words(run.progress.reason)}')
-        return Status(Level.OK, run.progress.phase.value)
+            return TaskReport(Severity.OK, 'waiting for the first measurement')
+        if run.progress.phase is ExperimentPhase.ABORTED:
+            return TaskReport(Severity.ERROR, f'aborted: {self._words(run.progress.reason)}')
+        return TaskReport(Severity.OK, run.progress.phase.value)
 
-    def _status(self) -> Status:
+    def _status(self) -> TaskReport:
         run = self._run
         if run is None:
             return self._outcome
@@ -167,7 +167,7 @@ class PlantExperiment:
             return verdict
         held = '' if run.running else f'; {run.going_home}'
         left = max(0.0, run.plan.duration - run.progress.elapsed) if run.running else 0.0
-        return Status(verdict.level, verdict.message + held, {
+        return TaskReport(verdict.level, verdict.message + held, {
             'topic': run.topics,
             **run.figures('level', level(run.plan, run.progress)),
             **run.figures('command', run.progress.command),

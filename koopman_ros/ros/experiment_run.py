@@ -25,8 +25,8 @@ from koopman_ros.control.experiment import (
     begin,
     end,
     Experiment,
-    Phase,
-    Progress,
+    ExperimentPhase,
+    ExperimentProgress,
     TrackingMonitor,
 )
 from koopman_ros.core.arrays import Array
@@ -82,7 +82,7 @@ class ExperimentRun:
         self.plan: Experiment = settings.experiment(
             signals, np.zeros(len(places)) if self._on_setpoints else None)
         self._topics = [node.resolve_topic_name(place.topic) for place in places.values()]
-        self.progress: Progress | None = None
+        self.progress: ExperimentProgress | None = None
         # why it cannot start, or None with the first measurement
         self.started = Future()
         self._node = node
@@ -135,7 +135,7 @@ class ExperimentRun:
     @property
     def running(self) -> bool:
         """Whether it waits for its first measurement, or steps."""
-        return self.progress is None or self.progress.phase is Phase.RUNNING
+        return self.progress is None or self.progress.phase is ExperimentPhase.RUNNING
 
     @property
     def _setpoints_missing(self) -> bool:
@@ -201,7 +201,7 @@ class ExperimentRun:
         return {f'{self._called(name)} {what} [{display_unit(unit)}]': shown(value, unit)
                 for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True)}
 
-    def stop(self, phase: Phase, why: Reason | None = None) -> None:
+    def stop(self, phase: ExperimentPhase, why: Reason | None = None) -> None:
         """End the steps; the signals then go home."""
         if self.progress is not None:
             self.progress = end(self.progress, phase, why)
@@ -336,7 +336,7 @@ class ExperimentRun:
             was_running = self.running
             # the way back goes by the wall clock
             self.progress = advance(
-                self.plan, end(self.progress, Phase.ABORTED, why), None,
+                self.plan, end(self.progress, ExperimentPhase.ABORTED, why), None,
                 self.progress.time_ns + round(_TICK * NANOSECONDS))
             self._command(self.progress.command, self.progress.time_ns)
             if was_running:

@@ -18,7 +18,7 @@ from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.ros.managed import one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import init
-from koopman_ros.ros.training import POLL_PERIOD, present_lift, Progress, task_fields
+from koopman_ros.ros.training import POLL_PERIOD, present_lift, task_fields, TrainingProgress
 
 
 def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
@@ -91,7 +91,7 @@ def _retrain(task: Mapping[str, object], arrived: Sequence[int]) -> JobState:
     """Retrain in a process of its own; tell of the plants as they end."""
     job = TrainingJob(task)
     told: set[str] = set()
-    progress = Progress(lambda text: print(text, file=sys.stderr, flush=True))
+    progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
     try:
         while True:
             state = job.poll()

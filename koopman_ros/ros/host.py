@@ -19,7 +19,7 @@ from koopman_ros.core.paths import config_directory, LEAN_PROFILE
 from koopman_ros.core.plugins import contained
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.process_entry import handle_signals
-from koopman_ros.ros.diagnostics import Diagnostics, Level, Status
+from koopman_ros.ros.diagnostics import Diagnostics, Severity, TaskReport
 from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
@@ -178,19 +178,19 @@ class Host:
         self._leaving += [namespace for namespace, node in self._nodes.items()
                           if node.exit_code is not None and namespace not in self._leaving]
 
-    def _status(self) -> Status:
+    def _status(self) -> TaskReport:
         running, failed = len(self._nodes), list(self._failed.items())
-        level, message = Level.OK, f'{running} of {len(self._loops)} loops run'
+        level, message = Severity.OK, f'{running} of {len(self._loops)} loops run'
         if failed:
-            level, message = Level.ERROR, f'{message}, {len(failed)} failed: ' + '; '.join(
+            level, message = Severity.ERROR, f'{message}, {len(failed)} failed: ' + '; '.join(
                 f'{namespace}: {why}' for namespace, why in failed[:_SHOWN]) + (
                 '; and more, see the log' if len(failed) > _SHOWN else '')
         delay, self._delay = self._delay, 0.0
-        if level is Level.OK and delay > _LATE and not self._waiting:
-            level, message = Level.WARN, (
+        if level is Severity.OK and delay > _LATE and not self._waiting:
+            level, message = Severity.WARN, (
                 f'{message}, {delay:.2g} s late: that is more than one process can do; spread the '
                 'loops over several, or measure less often')
-        return Status(level, message, {
+        return TaskReport(level, message, {
             'loops': len(self._loops), 'running': running, 'failed': len(failed),
             'to be started': len(self._waiting),
             'longest delay of a timer [ms]': 1e3 * delay})

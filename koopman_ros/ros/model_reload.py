@@ -19,10 +19,10 @@ from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.model_checks import (
     load_suitable,
     LoadedModel,
+    ModelCheckContext,
     refuse_setpoints,
     refuse_without_law,
     refuse_worse,
-    Situation,
 )
 from koopman_ros.parameters.signal_topics import Signals
 
@@ -34,7 +34,7 @@ _MAX_READING = 8  # files that a dead disk may keep open at once
 class _Trial:
     """A model file on its way, in a thread of its own that does not keep the process."""
 
-    def __init__(self, node: Node, name: str, signals: Signals, situation: Situation,
+    def __init__(self, node: Node, name: str, signals: Signals, situation: ModelCheckContext,
                  present: LiftedModel) -> None:
         self.outcome = Future()
         self.path = name
@@ -46,7 +46,7 @@ class _Trial:
             target=self._run, args=(name, signals, situation, present), daemon=True)
         self._node = node
 
-    def _run(self, name: str, signals: Signals, situation: Situation,
+    def _run(self, name: str, signals: Signals, situation: ModelCheckContext,
              present: LiftedModel) -> None:
         outcome: LoadedModel | str
         try:
@@ -88,7 +88,7 @@ class ModelReload:
     """
 
     def __init__(self, node: Node, in_force: LoadedModel, signals: Signals,
-                 situation: Callable[[], Situation], reloaded: Callable[[], None],
+                 situation: Callable[[], ModelCheckContext], reloaded: Callable[[], None],
                  refused: Callable[[], None]) -> None:
         self._signals = signals
         self.in_force, self.reloads, self.refused = in_force, 0, ''
@@ -168,7 +168,7 @@ class ModelReload:
             'model check': self.in_force.comparison or 'none',
         }
 
-    def _start(self, name: str, situation: Situation) -> _Trial:
+    def _start(self, name: str, situation: ModelCheckContext) -> _Trial:
         trial = _Trial(self._node, name, self._signals, situation, self.in_force.model)
         self._reading = [other for other in self._reading if other.reading]
         if trial.path in [other.path for other in self._reading]:

@@ -17,7 +17,7 @@ from koopman_ros.parameters.signal_topics import Wiring
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.records import BagWriter
 from koopman_ros.ros import topics
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import Owned
 from koopman_ros.ros.recorder import Recorder
@@ -157,13 +157,14 @@ class Recording:
             f'{free:.0f} MB are free on the disk of {folder}, below min_free_disk = '
             f'{limit:.10g} MB')
 
-    def _status(self) -> Status:
+    def _status(self) -> TaskReport:
         if self._recorder is None:
-            return Status(Level.ERROR, self._problem) if self._problem else Status(
-                Level.OK, 'not recording')
+            return TaskReport(Severity.ERROR, self._problem) if self._problem else TaskReport(
+                Severity.OK, 'not recording')
         counts = self._recorder.counts
         complaint = self._recorder.complaint
-        return Status(Level.WARN if complaint else Level.OK, f'recording to {self._path}' + (
+        return TaskReport(Severity.WARN if complaint else Severity.OK,
+                          f'recording to {self._path}' + (
             f'; {complaint}' if complaint else ''), {
             'bag': os.path.abspath(self._path),
             'messages': sum(counts.values()),

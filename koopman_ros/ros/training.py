@@ -25,7 +25,7 @@ from koopman_ros.execution.training import (
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.signal_topics import preset, system_of, Wiring
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode, Owned
 
@@ -72,7 +72,7 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
         **settings.training()}
 
 
-class Progress:
+class TrainingProgress:
     """
     How far a training is: a bar on a terminal, else a line every five seconds.
 
@@ -107,7 +107,7 @@ class Training:
         self._recorded, self._on_end = recorded, on_end
         self._job: TrainingJob | None = None
         self._state: JobState | None = None
-        self._progress = Progress(node.get_logger().info)
+        self._progress = TrainingProgress(node.get_logger().info)
         self._diagnostics = node.diagnostics.add('training', self._status)
         self._owned = owned = Owned(node)
         owned.keep(node.create_service(Trigger, '~/train', self._on_train))
@@ -123,7 +123,7 @@ class Training:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
         self._job = TrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
-        self._progress = Progress(self._node.get_logger().info)
+        self._progress = TrainingProgress(self._node.get_logger().info)
         self._timer.reset()
         said = f'training from {", ".join(bags)}'
         self._node.get_logger().info(said)
@@ -190,13 +190,13 @@ class Training:
         self._diagnostics.publish_if_changed()
         self._on_end(self._state)
 
-    def _status(self) -> Status:
+    def _status(self) -> TaskReport:
         state = self._state
         if state is None:
-            return Status(Level.OK, 'not training')
+            return TaskReport(Severity.OK, 'not training')
         values = {'done [%]': 100.0 * state.share, **scalars(state.summary or {})}
         if not state.ended or state.accepted:
             # the sentence stays while the figures move, or there would be a status a step
             text = state.text if state.ended else state.text.split(',')[0]
-            return Status(Level.OK, text, {**values, 'step': state.text})
-        return Status(Level.WARN if state.refused else Level.ERROR, state.text, values)
+            return TaskReport(Severity.OK, text, {**values, 'step': state.text})
+        return TaskReport(Severity.WARN if state.refused else Severity.ERROR, state.text, values)

@@ -11,7 +11,7 @@ from typing import Any
 
 from koopman_ros.testing import deferred_interrupt
 from studies.faults import report
-from studies.faults.case import Case, Trace
+from studies.faults.case import FaultCase, LoopTrace
 from studies.faults.cases import CASES
 from studies.faults.endurance import DAYS, HOURS, run_endurance
 from studies.faults.harness import run
@@ -51,9 +51,9 @@ def main(args: list[str] | None = None) -> int:
     return _run(cases, [name for name in DAYS if name in names], given.hours, given.output)
 
 
-def _run(cases: Sequence[Case], days: Sequence[str], hours: float, folder: Path) -> int:
+def _run(cases: Sequence[FaultCase], days: Sequence[str], hours: float, folder: Path) -> int:
     results: dict[str, dict[str, Any]] = {}
-    traces: dict[str, Trace] = {}
+    traces: dict[str, LoopTrace] = {}
     endured: dict[str, dict[str, Any]] = {}
     try:
         with deferred_interrupt() as check:

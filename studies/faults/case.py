@@ -14,14 +14,14 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import Code
-from studies.faults.plants import LOCKSTEP, Plant, REACTOR
+from studies.faults.plants import FaultPlant, LOCKSTEP, REACTOR
 
 if TYPE_CHECKING:
     from studies.faults.harness import FaultHarness
 
 
 @dataclass(frozen=True)
-class Case:
+class FaultCase:
     """A fault, and what the loop is to make of it; values are in the units of the messages."""
 
     group: str  #: heading in the report
@@ -31,7 +31,7 @@ class Case:
     play: Callable[[FaultHarness], None]
 
     between: bool = False  #: whether messages are altered
-    on: Plant = REACTOR  #: what the loop controls
+    on: FaultPlant = REACTOR  #: what the loop controls
     plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)  #: parameters
     controller: Mapping[str, object] = field(default_factory=dict)  #: parameters
     setpoint: tuple[float, ...] = REACTOR.setpoint  #: requested at the start
@@ -64,7 +64,7 @@ class Command(NamedTuple):
     stamp_ns: int
 
 
-class Status(NamedTuple):
+class SeenStatus(NamedTuple):
     """A status of diagnostics: whose, how bad (0 is OK, 1 WARN, 2 ERROR), and the sentence."""
 
     seconds: float
@@ -75,14 +75,14 @@ class Status(NamedTuple):
 
 
 @dataclass
-class Trace:
+class LoopTrace:
     """
     All that was seen of a case.
 
     Times are plant time in seconds since the first measurement, values those of the messages.
     """
 
-    on: Plant = REACTOR
+    on: FaultPlant = REACTOR
     #: when, and the true states before any fault of a sensor
     samples: list[tuple[float, tuple[float, ...]]] = field(default_factory=list)
     #: what the operator wanted of the controlled states, and from when on
@@ -91,7 +91,7 @@ class Trace:
     #: measured inputs by stamp and name
     applied: dict[int, dict[str, float]] = field(default_factory=dict)
     delivered: list[int] = field(default_factory=list)  #: stamps that reached the controller
-    statuses: list[Status] = field(default_factory=list)  #: of all nodes
+    statuses: list[SeenStatus] = field(default_factory=list)  #: of all nodes
     #: what the controller recorded of itself: (plant time, text)
     records: list[tuple[float, str]] = field(default_factory=list)
     begin: float = math.inf  #: when the fault began
@@ -104,7 +104,7 @@ class Trace:
         return [f'{status.name}: {status.message}' for status in self.statuses
                 if status.seconds >= self.begin]
 
-    def last(self, name: str) -> Status | None:
+    def last(self, name: str) -> SeenStatus | None:
         """Return the last status of a task."""
         return next((s for s in reversed(self.statuses) if s.name == name), None)
 

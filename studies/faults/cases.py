@@ -15,14 +15,14 @@ from koopman_ros.core.status import Code
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
 from studies.faults import interceptor, operators, processes, silence
-from studies.faults.case import Case
+from studies.faults.case import FaultCase
 from studies.faults.interceptor import delayed, frozen, lost, noise, Packet, stamped, twice, value
 from studies.faults.operators import altered, changed_for_good, Maker, REQUESTS, scaled
 from studies.faults.plants import (
+    FaultPlant,
     LOCKSTEP,
     PATIENT,
     PENDULUM,
-    Plant,
     QUADRUPLE_TANK,
     REACTOR,
     SADDLE,
@@ -43,10 +43,10 @@ _SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 1.0, 'recovery_time': 1.0}
 _NEAR = {REACTOR.name: 10.0, TWO_TANKS.name: 0.08}
 
 
-def _on(on: Plant, group: str, name: str, does: str, play: Callable[..., None], **details: Any
-        ) -> Case:
+def _on(on: FaultPlant, group: str, name: str, does: str, play: Callable[..., None], **details: Any
+        ) -> FaultCase:
     """Return a case on a plant, at its set-points and times; its name begins with the plant's."""
-    return Case(group, f'{on.name}-{name}', does, play, **{
+    return FaultCase(group, f'{on.name}-{name}', does, play, **{
         'on': on, 'setpoint': on.setpoint, 'settle': on.settle, 'afterwards': on.afterwards,
         'recovery': on.recovery, 'band': on.band, **details})
 
@@ -88,14 +88,14 @@ def _twice() -> interceptor.Alteration:
 # The reactor: one temperature, one coolant.
 
 def _sensor(name: str, does: str, make: Maker, seconds: float, code: Code | None = None,
-            **details: Any) -> Case:
-    return Case('sensor', name, f'{does}, {seconds:g} s',
+            **details: Any) -> FaultCase:
+    return FaultCase('sensor', name, f'{does}, {seconds:g} s',
                 partial(altered, make=make, seconds=seconds), True, code=code, **details)
 
 
 def _in_a_step(group: str, name: str, does: str, make: Maker, seconds: float, *,
-               what: str = 'measurements', largest_step: float = 2.0, **details: Any) -> Case:
-    return Case(group, name, f'{does}, while the set-point steps, {seconds:g} s',
+               what: str = 'measurements', largest_step: float = 2.0, **details: Any) -> FaultCase:
+    return FaultCase(group, name, f'{does}, while the set-point steps, {seconds:g} s',
                 partial(altered, make=make, seconds=seconds, setpoint=REACTOR.other, what=what),
                 True, largest_step=largest_step, **details)
 
@@ -116,11 +116,12 @@ _MESSAGES = (
     _sensor('spikes', 'a spike of +20 K in every seventh sample',
             _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, Code.JUMPED),
     _sensor('frozen-at-rest', 'bit-identical values', frozen, 120.0),
-    Case('sensor', 'frozen-in-a-step', 'bit-identical values, 10 s after a step of the set-point, '
+    FaultCase('sensor', 'frozen-in-a-step',
+              'bit-identical values, 10 s after a step of the set-point, '
          '90 s', partial(altered, make=frozen, seconds=90.0, setpoint=(42.0,), wait=10.0), True,
          code=Code.FROZEN),
     _sensor('drift', 'drifts by 1 K/min', _shifted(lambda seconds: seconds / 60.0), 180.0),
-    Case('sensor', 'bias', 'wrong by +2 K, 300 s and more', operators.biased, True,
+    FaultCase('sensor', 'bias', 'wrong by +2 K, 300 s and more', operators.biased, True,
          recovery=360.0, afterwards=420.0),
     _sensor('noise-burst', 'noise of 1 K', lambda: noise(1.0), 60.0),
     _sensor('noise-wild', 'noise of 10 K', lambda: noise(10.0), 60.0, Code.JUMPED),
@@ -149,11 +150,11 @@ _MESSAGES = (
            says=('^controller: control: .*does not advance',)),
     _clock('clock-jitter', 'stamps are up to 0.4 s wrong', lambda: stamped(_jittered), 120.0),
     _clock('clock-twins', 'two measurements with each stamp', _twins(0.01), 60.0),
-    Case('clocks', 'no-clock', 'use_sim_time is set, and nobody publishes /clock',
+    FaultCase('clocks', 'no-clock', 'use_sim_time is set, and nobody publishes /clock',
          operators.without_clock, plant={**LOCKSTEP, 'publish_clock': False},
          controller=_BY_CLOCK, says=(operators.NO_CLOCK,)))
 
-_process, _neighbour = partial(Case, 'processes'), partial(Case, 'neighbours')
+_process, _neighbour = partial(FaultCase, 'processes'), partial(FaultCase, 'neighbours')
 _PROCESSES = (
     _process('plant-restart', 'the plant is ended and started again, 5 K too warm and at time 1 s',
              partial(processes.plant_again, number=signal.SIGINT)),
@@ -212,19 +213,19 @@ def _cycled(changes: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 
 def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, Any]]],
-                refused: bool = False) -> Case:
-    return Case('operators', name, f'{REQUESTS} {does}',
+                refused: bool = False) -> FaultCase:
+    return FaultCase('operators', name, f'{REQUESTS} {does}',
                 partial(operators.storm_of_parameters, make=make, refused=refused))
 
 
-def _setpoints(name: str, does: str, *values: float, code: Code | None = None) -> Case:
-    return Case('operators', name, f'set-points at 1 kHz{does}',
+def _setpoints(name: str, does: str, *values: float, code: Code | None = None) -> FaultCase:
+    return FaultCase('operators', name, f'set-points at 1 kHz{does}',
                 partial(operators.storm_of_setpoints, asked=tuple(
                     {reactor.TEMPERATURE: value} for value in values)), code=code)
 
 
-def _constant(name: str, does: str, play: Callable[..., None], **details: Any) -> Case:
-    return Case('disturbances', name, does, play,
+def _constant(name: str, does: str, play: Callable[..., None], **details: Any) -> FaultCase:
+    return FaultCase('disturbances', name, does, play,
                 **{'recovery': 360.0, 'afterwards': 600.0, 'offset': 0.01, **details})
 
 
@@ -243,9 +244,9 @@ _OPERATORS = (
     _setpoints('setpoint-storm-outside', ': 500 and -1e308 degC', 500.0, -1e308,
                code=Code.SETPOINT_OUTSIDE),
     _setpoints('setpoint-storm-alternating', ': 41 and 51 degC in turn', 41.0, 51.0),
-    Case('operators', 'mode-once', 'manual mode for a minute, and back, without a bump',
+    FaultCase('operators', 'mode-once', 'manual mode for a minute, and back, without a bump',
          operators.mode_once, bump=_BUMP),
-    Case('operators', 'mode-storm', f'{REQUESTS} changes between automatic and manual mode',
+    FaultCase('operators', 'mode-storm', f'{REQUESTS} changes between automatic and manual mode',
          operators.storm_of_modes),
     *(_constant(name, f'{does}, for good', partial(changed_for_good, parameters=changes))
       for name, does, changes in (
@@ -279,19 +280,19 @@ _OPERATORS = (
 
 # The tanks: several signals, of which one may fail, or all at once.
 
-def _tank_messages(on: Plant) -> Iterator[Case]:
+def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
     last, half = on.states[-1], on.period / 2.0
     long, short = 60.0 * on.period, 10.0 * on.period
     step = {'largest_step': 2.0 * on.rate * on.period}
 
     def one(name: str, does: str, make: Maker, seconds: float = short, code: Code | None = None,
-            group: str = 'sensor', **details: Any) -> Case:
+            group: str = 'sensor', **details: Any) -> FaultCase:
         return _on(on, group, name, f'{last}: {does}, {seconds:g} s', partial(
             altered, make=lambda: interceptor.part(make(), last), seconds=seconds,
             setpoint=on.other), between=True, code=code, **{**step, **details})
 
     def every(name: str, does: str, make: Maker, seconds: float = short, group: str = 'clocks',
-              what: str = 'measurements', **details: Any) -> Case:
+              what: str = 'measurements', **details: Any) -> FaultCase:
         return _on(on, group, name, f'all: {does}, {seconds:g} s', partial(
             altered, make=make, seconds=seconds, setpoint=on.other, what=what), between=True,
             **{**step, **details})
@@ -322,7 +323,7 @@ def _tank_messages(on: Plant) -> Iterator[Case]:
               group='clocks')
 
 
-def _refused(on: Plant) -> list[dict[str, Any]]:
+def _refused(on: FaultPlant) -> list[dict[str, Any]]:
     """Return values that no signal can have."""
     return [*({f'{name}.{item}': wrong} for name in on.states for item, wrong in (
         ('weight', math.nan), ('weight', -1.0), ('setpoint_ramp', -1.0), ('sensor_min', 1e8))),
@@ -331,7 +332,7 @@ def _refused(on: Plant) -> list[dict[str, Any]]:
             ('safe', math.inf)))]
 
 
-def _tank_operators(on: Plant) -> Iterator[Case]:
+def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
     case = partial(_on, on, 'operators')
 
     def each(wanted: tuple[float, ...]) -> list[dict[str, float]]:
@@ -363,7 +364,7 @@ def _tank_operators(on: Plant) -> Iterator[Case]:
                        refused=True))
 
 
-def _tank_processes(on: Plant) -> Iterator[Case]:
+def _tank_processes(on: FaultPlant) -> Iterator[FaultCase]:
     case = partial(_on, on, 'processes')
     yield case('controller-killed', 'the controller is killed at rest and started again',
                processes.controller_again, plant=PATIENT, bump=_TANK_BUMP)
@@ -383,7 +384,7 @@ def _tank_processes(on: Plant) -> Iterator[Case]:
                 f'^controller: control: .*2 nodes publish the {on.states[0]}',)), between=True)
 
 
-def _tanks(on: Plant) -> list[Case]:
+def _tanks(on: FaultPlant) -> list[FaultCase]:
     return [*_tank_messages(on), *_tank_operators(on), *_tank_processes(on)]
 
 
@@ -397,7 +398,7 @@ _MANY = {f'{QUADRUPLE_TANK.name}-{name}' for name in (
 # The reactor at its saddle, where it runs away by itself; one of its states is estimated.
 
 def _saddle(group: str, name: str, does: str, make: Maker, seconds: float, *, step: bool = False,
-            what: str = 'measurements', **details: Any) -> Case:
+            what: str = 'measurements', **details: Any) -> FaultCase:
     return _on(SADDLE, group, name, f'{does}, {seconds:g} s'
                + (', while the set-point steps' if step else ''),
                partial(altered, make=make, seconds=seconds,
@@ -438,7 +439,7 @@ _SADDLE = (
 
 # Faults that could leave a plant without control while every status is OK, or end a process.
 
-def _silent(on: Plant) -> Iterator[Case]:
+def _silent(on: FaultPlant) -> Iterator[FaultCase]:
     case = partial(_on, on)
     fast: dict[str, Any] = {'plant': _FAST, 'controller': _BY_CLOCK, 'between': True,
                             'largest_step': _LOOK * on.rate,
@@ -473,7 +474,7 @@ def _silent(on: Plant) -> Iterator[Case]:
     yield case('demo', 'the demo is started in the same domain', silence.demo)
 
 
-def _ahead(on: Plant) -> Case:
+def _ahead(on: FaultPlant) -> FaultCase:
     return _on(on, 'clocks', 'ahead-one', f'{on.states[-1]}: stamps an hour ahead, 110 samples',
                silence.one_ahead, between=True, largest_step=2.0 * on.rate * on.period)
 

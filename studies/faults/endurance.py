@@ -20,11 +20,11 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.records import summary
 from koopman_ros.testing import HarnessError
 from studies.faults import interceptor
-from studies.faults.case import Trace
+from studies.faults.case import LoopTrace
 from studies.faults.harness import FaultHarness
 from studies.faults.interceptor import Alteration, value
 from studies.faults.judge import out_of_range, responses
-from studies.faults.plants import LOCKSTEP, Plant, REACTOR, SADDLE
+from studies.faults.plants import FaultPlant, LOCKSTEP, REACTOR, SADDLE
 
 HOURS = 24.0
 _EVENT_PERIOD = 300.0  # s, mean time between two events
@@ -39,7 +39,7 @@ _RECORDED = ('temperature', 'coolant_setpoint')
 class Day:
     """What is run, and between what its set-points and constants are drawn."""
 
-    on: Plant
+    on: FaultPlant
     setpoints: tuple[float, float]
     plant: Mapping[str, tuple[float, float]]  #: parameters of the plant
     models: tuple[str, ...]  #: one of which there is not
@@ -186,7 +186,7 @@ def growth(seconds: Array, megabytes: Array) -> float:
     return float(slope * np.ptp(seconds[warm])) + 0.0
 
 
-def _held_against(trace: Trace, answers: dict[str, int], memory: dict[str, dict[str, float]],
+def _held_against(trace: LoopTrace, answers: dict[str, int], memory: dict[str, dict[str, float]],
                   recorded: dict[str, int]) -> Iterator[str]:
     yield from trace.complaints
     wrong = ('unanswered', 'repeated', 'unasked', 'out_of_order')

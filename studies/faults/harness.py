@@ -23,10 +23,10 @@ from koopman_ros.core.message_fields import Place
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
-from studies.faults.case import Case, Trace
+from studies.faults.case import FaultCase, LoopTrace
 from studies.faults.interceptor import Alteration, Interceptor, message_of, remapped, unchanged
 from studies.faults.judge import judge
-from studies.faults.plants import Plant, REACTOR
+from studies.faults.plants import FaultPlant, REACTOR
 
 T = TypeVar('T')
 _STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
@@ -40,8 +40,8 @@ class SkipError(Exception):
     """A case cannot be tried on this machine; the message says why."""
 
 
-def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None
-        ) -> tuple[dict[str, Any], Trace]:
+def run(case: FaultCase, folder: Path, check: Callable[[], None] = lambda: None
+        ) -> tuple[dict[str, Any], LoopTrace]:
     """
     Run a case in a domain of its own and judge it.
 
@@ -92,7 +92,7 @@ class FaultHarness:
     """
 
     def __init__(self, folder: Path, limit: float, check: Callable[[], None],
-                 between: bool = False, on: Plant = REACTOR) -> None:
+                 between: bool = False, on: FaultPlant = REACTOR) -> None:
         self.folder, self.on = folder, on
         self.processes: dict[str, NodeProcess] = {}
         self._deadline = time.monotonic() + limit

@@ -25,8 +25,8 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.signals import by_topic
-from studies.faults.case import Command, Status, Trace
-from studies.faults.plants import Plant
+from studies.faults.case import Command, LoopTrace, SeenStatus
+from studies.faults.plants import FaultPlant
 
 # that wait to be read: a storm makes thousands while the harness is busy sending it
 MOST_RECORDS = 100_000
@@ -34,7 +34,7 @@ MOST_RECORDS = 100_000
 _BEHIND = 'plant/'  # before the topics of a plant whose messages are altered
 
 
-def remapped(on: Plant) -> tuple[str, ...]:
+def remapped(on: FaultPlant) -> tuple[str, ...]:
     """Return what a plant is started with when messages are altered."""
     topics_ = dict.fromkeys(place.topic for place in (
         *on.wiring.measured.values(), *on.wiring.commands.values()))
@@ -155,8 +155,8 @@ class Interceptor:
     :ivar commands: what is done to commands on their way to the plant.
     """
 
-    def __init__(self, node: Node, on: Plant, between: bool) -> None:
-        self.trace = Trace(on)
+    def __init__(self, node: Node, on: FaultPlant, between: bool) -> None:
+        self.trace = LoopTrace(on)
         self.measurements: Alteration = unchanged
         self.commands: Alteration = unchanged
         self.now = 0.0  # plant time in s since the first measurement
@@ -279,7 +279,7 @@ class Interceptor:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.trace.statuses += [
-            Status(self.now, status.name, status.level[0], status.message,
+            SeenStatus(self.now, status.name, status.level[0], status.message,
                    {item.key: item.value for item in status.values}) for status in message.status]
 
 

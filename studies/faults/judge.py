@@ -16,14 +16,14 @@ import numpy as np
 
 from koopman_ros.event_log.records import parse, RecordError
 from koopman_ros.event_log.run import replay_records
-from studies.faults.case import Case, Trace
+from studies.faults.case import FaultCase, LoopTrace
 
 LONGEST_GAP = 3.0  # samples between two commands, for which a larger step is allowed
 _PLANNER = 'koopman_ros.control.mpc.planner'
 _LAST = 30.0  # s at the end of a trace, in which an offset is looked for
 
 
-def judge(trace: Trace, case: Case) -> dict[str, Any]:
+def judge(trace: LoopTrace, case: FaultCase) -> dict[str, Any]:
     """
     Judge the trace of a case.
 
@@ -64,7 +64,7 @@ def judge(trace: Trace, case: Case) -> dict[str, Any]:
             'time_to_recover_s': round(recovery, 6), 'offset_at_the_end': round(offset, 6)}
 
 
-def _recovery(trace: Trace, band: float) -> float:
+def _recovery(trace: LoopTrace, band: float) -> float:
     times, errors = trace.errors()
     after = times >= trace.end
     times, out = times[after], errors[after] > band
@@ -74,7 +74,7 @@ def _recovery(trace: Trace, band: float) -> float:
     return float(times[np.flatnonzero(out)[-1] + 1] - trace.end) if np.any(out) else 0.0
 
 
-def out_of_range(trace: Trace) -> Iterator[str]:
+def out_of_range(trace: LoopTrace) -> Iterator[str]:
     """Say whether the plant was lost, and which command is the first outside its range."""
     on = trace.on
     unit, input_unit = on.shown_units
@@ -91,7 +91,7 @@ def out_of_range(trace: Trace) -> Iterator[str]:
                 return
 
 
-def _too_large_steps(trace: Trace, case: Case) -> Iterator[str]:
+def _too_large_steps(trace: LoopTrace, case: FaultCase) -> Iterator[str]:
     if not trace.commands:
         yield 'the controller never commanded'
         return
@@ -106,7 +106,7 @@ def _too_large_steps(trace: Trace, case: Case) -> Iterator[str]:
                f'{allowed[first]:g} {unit} are allowed after {gaps[first]:g} s')
 
 
-def _reports(trace: Trace, case: Case) -> Iterator[str]:
+def _reports(trace: LoopTrace, case: FaultCase) -> Iterator[str]:
     reported = trace.reported()
     for words in case.says:
         if not any(re.search(words, text) for text in reported):
@@ -116,7 +116,7 @@ def _reports(trace: Trace, case: Case) -> Iterator[str]:
             yield f'at the end diagnostics still say ERROR: {name}: {status.message}'
 
 
-def _records(trace: Trace, case: Case) -> Iterator[str]:
+def _records(trace: LoopTrace, case: FaultCase) -> Iterator[str]:
     """Say which reason the records lack, and where commands do not follow from them."""
     try:
         records = [(seconds, parse(text)) for seconds, text in trace.records]

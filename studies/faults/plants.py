@@ -26,7 +26,7 @@ PATIENT = {**LOCKSTEP, 'lockstep_timeout': 0.05}
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class FaultPlant:
     """A plant that is shipped; controlled states share a unit, and so do inputs."""
 
     name: str  #: by which it is called on the command line
@@ -130,25 +130,25 @@ def _each(names: tuple[str, ...], **values: float) -> dict[str, float]:
     return {f'{name}.{item}': value for name in names for item, value in values.items()}
 
 
-REACTOR = Plant(
+REACTOR = FaultPlant(
     # 5 K below the steady state that it starts from; its operating points end below 54 degC
     reactor.SYSTEM, setpoint=(46.0,), other=(44.0,), by_hand=(20.0,), band=0.3, highest=60.0)
 # Two levels and two pumps, each on a topic of its own: samples are put together by their stamps.
-TWO_TANKS = Plant(
+TWO_TANKS = FaultPlant(
     'two_tanks', setpoint=(0.1, 0.15), other=(0.09, 0.14), by_hand=(7.0, 2.0), band=0.002,
     settle=80.0, afterwards=200.0, recovery=180.0, never={'level_2': 0.08}, highest=0.35, tuned={
         **_each(('level_1', 'level_2'), max_rate=0.03, max_step=0.01),
         **_each(('pump_1', 'pump_2'), rate_limit=2.0), 'bumpless_transfer_time': 10.0})
 # Four levels in one message, two of them controlled.
 _LEVELS = ('level_1', 'level_2', 'level_3', 'level_4')
-QUADRUPLE_TANK = Plant(
+QUADRUPLE_TANK = FaultPlant(
     'quadruple_tank', setpoint=(0.15, 0.1), other=(0.14, 0.11), by_hand=(3.2, 2.8), band=0.002,
     settle=200.0, afterwards=300.0, recovery=270.0, never={'level_2': 0.042}, highest=0.25,
     wired={f'{name}.topic': 'levels' for name in _LEVELS}, tuned={
         **_each(_LEVELS, max_rate=0.01, max_step=0.01),
         **_each(('pump_1', 'pump_2'), rate_limit=1.0), 'bumpless_transfer_time': 10.0})
 # The reactor of two states where no coolant that is held holds it, its concentration estimated.
-SADDLE = Plant(
+SADDLE = FaultPlant(
     'saddle', kind='two_state', setpoint=(76.85,), other=(73.85,), by_hand=(26.85,), band=0.5,
     settle=120.0, afterwards=420.0, recovery=300.0, highest=110.0,
     simulated={'concentration.initial_offset': -0.37733466,
@@ -162,7 +162,7 @@ SADDLE = Plant(
         **_each(('coolant_temperature',), disturbance_noise=0.775, min=-20.0, max=100.0,
                 rate_limit=1.0)})
 # It falls where nothing acts; its rate is estimated from the angle.
-PENDULUM = Plant(
+PENDULUM = FaultPlant(
     'pendulum', setpoint=(0.0,), other=(0.1,), by_hand=(0.0,), band=math.inf, settle=4.0,
     afterwards=2.0, recovery=2.0, tuned={'states_measured': ('angle [rad]',)})
 PLANTS = {plant.name: plant for plant in (

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from koopman_ros.core import plots
-from studies.faults.case import Trace
+from studies.faults.case import LoopTrace
 from studies.faults.plants import PLANTS
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _HEAD = ('case', 'fault', 'worst error', 'worst step', 'back after [s]', 'left',
 
 def write(folder: Path, results: Mapping[str, dict[str, Any]],
           runs: Mapping[str, dict[str, Any]] | None = None,
-          traces: Mapping[str, Trace] | None = None) -> bool:
+          traces: Mapping[str, LoopTrace] | None = None) -> bool:
     """
     Write a page, figures and, where traces are given, a picture of all cases so far.
 
@@ -119,7 +119,7 @@ def _endurance_sections(name: str, run: dict[str, Any]) -> Iterator[str]:
         ((name, *seen.values()) for name, seen in run['memory_MB'].items()), (1, 2, 3))
 
 
-def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
+def _draw(traces: Mapping[str, LoopTrace], path: Path) -> bool:
     """Draw the first controlled state and the first input of telling cases, if there are any."""
     shown = {name: trace for name in TELLING if (trace := traces.get(name)) is not None
              and trace.commands and math.isfinite(trace.end)}
@@ -134,7 +134,7 @@ def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
     return bool(shown)
 
 
-def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
+def _draw_case(upper: Axes, lower: Axes, trace: LoopTrace) -> None:
     on = trace.on
     state = on.controlled[0]
     times = [seconds for seconds, _ in trace.samples]

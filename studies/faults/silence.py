@@ -19,11 +19,11 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
 from studies.faults import interceptor
-from studies.faults.case import Trace
+from studies.faults.case import LoopTrace
 from studies.faults.harness import FaultHarness
 from studies.faults.interceptor import Alteration, lost, message_of, stamped, value
 from studies.faults.operators import altered, Maker
-from studies.faults.plants import LOCKSTEP, Plant
+from studies.faults.plants import FaultPlant, LOCKSTEP
 
 CONTROL = 'controller: control'
 SLOW = {'speed': 1.0, 'start_time': 10_000.0}
@@ -91,7 +91,7 @@ def stray(loop: FaultHarness) -> None:
     loop.ros.set_bool('controller/set_automatic', True)
 
 
-def _expect_rate(trace: Trace) -> None:
+def _expect_rate(trace: LoopTrace) -> None:
     """Hold commands against the case that moved faster than the rate limit within a second."""
     on = trace.on
     for first, then in itertools.combinations(
@@ -107,7 +107,7 @@ def _expect_rate(trace: Trace) -> None:
 
 # Operators.
 
-def unheard(on: Plant) -> dict[str, str]:
+def unheard(on: FaultPlant) -> dict[str, str]:
     """Return the parameters of a plant whose inputs are not measured."""
     return {f'{name}.topic': f'unheard/{name}' for name in on.inputs}
 
@@ -240,7 +240,7 @@ def unmeasured(loop: FaultHarness) -> None:
         loop.request(*on.setpoint)
 
 
-def away(on: Plant) -> dict[str, str]:
+def away(on: FaultPlant) -> dict[str, str]:
     """Return the parameters of a plant that subscribes to commands on other topics."""
     return {f'{name}.command_topic': f'unheard/{place.topic}'
             for name, place in on.wiring.commands.items()}

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from koopman_ros.control import averaged, recentred
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Samples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, split_by_episode
 from koopman_ros.learning import NoUsefulLift, rollout_rmse, train
 from koopman_ros.learning.lift.metrics import drift_error
 from koopman_ros.model import Box, LiftedModel, PolynomialObservables
@@ -35,24 +35,24 @@ _DEGREE = 3  # of the monomials in discrete time
 _FAR = 1e3  # half widths, beyond which a prediction has diverged
 
 
-def noisy(samples: Samples, seed: int) -> Samples:
+def noisy(samples: DriftSamples, seed: int) -> DriftSamples:
     """Return samples whose derivatives are measured with noise."""
     rng = np.random.default_rng(seed)
     size = NOISE * np.sqrt(np.mean(samples.dxdt ** 2, axis=0))
     return replace(samples, dxdt=samples.dxdt + size * rng.normal(size=samples.dxdt.shape))
 
 
-def few(samples: Samples, seed: int) -> Samples:
+def few(samples: DriftSamples, seed: int) -> DriftSamples:
     """Return the first episodes alone."""
     episodes = np.unique(samples.episode)
     return samples.take(episodes[:round(FEW * len(episodes))])
 
 
-CONDITIONS: Mapping[str, Callable[[Samples, int], Samples]] = {
+CONDITIONS: Mapping[str, Callable[[DriftSamples, int], DriftSamples]] = {
     'rx': lambda samples, seed: samples, 'rx_noisy': noisy, 'rx_few': few}
 
 
-def beyond(case: Regulation, box: Box, seed: int) -> Samples:
+def beyond(case: Regulation, box: Box, seed: int) -> DriftSamples:
     """Return held-out samples outside of a box, of episodes that go beyond its upper ends."""
     more = BEYOND * (box.states.upper - box.states.lower)
     wider = replace(case, lower=0.5 * (box.states.lower + box.states.upper),
@@ -63,7 +63,7 @@ def beyond(case: Regulation, box: Box, seed: int) -> Samples:
     return found.where(np.any(found.x > box.states.upper, axis=1))
 
 
-def rolled_in_z(model: LiftedModel, samples: Samples) -> Array:
+def rolled_in_z(model: LiftedModel, samples: DriftSamples) -> Array:
     """
     Predict every episode by dz/dt = A z + J(x) B u alone, x the first coordinates of z.
 
@@ -90,7 +90,7 @@ def rolled_in_z(model: LiftedModel, samples: Samples) -> Array:
     return np.sqrt(squares / count)
 
 
-def discrete(case: Regulation, box: Box, samples: Samples, held_out: Samples, delays: int
+def discrete(case: Regulation, box: Box, samples: DriftSamples, held_out: DriftSamples, delays: int
              ) -> float:
     """
     Predict held-out episodes by EDMD in discrete time, with inputs and delay coordinates.
@@ -104,7 +104,7 @@ def discrete(case: Regulation, box: Box, samples: Samples, held_out: Samples, de
     terms = PolynomialObservables.total_degree(case.system.n_x, _DEGREE)
     n = case.system.n_x
 
-    def lifted(given: Samples) -> list[tuple[Array, Array, Array]]:
+    def lifted(given: DriftSamples) -> list[tuple[Array, Array, Array]]:
         found = []
         for number in np.unique(given.episode):
             rows = given.episode == number
@@ -169,7 +169,7 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
             for figure, value in figures.items()}, {}
 
 
-def _used(name: str, model: LiftedModel, held_out: Samples, outside: Samples, lift: bool,
+def _used(name: str, model: LiftedModel, held_out: DriftSamples, outside: DriftSamples, lift: bool,
           starts: int) -> Metrics:
     """Judge a model of good data by what it is used for."""
     case = CASES[name]

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from koopman_ros.core.datasets import Plant, Samples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.learning import Edmd, Growth, NeuralDrift, NoUsefulLift, train
 from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.model import Box, LiftedModel, PolynomialObservables
@@ -25,11 +25,11 @@ class Learned:
     refused: str | None = None  #: why it was refused, '' where it was not; None for what never is
 
 
-Learner: TypeAlias = Callable[[Plant, Samples, int], Learned]
+Learner: TypeAlias = Callable[[PlantDescription, DriftSamples, int], Learned]
 
 
 def _polynomial(degree: int) -> Learner:
-    def learn(plant: Plant, samples: Samples, seed: int) -> Learned:
+    def learn(plant: PlantDescription, samples: DriftSamples, seed: int) -> Learned:
         begin = time.process_time()
         known, box = split_by_episode(samples, 0)[0], Box.of(plant, samples.x, samples.u)
         model = Edmd(degree).learn(plant, known, box)
@@ -48,7 +48,7 @@ def _sparse(degree: int, threshold: float = 0.01) -> Learner:
     :param threshold: coefficients below are 0, with states in halves of their range and rates in
         units of their root mean square.
     """
-    def learn(plant: Plant, samples: Samples, seed: int) -> Learned:
+    def learn(plant: PlantDescription, samples: DriftSamples, seed: int) -> Learned:
         import pysindy
 
         full = _polynomial(degree)(plant, samples, seed).model
@@ -71,7 +71,7 @@ def _sparse(degree: int, threshold: float = 0.01) -> Learner:
 
 def _trained(recipe: Callable[[int], Recipe]) -> Learner:
     """Return the learner of a recipe that is made for a number of states."""
-    def learn(plant: Plant, samples: Samples, seed: int) -> Learned:
+    def learn(plant: PlantDescription, samples: DriftSamples, seed: int) -> Learned:
         made = recipe(samples.x.shape[1])
         begin = time.process_time()
         try:

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import fit, rollout_rmse
 from koopman_ros.model.model_file import MAX_COORDINATES
 from koopman_ros.plants import describe
@@ -40,7 +40,7 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
             for figure, value in figures.items()}, {}
 
 
-def predicted(case: Regulation, learned: Learned, held_out: Samples) -> Metrics:
+def predicted(case: Regulation, learned: Learned, held_out: DriftSamples) -> Metrics:
     """
     Judge a model on held-out episodes.
 

@@ -13,7 +13,7 @@ from scipy.stats import qmc
 
 from koopman_ros.control import Weights
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning import Linearisation
 from koopman_ros.model import Box, LiftedModel
@@ -41,7 +41,7 @@ class Regulation:
     episodes: int  #: to learn from
     duration: float  #: of each, in time units
 
-    def samples(self, seed: int, episodes: int | None = None) -> Samples:
+    def samples(self, seed: int, episodes: int | None = None) -> DriftSamples:
         """Simulate episodes from states in the box, a fifth of them from its corners."""
         return box_episodes(self.system, self.design, episodes or self.episodes, self.duration,
                             seed, (self.lower, self.upper))

@@ -113,7 +113,7 @@ def _scalar(campaign: Campaign, path: Path) -> str:
             f'range, A z is {100 * off:.2g} % off.')
 
 
-def _derivatives(model: LiftedModel, box: two_state.Box, path: Path) -> float:
+def _derivatives(model: LiftedModel, box: two_state.StateRange, path: Path) -> float:
     """Draw both sides of the lifted dynamics; return the largest relative difference."""
     # one training trajectory that is long enough to look at
     episode = two_state.samples(box, FIGURE_SEED, episodes=1, duration=3.0)
@@ -210,7 +210,8 @@ def _set_point(campaign: Campaign, path: Path) -> str:
             f'{offsets["nz=3"]:.1e} K off, the linearised controller {offsets["linear"]:.3f} K.')
 
 
-def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, ClosedLoop, str]]) -> None:
+def _boxes(path: Path,
+           parts: Sequence[tuple[str, str, two_state.StateRange, ClosedLoop, str]]) -> None:
     """
     Draw boxes over (x1, x2, u) with the closed-loop paths that their lifts give.
 

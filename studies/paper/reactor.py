@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from koopman_ros import learning
 from koopman_ros.control import steady_state_target, Weights
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation import ClosedLoop, run_closed_loop
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import (
@@ -46,13 +46,13 @@ RECIPE = learning.Growth(max(LIFTED_SIZES), max_iterations=600)
 EDMD_DEGREE = 5
 
 
-def training_samples(seed: int) -> Samples:
+def training_samples(seed: int) -> DriftSamples:
     """Simulate 240 episodes of 1 min under random coolant steps from anywhere in the box."""
     return box_episodes(SYSTEM, TRAINING, 240, 1.0, seed)
 
 
 def random_steps_of(design: RandomStepDesign, episodes: int, duration: float, seed: int
-                    ) -> Samples:
+                    ) -> DriftSamples:
     """Simulate random coolant steps from T_ss, each episode of so many min, with rates."""
     return sample_derivatives(SYSTEM, [
         random_steps(SYSTEM, design, duration, seed + number) for number in range(episodes)])
@@ -80,7 +80,8 @@ def feed_forward_offset(model: LiftedModel) -> float:
     return abs(float(end) - SETPOINT)
 
 
-def judged(model: LiftedModel, held_out: Samples, inside: Samples, outside: Samples) -> Metrics:
+def judged(model: LiftedModel, held_out: DriftSamples, inside: DriftSamples,
+           outside: DriftSamples) -> Metrics:
     """
     Judge a model on fresh episodes and on the task of the paper.
 

@@ -14,7 +14,7 @@ from studies.report import at, figures_table, rows_table, share, spread
 
 
 @dataclass(frozen=True)
-class Target:
+class Criterion:
     """A bound for every seed."""
 
     path: str  #: place of the list in the summary
@@ -29,17 +29,17 @@ class Target:
 
 
 TARGETS = (
-    Target('two_state/rw', 1e-8),
-    Target('two_state/eigenvalue_error', 1e-4),
-    *(Target(f'two_state/cost_ratio_to_exact/R={R}', 1e-6, 1.0) for R in ('1', '0.1', '0.001')),
-    *(Target(f'reactor/nz={n}/{name}', bounds[n - 2]) for name, bounds in (
+    Criterion('two_state/rw', 1e-8),
+    Criterion('two_state/eigenvalue_error', 1e-4),
+    *(Criterion(f'two_state/cost_ratio_to_exact/R={R}', 1e-6, 1.0) for R in ('1', '0.1', '0.001')),
+    *(Criterion(f'reactor/nz={n}/{name}', bounds[n - 2]) for name, bounds in (
         ('rw', (1e-4, 1e-6, 1e-7, 1e-7)), ('cond', (10.0, 10.0, 10.0, 10.0)),
         ('rollout_rmse_in_kelvin', (0.1, 0.005, 0.002, 0.002))) for n in (2, 3, 4, 5)),
-    *(Target(f'reactor/nz={n}/tracking_offset_kelvin', 1e-3) for n in (3, 4, 5)),
-    Target('sensors/noisy/rollout_kelvin', 0.05),
-    Target('sensors/noisy/input_gain_error', 0.01),
-    Target('sensors/noise_free/rollout_kelvin', 0.01),
-    Target('sensors/drifted/offset_ratio', 0.05),
+    *(Criterion(f'reactor/nz={n}/tracking_offset_kelvin', 1e-3) for n in (3, 4, 5)),
+    Criterion('sensors/noisy/rollout_kelvin', 0.05),
+    Criterion('sensors/noisy/input_gain_error', 0.01),
+    Criterion('sensors/noise_free/rollout_kelvin', 0.01),
+    Criterion('sensors/drifted/offset_ratio', 0.05),
 )
 _REACTOR = {name: (name, spread) for name in (
     'rw', 'cond', 'rollout_rmse_in_kelvin', 'rollout_rmse_out_kelvin', 'tracking_offset_kelvin',

@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import fit, Growth, train
 from koopman_ros.plants import describe, scalar_example
 from studies.campaign import Metrics, Models
@@ -16,10 +16,10 @@ SAMPLES = 500
 STARTS = 4
 
 
-def points(lower: float, upper: float, count: int = 400) -> Samples:
+def points(lower: float, upper: float, count: int = 400) -> DriftSamples:
     """Return evenly spaced states with their derivatives; there is no input."""
     x = np.linspace(lower, upper, count)[:, None]
-    return Samples(x, x * x, np.zeros((count, 0)), np.zeros(count, dtype=int))
+    return DriftSamples(x, x * x, np.zeros((count, 0)), np.zeros(count, dtype=int))
 
 
 def run(seed: int) -> tuple[Metrics, Models]:
@@ -30,7 +30,7 @@ def run(seed: int) -> tuple[Metrics, Models]:
         `eigenvalue` found; any positive one belongs to an exact lift, exp(-eigenvalue / x).
     """
     x = np.random.default_rng(seed).uniform(*RANGE, (SAMPLES, 1))
-    samples = Samples(x, x * x, np.zeros((SAMPLES, 0)), np.arange(SAMPLES) % 10)
+    samples = DriftSamples(x, x * x, np.zeros((SAMPLES, 0)), np.arange(SAMPLES) % 10)
     recipe = Growth(1, identity=False, hidden_first=10)
     model = train(describe(scalar_example()), samples, recipe, seed=seed, starts=STARTS).model
     metrics: Metrics = {'eigenvalue': float(model.A[0, 0])}

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from koopman_ros import learning
 from koopman_ros.control import averaged, Feedback, recentred, Target, Weights
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation import ClosedLoop, run_closed_loop
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign, two_state_example
@@ -26,7 +26,7 @@ from studies.paper.optimal_control import (
 
 
 @dataclass(frozen=True)
-class Box:
+class StateRange:
     """A training box."""
 
     lower: tuple[float, float]  #: lower corner in (x1, x2)
@@ -42,11 +42,11 @@ _MAX_EVALUATIONS = {1.0: 4_000, 0.1: 6_000, 0.001: 15_000}
 HORIZON = 80.0  # s, in which x1 decays to 0.002
 # Lower and upper corner in (x1, x2). The wide box holds the whole path from (5, 5) to the
 # origin, the narrow ones only its beginning.
-WIDE = Box((-6.0, -6.0), (6.0, 8.0), (-20.0, 60.0))
+WIDE = StateRange((-6.0, -6.0), (6.0, 8.0), (-20.0, 60.0))
 NARROW = {
-    '[2,6]x[2,8]': Box((2.0, 2.0), (6.0, 8.0), (0.0, 40.0)),
-    '[3,6]x[3,8]': Box((3.0, 3.0), (6.0, 8.0), (0.0, 40.0)),
-    '[4,5.5]x[4,5.5]': Box((4.0, 4.0), (5.5, 5.5), (5.0, 35.0)),
+    '[2,6]x[2,8]': StateRange((2.0, 2.0), (6.0, 8.0), (0.0, 40.0)),
+    '[3,6]x[3,8]': StateRange((3.0, 3.0), (6.0, 8.0), (0.0, 40.0)),
+    '[4,5.5]x[4,5.5]': StateRange((4.0, 4.0), (5.5, 5.5), (5.0, 35.0)),
 }
 WIDE_RECIPE = learning.Growth(3, hidden_first=16, max_iterations=600)
 NARROW_RECIPE = learning.Growth(3)
@@ -55,7 +55,7 @@ STARTS = 2
 SYSTEM = two_state_example()
 
 
-def samples(box: Box, seed: int, episodes: int = 40, duration: float = 1.0) -> Samples:
+def samples(box: StateRange, seed: int, episodes: int = 40, duration: float = 1.0) -> DriftSamples:
     """Simulate random steps of the input from states in a box, which they do not leave; in s."""
     design = RandomStepDesign(
         input_lower=box.inputs[0], input_upper=box.inputs[1], state_lower=box.lower,
@@ -148,7 +148,7 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
     return judged(model, seed), {'paper_two_state': model}
 
 
-def _learned(data: Samples, recipe: learning.Growth | learning.Algorithm1, seed: int,
+def _learned(data: DriftSamples, recipe: learning.Growth | learning.Algorithm1, seed: int,
              starts: int = 1) -> LiftedModel:
     return learning.train(describe(SYSTEM), data, recipe, seed=seed, starts=starts,
                           refuse=False).model

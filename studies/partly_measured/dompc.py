@@ -36,7 +36,7 @@ _WINDOW = 20  # samples that the estimator looks back
 _SETTLING = 400  # samples after which a filter's covariance stands still
 
 
-class Planner:
+class DoMpcPlanner:
     """
     Its nonlinear MPC towards a set-point: collocation at its defaults, warm-started IPOPT.
 
@@ -90,7 +90,7 @@ class WithFilter:
     """Its MPC on what the extended Kalman filter of this package says with the true model."""
 
     def __init__(self, case: PartialCase) -> None:
-        self._case, self._planner, self._filter = case, Planner(case), true_filter(case)
+        self._case, self._planner, self._filter = case, DoMpcPlanner(case), true_filter(case)
         self._estimate: Estimate | None = None
         self._u = case.start[1]
 
@@ -117,7 +117,7 @@ class WithWindow:
     """Its MPC on its own moving horizon estimator, of state and constant disturbances."""
 
     def __init__(self, case: PartialCase) -> None:
-        self._case, self._planner = case, Planner(case)
+        self._case, self._planner = case, DoMpcPlanner(case)
         self._model = _model(case, measuring=True)
         self._window = window = do_mpc.estimator.MHE(self._model, ['d'])
         window.settings.n_horizon = _WINDOW

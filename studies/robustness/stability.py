@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
 import control
-from koopman_ros.control import Controller, Report, SAFE, State, Supervisor
+from koopman_ros.control import Controller, SAFE, State, StepReport, Supervisor
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS
@@ -151,7 +151,7 @@ def end_of(temperature: float, setpoint: float, *, fallback: bool, coolant: floa
     """
     near = 0
 
-    def arrived(x: Array, _: Array, report: Report) -> bool:
+    def arrived(x: Array, _: Array, report: StepReport) -> bool:
         nonlocal near
         near = near + 1 if abs(x[-1] - setpoint) <= TOLERANCE else 0
         # it could still fall back from there

@@ -18,7 +18,7 @@ from sensor_msgs.msg import Temperature
 from benchmarks import ipopt, loop, planning, recording, solvers, training
 from benchmarks.__main__ import main
 from benchmarks.problems import build
-from benchmarks.sqp import Problem, solver_of, Sqp
+from benchmarks.sqp import solver_of, Sqp, SqpProblem
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from studies.equations import EQUATIONS
 from studies.general.learners import LEARNERS
@@ -36,13 +36,13 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> Any:
         serialize_message(Temperature())
         warnings.simplefilter('error')
         # few samples: casadi's graphs take most of the time, and grow with them
-        patch.setitem(training.PLANS, 'quick', training.Plan(
+        patch.setitem(training.PLANS, 'quick', training.TrainingPlan(
             ((100, 8),), 0.8, 10.0, 4e3, 1, ('one-state reactor',)))
         patch.setattr(training, 'SOLVERS', {
             name: training.SOLVERS[name] for name in ('ours', 'ipopt', 'adam')})
-        patch.setitem(loop.PLANS, 'quick', loop.Plan(1, 1, 50.0, 12, False))
+        patch.setitem(loop.PLANS, 'quick', loop.LoopPlan(1, 1, 50.0, 12, False))
         patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
-        patch.setitem(recording.PLANS, 'quick', recording.Plan(1.0, 3000, 1))
+        patch.setitem(recording.PLANS, 'quick', recording.RecordingPlan(1.0, 3000, 1))
         assert main(['--quick', '--output', str(folder)]) == 0
     return json.loads((folder / 'summary.json').read_text())
 
@@ -86,7 +86,7 @@ def test_plans_that_differ_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_the_plan_of_an_integrator_is_the_known_one_within_its_limits(tmp_path: Path) -> None:
-    problem = Problem(lambda x, u: u, np.full(2, 0.5), np.zeros(1), np.ones(1), np.eye(1),
+    problem = SqpProblem(lambda x, u: u, np.full(2, 0.5), np.zeros(1), np.ones(1), np.eye(1),
                       np.array([-1.5]), np.array([1.5]), (np.full(1, 2.0), np.full(1, 3.0)))
     for compiler in [None, *filter(None, [shutil.which('cc')])]:
         one = Sqp(problem, solver_of(problem, tmp_path, compiler))

@@ -16,8 +16,8 @@ from koopman_ros.control.experiment import (
     begin,
     end,
     Experiment,
+    ExperimentPhase,
     level,
-    Phase,
     TrackingMonitor,
 )
 from koopman_ros.core.status import Words
@@ -46,7 +46,7 @@ SETPOINT = replace(
 
 
 def run(plan: Experiment = PLAN, seconds: int = 700, measured: np.ndarray = INSIDE
-        ) -> list[experiment.Progress]:
+        ) -> list[experiment.ExperimentProgress]:
     """Measure once a second, from the start on."""
     history = [begin(plan, START)]
     for k in range(1, seconds + 1):
@@ -126,8 +126,8 @@ def test_each_level_is_reached_along_its_rate_and_home_at_the_end(
     assert np.all(commands <= plan.upper)
     np.testing.assert_allclose(np.abs(np.diff(commands, axis=0)).max(axis=0), plan.rate,
                                rtol=1e-9)
-    assert {progress.phase for progress in history[:600]} == {Phase.RUNNING}
-    assert {progress.phase for progress in history[600:]} == {Phase.FINISHED}
+    assert {progress.phase for progress in history[:600]} == {ExperimentPhase.RUNNING}
+    assert {progress.phase for progress in history[600:]} == {ExperimentPhase.FINISHED}
     np.testing.assert_array_equal(commands[640:], np.tile(plan.home, (61, 1)))
 
 
@@ -150,7 +150,8 @@ def test_a_bad_measurement_aborts_and_refuses_a_start(
     for time_ns in (START + SECOND, START):
         after = advance(PAIR, begin(PAIR, START), y, time_ns)
         assert (PAIR.refusal(y) is None) == (words is None)
-        assert after.phase is (Phase.RUNNING if words is None else Phase.ABORTED)
+        assert after.phase is (ExperimentPhase.RUNNING if words is None
+                               else ExperimentPhase.ABORTED)
         if words is not None:
             assert words in write(PAIR.refusal(y))
             assert words in write(after.reason)
@@ -174,7 +175,7 @@ def test_aborted_signals_return_each_at_its_rate(
         left = np.maximum(np.abs(start - home) - k * rate, 0.0)
         np.testing.assert_allclose(progress.command, home + np.sign(start - home) * left,
                                    rtol=0.0, atol=1e-12)
-    assert progress.phase is Phase.ABORTED
+    assert progress.phase is ExperimentPhase.ABORTED
 
 
 def test_aborted_input_returns_along_the_rate_limit_and_stays() -> None:
@@ -187,22 +188,22 @@ def test_aborted_input_returns_along_the_rate_limit_and_stays() -> None:
         commands.append(progress.command[0])
     assert commands[:8] == [298.5, 297.5, 296.5, 295.5, 294.5, 293.5, 292.5, 292.0]
     assert set(commands[8:]) == {292.0}
-    assert progress.phase is Phase.ABORTED
+    assert progress.phase is ExperimentPhase.ABORTED
 
 
 def test_ended_input_returns_and_the_first_end_counts() -> None:
-    progress = end(run(seconds=300)[-1], Phase.ENDED)
-    progress = end(progress, Phase.ABORTED, 'too late')
-    assert (progress.phase, progress.reason) == (Phase.ENDED, None)
+    progress = end(run(seconds=300)[-1], ExperimentPhase.ENDED)
+    progress = end(progress, ExperimentPhase.ABORTED, 'too late')
+    assert (progress.phase, progress.reason) == (ExperimentPhase.ENDED, None)
     assert level(PLAN, progress) == 292.0
     for k in range(301, 320):
         progress = advance(PLAN, progress, np.array([400.0]), START + k * SECOND)
-    assert (progress.phase, progress.command) == (Phase.ENDED, 292.0)
+    assert (progress.phase, progress.command) == (ExperimentPhase.ENDED, 292.0)
 
 
 def test_input_returns_without_measurements() -> None:
     progress = replace(run(seconds=300)[-1], command=np.array([285.0]))
-    progress = end(progress, Phase.ABORTED, 'silence')
+    progress = end(progress, ExperimentPhase.ABORTED, 'silence')
     for k in range(100):
         progress = advance(PLAN, progress, None, START + 300 * SECOND + k * SECOND // 10)
     assert progress.command == 292.0
@@ -213,7 +214,7 @@ def test_a_stamp_that_is_not_later_moves_nothing_and_time_that_goes_back_aborts(
     for time_ns in (progress.time_ns, progress.time_ns - SECOND):
         assert advance(PAIR, progress, PAIR_INSIDE, time_ns) is progress
     progress = advance(PAIR, progress, PAIR_INSIDE, START)
-    assert progress.phase is Phase.ABORTED
+    assert progress.phase is ExperimentPhase.ABORTED
     assert 'went back' in say(progress.reason)
     # time starts afresh for the way home
     progress = advance(PAIR, replace(progress, command=np.array([299.0, 0.9])), PAIR_INSIDE,
@@ -223,7 +224,7 @@ def test_a_stamp_that_is_not_later_moves_nothing_and_time_that_goes_back_aborts(
 
 def test_a_gap_counts_as_twice_the_interval_before() -> None:
     before = replace(run(PAIR, 10, PAIR_INSIDE)[-1], command=np.array([282.0, 0.1]),
-                     phase=Phase.FINISHED)
+                     phase=ExperimentPhase.FINISHED)
     after = advance(PAIR, before, PAIR_INSIDE, before.time_ns + 60 * SECOND)
     np.testing.assert_allclose(after.command, [284.0, 0.14], rtol=1e-12)
 

@@ -13,14 +13,14 @@ from scipy.linalg import expm
 from scipy.optimize import lsq_linear
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
-from koopman_ros.control.events import Outcome
+from koopman_ros.control.events import EventOutcome
 from koopman_ros.control.steady_state import reachable_target
 from koopman_ros.core.status import Code, Words
 from koopman_ros.core.units import Displays
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, run_closed_loop, simulate
-from koopman_ros.event_log.records import event_of, fields_of, Record
+from koopman_ros.event_log.records import event_of, EventRecord, fields_of
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.model.observables import PolynomialObservables
 from koopman_ros.plants import Actuator, Process
@@ -418,9 +418,9 @@ def test_a_continuous_loop_goes_to_the_steady_state_of_its_setpoint():
 
 def test_the_records_of_requests():
     def written(event):
-        name, fields = fields_of(event, Outcome(State()))
+        name, fields = fields_of(event, EventOutcome(State()))
         return json.loads(json.dumps(fields)), event_of(
-            Record('run', 1, name, json.loads(json.dumps(fields))))
+            EventRecord('run', 1, name, json.loads(json.dumps(fields))))
 
     fields, again = written(SetpointRequest(7, np.array([1.5])))
     assert fields['signals'] is None

@@ -18,11 +18,11 @@ from koopman_ros.control import Controller, Mode, State
 from koopman_ros.control.events import (
     apply,
     Event,
+    EventOutcome,
     Initialisation,
     ManualCommand,
     Measurement,
     ModeChange,
-    Outcome,
     SetpointRequest,
     Silence,
 )
@@ -74,10 +74,10 @@ class Run:
         self.write(records.START, records.snapshot(self.state, self.values, self.identity))
 
     def write(self, event: str, fields: Mapping[str, object]) -> None:
-        self.texts.append(records.Record(str(self.runs), self.number, event, fields).text())
+        self.texts.append(records.EventRecord(str(self.runs), self.number, event, fields).text())
         self.number += 1
 
-    def do(self, event: Event) -> Outcome:
+    def do(self, event: Event) -> EventOutcome:
         outcome = apply(self.controller, self.state, event)
         self.state = outcome.state
         if not isinstance(event, Silence) or outcome.command is not None:

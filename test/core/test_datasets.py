@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.core.datasets import cut, Episode, Samples, split_by_episode, within
+from koopman_ros.core.datasets import cut, DriftSamples, Episode, split_by_episode, within
 from koopman_ros.evaluation import Simulation
 from support.small_plants import BENT, bent_samples, TWO_STATE
 
@@ -223,7 +223,7 @@ def test_lists_are_taken_for_arrays():
     plant = replace(TWO_STATE, state_names=['a', 'b'], nominal_state=[1, 2], B=[[0], [1]])
     assert plant.state_names == ('a', 'b')
     assert (plant.nominal_state.tolist(), plant.B.tolist()) == ([1.0, 2.0], [[0.0], [1.0]])
-    samples = Samples([[1.0], [2.0], [3.0]], [[0.0]] * 3, [[0.5]] * 3, [0, 0, 1], [0, 1, 0])
+    samples = DriftSamples([[1.0], [2.0], [3.0]], [[0.0]] * 3, [[0.5]] * 3, [0, 0, 1], [0, 1, 0])
     assert samples.take([0]).x.tolist() == [[1.0], [2.0]]
     assert samples.digest() == replace(samples, episode=np.array([0, 0, 1])).digest()
     with pytest.raises(ValueError, match='episode must hold one whole number a sample'):

@@ -14,7 +14,7 @@ from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
 from koopman_ros.core.signals import Outputs
 from koopman_ros.evaluation import model_comparison
-from koopman_ros.evaluation.model_comparison import Comparison, Recent, Windows
+from koopman_ros.evaluation.model_comparison import ModelComparison, Recent, Windows
 from koopman_ros.evaluation.simulate import at, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
@@ -41,7 +41,7 @@ def one(model: LiftedModel, outputs: Outputs | None = None) -> Controller:
 
 
 def compare(present: LiftedModel, candidate: LiftedModel, windows: Windows,
-            outputs: Outputs | None = None) -> Comparison | None:
+            outputs: Outputs | None = None) -> ModelComparison | None:
     return model_comparison.compare(one(present, outputs), one(candidate, outputs), windows)
 
 

@@ -8,17 +8,17 @@ import itertools
 
 import pytest
 
-from koopman_ros.event_log.records import Record
+from koopman_ros.event_log.records import EventRecord
 from koopman_ros.event_log.sources import lately
 
 
-def _records() -> Iterator[Record]:
+def _records() -> Iterator[EventRecord]:
     """Give a start, and a snapshot each ten of a hundred measurements, one a second."""
     number = itertools.count()
     for second in range(100):
         if second % 10 == 0:
-            yield Record('run', next(number), 'snapshot' if second else 'start', {})
-        yield Record('run', next(number), 'measurement', {'stamp_ns': second * 10 ** 9})
+            yield EventRecord('run', next(number), 'snapshot' if second else 'start', {})
+        yield EventRecord('run', next(number), 'measurement', {'stamp_ns': second * 10 ** 9})
 
 
 RECORDS = list(_records())

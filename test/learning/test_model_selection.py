@@ -13,12 +13,12 @@ from koopman_ros.core.datasets import split_by_episode
 from koopman_ros.evaluation.closed_loop_test import check_law
 from koopman_ros.learning import (
     compare,
-    Contender,
     Edmd,
     evaluate,
     fit,
     Growth,
     model_selection,
+    ModelCandidate,
     NeuralDrift,
     NoUsefulLift,
 )
@@ -40,7 +40,7 @@ RECIPES = {'neural drift': NeuralDrift(3, max_iterations=40), 'identity lift': S
 
 
 def contender(name, rx, refusal=''):
-    return Contender(name, None, rx, None, None, 0.0, refusal)
+    return ModelCandidate(name, None, rx, None, None, 0.0, refusal)
 
 
 @pytest.mark.parametrize(('errors', 'refused', 'chosen'), [

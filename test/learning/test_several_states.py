@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 import pytest
 
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import Place
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.execution.training import constant_lines, scalars
@@ -151,7 +151,7 @@ def learned_errors(lagging, measured):
     minutes = np.arange(len(rows)) / 60.0
     episode = Episode(minutes, x, minutes, rows[:, 1:2] if measured else rows[:, 2:],
                       (True,) if measured else ())
-    plant = Plant('reactor', ('temperature',), ('K',), ('coolant',), ('K',), 'min',
+    plant = PlantDescription('reactor', ('temperature',), ('K',), ('coolant',), ('K',), 'min',
                   system.nominal_state, system.nominal_input, None)
     found = identify(plant, [episode], degrees=(1, 3), methods=methods(40)).drift
     states = np.linspace(308.0, 320.0, 25)[:, None]

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.learning import Growth, train
 from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.model import (
@@ -370,7 +370,8 @@ def test_box_scales_by_half_the_range_from_the_nominal_point():
         rate, (-x - 0.3 * box.states.scale * x * x) + u @ box.input_matrix(BENT.B).T,
         rtol=0, atol=1e-14)
     # and without inputs
-    plant = Plant('free', ('x',), ('1',), (), (), 's', np.zeros(1), np.zeros(0), np.zeros((1, 0)))
+    plant = PlantDescription('free', ('x',), ('1',), (), (), 's', np.zeros(1), np.zeros(0),
+                             np.zeros((1, 0)))
     samples = replace(samples, u=np.zeros((180, 0)))
     box = Box.of(plant, samples.x, samples.u)
     assert len(box.inputs) == 0

@@ -14,7 +14,7 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.control.experiment import advance, begin, Phase
+from koopman_ros.control.experiment import advance, begin, ExperimentPhase
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import to_celsius, to_kelvin
 from koopman_ros.demo import reactor
@@ -118,7 +118,7 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
             assert command.temperature == to_celsius(float(progress.command[0]))
     # a command may be heard before its measurement
     assert len(heard) <= 1
-    assert progress.phase is Phase.FINISHED
+    assert progress.phase is ExperimentPhase.FINISHED
 
 
 @pytest.fixture(scope='module')

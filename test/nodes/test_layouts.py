@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
-from koopman_ros.control import Mode, Report
+from koopman_ros.control import Mode, StepReport
 from koopman_ros.control.laws import Plan
 from koopman_ros.control.state import EstimateReport
 from koopman_ros.core.paths import config_directory
@@ -37,7 +37,7 @@ ONE, NONE = np.ones(1), np.zeros(1)
 ESTIMATE = EstimateReport(ONE, NONE, False, np.eye(1), Innovation(NONE, 1.0, 1))
 PLAN = Plan(np.arange(2.0), np.ones((2, 1)), np.ones((1, 1)), NONE, NONE, NONE)
 NAMES = {
-    topics.CONTROLLER_INTERNALS: list(internals(WIRING.signals, Report(
+    topics.CONTROLLER_INTERNALS: list(internals(WIRING.signals, StepReport(
         Mode.AUTOMATIC, 'mpc', estimate=ESTIMATE), Time(), '').name),
     topics.ACTIVE_CONSTRAINTS: list(active_constraints(WIRING.signals, PLAN, Time(), '').name)}
 
@@ -81,7 +81,7 @@ def test_plotjuggler_shows_what_is_published_and_subscribes_to_it() -> None:
 
 
 def test_a_kalman_filter_leaves_the_places_of_the_others() -> None:
-    plain = internals(WIRING.signals, Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name
+    plain = internals(WIRING.signals, StepReport(Mode.AUTOMATIC, 'sdre'), Time(), '').name
     assert NAMES[topics.CONTROLLER_INTERNALS][:len(plain)] == list(plain)
 
 

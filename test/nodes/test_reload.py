@@ -222,9 +222,9 @@ def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', None)
     center = SHIPPED.states.center
 
-    def situation(*levels: str) -> model_checks.Situation:
+    def situation(*levels: str) -> model_checks.ModelCheckContext:
         parameters = table_of(SHIPPED, {}).snapshot({'fallback_order': levels})
-        return model_checks.Situation(parameters, State(), center, None)
+        return model_checks.ModelCheckContext(parameters, State(), center, None)
 
     model_checks.refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
     bad = replace(SHIPPED, A=1e300 * SHIPPED.A)

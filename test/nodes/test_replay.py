@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.core.units import to_kelvin
 from koopman_ros.demo import reactor
-from koopman_ros.event_log.records import parse, Record, SNAPSHOT
+from koopman_ros.event_log.records import EventRecord, parse, SNAPSHOT
 from koopman_ros.event_log.report import ReplayedBag, reproduced, verdict
 from koopman_ros.event_log.run import replayed_bag
 from koopman_ros.event_log.sources import read_records
@@ -248,7 +248,7 @@ def test_bag_that_was_cut_off_is_reproduced_as_far_as_it_is_whole(
     assert not found.complete
 
 
-def write_run(path: Path, change: Callable[[list[Record]], Iterable[Record]] = list,
+def write_run(path: Path, change: Callable[[list[EventRecord]], Iterable[EventRecord]] = list,
               model: str = 'reactor_nz4', prefix: str = '') -> Path:
     """Write a bag of twenty measurements, with a snapshot in the middle of the records."""
     controller = Recorded(model)
@@ -259,7 +259,7 @@ def write_run(path: Path, change: Callable[[list[Record]], Iterable[Record]] = l
     return controller.save(path, change, prefix)
 
 
-def altered(whole: list[Record]) -> list[Record]:
+def altered(whole: list[EventRecord]) -> list[EventRecord]:
     record = next(record for record in whole if 'command' in record.fields)
     record.fields['command'][0] += 1.0
     return whole
@@ -274,7 +274,7 @@ def altered(whole: list[Record]) -> list[Record]:
 ])
 def test_records_that_are_not_reproduced_end_with_their_code_and_one_line(
         tmp_path: Path, capfd: pytest.CaptureFixture[str],
-        change: Callable[[list[Record]], list[Record]], code: int, words: str) -> None:
+        change: Callable[[list[EventRecord]], list[EventRecord]], code: int, words: str) -> None:
     path = write_run(tmp_path / 'part.mcap', change)
     assert run_here(replay, bags=f'[{path}]', output=tmp_path) == code
     line = complaint(capfd)

@@ -22,8 +22,8 @@ from koopman_ros.panel.training_report import (
     Learning,
     read_comparison,
     read_report,
-    Report,
     report_base,
+    TrainingReport,
 )
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.signal_topics import Wiring
@@ -108,7 +108,7 @@ def test_a_report_is_beside_its_model(model: str, name: str | None) -> None:
 
 
 def test_pictures_have_two_names() -> None:
-    own = Learning(report=Report(picture=b'one'))
+    own = Learning(report=TrainingReport(picture=b'one'))
     assert [own.picture(name) for name in ('training', 'comparison', '../x', '/etc/passwd')] == [
         b'one', b'', b'', b'']
 

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import HostContext, wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import events_executor
@@ -35,7 +35,7 @@ class Failing(ManagedNode):
         self.create_subscription(String, 'other', lambda _: None, 1)
         self.create_service(Trigger, '~/service', lambda _, response: response)
         wall_timer(self, 1.0, lambda: None)
-        self.diagnostics.add('task', lambda: Status(Level.OK, 'well'))
+        self.diagnostics.add('task', lambda: TaskReport(Severity.OK, 'well'))
         self._fail('configure')
 
     def activate(self) -> None:

@@ -33,7 +33,7 @@ from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.controller_messages import active_constraints, planned
 from koopman_ros.ros.controller_status import statuses
-from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
@@ -60,7 +60,7 @@ def made(part: str, node: Part, folder: Path) -> Callable[[], object]:
     wiring = Wiring(SIGNALS, settings.states, settings.inputs)
     match part:
         case 'diagnostics':
-            made = node.diagnostics.add('task', lambda: Status(Level.OK, 'well'))
+            made = node.diagnostics.add('task', lambda: TaskReport(Severity.OK, 'well'))
         case 'matching':
             made = topics.Matching(node, lambda: None)
             made.publish('mine', Temperature)
@@ -248,4 +248,4 @@ def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
         timing=SimpleNamespace(silence=silence, paused=False, without_clock=False, age=math.nan,
                                no_news=lambda _: None))
     found = statuses(now)['measurements']
-    assert (found.level is Level.WARN) is warned
+    assert (found.level is Severity.WARN) is warned

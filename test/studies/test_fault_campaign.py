@@ -16,7 +16,7 @@ from koopman_ros.core.status import Code
 from koopman_ros.event_log.records import parse
 from studies.faults import interceptor
 from studies.faults.__main__ import main
-from studies.faults.case import Case, Command, Status, Trace
+from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
 from studies.faults.cases import CASES
 from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
@@ -30,24 +30,24 @@ from support.recorded_runs import Recorded, STEADY
 # the type support's parser imports a module that Python deprecated
 pytestmark = pytest.mark.filterwarnings('ignore::DeprecationWarning')
 
-CASE = Case('test', 'test', '', lambda _: None, recovery=50.0,
+CASE = FaultCase('test', 'test', '', lambda _: None, recovery=50.0,
             says=('^controller: control: .*frozen',))
 BEGIN, END = 50, 60
 CONTROL, RECORDING = 'controller: control', 'trainer: recording'
 
 
 def trace(temperature: Any = lambda t: 47.0 if BEGIN <= t < END + 20 else 46.0,
-          coolant: Any = lambda t: 20.0 + 0.01 * t, **changes: Any) -> Trace:
+          coolant: Any = lambda t: 20.0 + 0.01 * t, **changes: Any) -> LoopTrace:
     """Return a trace that keeps to the bounds: 1 K off until 20 s after the fault."""
-    return replace(Trace(
+    return replace(LoopTrace(
         samples=[(float(t), (temperature(t),)) for t in range(200)],
         setpoints=[(0.0, (46.0,))], begin=float(BEGIN), end=float(END),
-        statuses=[Status(55.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
-                  Status(70.0, CONTROL, 0, 'automatic', {})],
+        statuses=[SeenStatus(55.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
+                  SeenStatus(70.0, CONTROL, 0, 'automatic', {})],
         commands=[Command(float(t), (coolant(t),), t) for t in range(200)]), **changes)
 
 
-def reasons(found: Trace, **bounds: Any) -> str:
+def reasons(found: LoopTrace, **bounds: Any) -> str:
     return '; '.join(judge(found, replace(CASE, **bounds))['reasons'])
 
 
@@ -72,12 +72,13 @@ def test_figures_of_a_survived_case() -> None:
     (trace(samples=[*trace().samples, (200.0, (61.0,)), (201.0, (46.0,))]), {}, 'lost from 60'),
     (trace(complaints=['ended with code -6']), {}, 'code -6'),
     # before the fault, or by another node
-    (trace(statuses=[Status(10.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
-                     Status(56.0, 'plant: simulation', 0, 'frozen', {})]), {}, 'never said'),
-    (trace(statuses=[*trace().statuses, Status(150.0, RECORDING, 2, 'the disk is full', {})]), {},
+    (trace(statuses=[SeenStatus(10.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
+                     SeenStatus(56.0, 'plant: simulation', 0, 'frozen', {})]), {}, 'never said'),
+    (trace(statuses=[*trace().statuses, SeenStatus(150.0, RECORDING, 2, 'the disk is full', {})]),
+     {},
      'still say ERROR'),
     (trace(records=[(60.0, '{}')]), {}, 'cannot be replayed')])
-def test_a_missed_bound_is_a_reason(found: Trace, bounds: dict[str, Any], words: str) -> None:
+def test_a_missed_bound_is_a_reason(found: LoopTrace, bounds: dict[str, Any], words: str) -> None:
     assert words in reasons(found, **bounds)
 
 
@@ -148,7 +149,7 @@ def test_alterations_of_one_of_two_signals(
 
 def test_distances_and_steps_of_several_signals_are_the_largest() -> None:
     """Of tanks whose levels 3 and 4 have no set-point."""
-    found = Trace(QUADRUPLE_TANK, samples=[(float(t), (0.15, 0.11, t, t)) for t in range(3)],
+    found = LoopTrace(QUADRUPLE_TANK, samples=[(float(t), (0.15, 0.11, t, t)) for t in range(3)],
                   setpoints=[(0.0, (0.15, 0.1))],
                   commands=[Command(0.0, (3.0, 3.0), 0), Command(1.0, (3.1, 10.5), 1)])
     np.testing.assert_allclose(found.errors()[1], 0.01)
@@ -205,7 +206,7 @@ def test_a_case_that_is_not_survived(tmp_path: Path) -> None:
         loop.request(53.0)
         loop.processes['controller'].process.kill()
 
-    result, _ = run(Case('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
+    result, _ = run(FaultCase('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
                          says=('nobody says this',)), tmp_path)
     found = '; '.join(result['reasons'])
     for words in ('ended early, with code -9', 'not back', 'never said "nobody says this"'):

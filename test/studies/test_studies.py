@@ -193,7 +193,7 @@ def test_report_of_the_paper_has_its_tables_and_eleven_figures(
     assert len(re.findall(r'^!\[.*\]\((.*)\)$', text, re.MULTILINE)) == 11
     assert '| `reactor/nz=3/tracking_offset_kelvin` | 0.001 |' in text
     assert 'nan' not in text
-    assert report.Target('a/b', 1e-6, 1.0).met({'a': {'b': [1.0, 1.1, None, 0.99]}}) == (2, 4)
+    assert report.Criterion('a/b', 1e-6, 1.0).met({'a': {'b': [1.0, 1.1, None, 0.99]}}) == (2, 4)
 
 
 # Other plants.

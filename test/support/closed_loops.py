@@ -97,7 +97,7 @@ class Sample:
     second: int
     temperature: float
     command: float
-    report: control.Report
+    report: control.StepReport
 
 
 class Reactor:

@@ -17,7 +17,7 @@ from std_msgs.msg import String
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import to_celsius
 from koopman_ros.demo import reactor
-from koopman_ros.event_log.records import parse, Record
+from koopman_ros.event_log.records import EventRecord, parse
 from koopman_ros.event_log.run import replay_records
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
@@ -39,7 +39,7 @@ RESET = {name: PURE.get(name, row.default)
          for name, row in TABLE.rows.items() if not row.read_only and name != 'model'}
 
 
-def reproduced(messages: Sequence[String]) -> tuple[list[Record], list[float]]:
+def reproduced(messages: Sequence[String]) -> tuple[list[EventRecord], list[float]]:
     """Return records, and the commands in them in degC, which a replay finds bit for bit."""
     records = [parse(message.data) for message in messages]
     samples = replay_records(records).samples

@@ -9,7 +9,7 @@ import math
 from koopman_ros.panel.alarms import Priority
 from koopman_ros.panel.requests import Action, Answer
 from koopman_ros.panel.snapshot import CONTROLLER, ERROR, TRAINER
-from koopman_ros.panel.training_report import Comparison, Learning, Report
+from koopman_ros.panel.training_report import Learning, ReplayComparison, TrainingReport
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.signal_topics import Signals
@@ -67,8 +67,8 @@ class HostileSource:
         own.alarms.acknowledge(TEXTS[0], TEXT, NOW + 2.0)
         own.alarms.shelve(f'shelved {TEXTS[0]}', 600.0, TEXT, NOW + 2.0)
         self.learning = Learning(
-            Report('', TEXTS, TEXT, _PICTURE, NOW, True, TEXT),
-            Comparison('', TEXTS, TEXT, _PICTURE, TEXT, NOW))
+            TrainingReport('', TEXTS, TEXT, _PICTURE, NOW, True, TEXT),
+            ReplayComparison('', TEXTS, TEXT, _PICTURE, TEXT, NOW))
         self.title = TEXT
         self.snapshot = own.snapshot(NOW + 2.0)
         self.asked: list[Action] = []

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.learning.identification import (
     DriftModel,
     IdentificationMethod,
@@ -48,10 +48,11 @@ class KnownPlant:
     B: np.ndarray  #: (n_x, n_u)
 
     @property
-    def plant(self) -> Plant:
+    def plant(self) -> PlantDescription:
         """What an identification is told: names and units, B not among it."""
         n_x, n_u = self.B.shape
-        return Plant('known', names('x', n_x), ('m',) * n_x, names('u', n_u), ('A',) * n_u, 's',
+        return PlantDescription('known', names('x', n_x), ('m',) * n_x, names('u', n_u),
+                                ('A',) * n_u, 's',
                      np.zeros(n_x), np.zeros(n_u), None)
 
     def rate(self, x, u):

@@ -16,7 +16,7 @@ from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_MINUTE
 from koopman_ros.learning import TrainingTask
 from koopman_ros.learning.identification import Drift
-from koopman_ros.learning.record import Source
+from koopman_ros.learning.record import RecordSource
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.records import BagWriter, message_definition, RecordedInput, RecordedState
 
@@ -75,10 +75,10 @@ def task(bags: Sequence[Path], output: Path) -> TrainingTask:
                 (RecordedInput('coolant_temperature', 'K', coolant),), plant='reactor at 1 Hz')
 
 
-def source(bags: Sequence[Path]) -> Source:
+def source(bags: Sequence[Path]) -> RecordSource:
     """Return how some bags are read."""
     given = task(bags, Path('none.safetensors'))
-    return Source(given.bags, given.states, given.inputs, 0, None)
+    return RecordSource(given.bags, given.states, given.inputs, 0, None)
 
 
 def drift_error(drift: Drift) -> float:

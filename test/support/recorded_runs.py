@@ -14,7 +14,7 @@ import numpy as np
 
 from koopman_ros import plants
 from koopman_ros.control import Controller, State
-from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
+from koopman_ros.control.events import apply, Event, EventOutcome, Measurement, Silence
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path
@@ -135,14 +135,14 @@ class Recorded:
         return built(TABLE.snapshot(self.parameters), model)
 
     def write(self, event: str, fields: Mapping[str, object]) -> None:
-        self.texts.append(records.Record(self.run, len(self.texts), event, fields).text())
+        self.texts.append(records.EventRecord(self.run, len(self.texts), event, fields).text())
 
     def snapshot(self, event: str = records.SNAPSHOT) -> None:
         name = self.parameters['model']
         self.write(event, records.snapshot(
             self.state, self.parameters, {'name': name, 'digest': MODELS[name][1]}))
 
-    def do(self, event: Event) -> Outcome:
+    def do(self, event: Event) -> EventOutcome:
         outcome = apply(self.controller, self.state, event)
         self.state = outcome.state
         if outcome.command is not None:

@@ -7,20 +7,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from koopman_ros.core.datasets import Plant, Samples
+from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.learning import Growth
 from koopman_ros.plants import two_state_example
 
 # dx/dt = -x - 0.3 x^2 + 2 u, in deviations from 3 m and 0.5 m/s
-BENT = Plant('bent', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
+BENT = PlantDescription('bent', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
              np.array([0.5]), np.array([[2.0]]))
 # the same without its input
-UNFORCED = Plant('unforced', ('level',), ('m',), (), (), 's', np.array([3.0]), np.zeros(0),
+UNFORCED = PlantDescription('unforced', ('level',), ('m',), (), (), 's', np.array([3.0]),
+                            np.zeros(0),
                  np.zeros((1, 0)))
 SMALL = Growth(2, hidden_first=3, max_iterations=40)
 
 _EXAMPLE = two_state_example()
-TWO_STATE = Plant(
+TWO_STATE = PlantDescription(
     _EXAMPLE.name, _EXAMPLE.state_names, _EXAMPLE.state_units, _EXAMPLE.input_names,
     _EXAMPLE.input_units, _EXAMPLE.time_unit, np.zeros(2), np.zeros(1), _EXAMPLE.B)
 
@@ -29,7 +30,7 @@ def bent_samples(episodes=6, length=30, seed=0):
     rng = np.random.default_rng(seed)
     x = rng.uniform(-1.0, 1.5, (episodes * length, 1))
     u = rng.uniform(-1.0, 1.0, (episodes * length, 1))
-    return Samples(x + 3.0, -x - 0.3 * x * x + 2.0 * u, u + 0.5,
+    return DriftSamples(x + 3.0, -x - 0.3 * x * x + 2.0 * u, u + 0.5,
                    np.repeat(np.arange(episodes), length))
 
 
@@ -43,7 +44,7 @@ def two_state_samples(count=600, seed=0):
     rng = np.random.default_rng(seed)
     x = np.stack([rng.uniform(-6.0, 6.0, count), rng.uniform(-6.0, 8.0, count)], 1)
     u = rng.uniform(-5.0, 5.0, (count, 1))
-    return Samples(x, _EXAMPLE.derivative(x, u), u, np.arange(count) // (count // 10))
+    return DriftSamples(x, _EXAMPLE.derivative(x, u), u, np.arange(count) // (count // 10))
 
 
 def bits(model):

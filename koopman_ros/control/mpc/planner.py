@@ -48,7 +48,7 @@ _SOFT = 8  # its mark of a soft constraint
 
 
 @dataclass(frozen=True)
-class Problem:
+class PlanningProblem:
     """The optimal control problem of a sample, in scaled deviations and the model's time unit."""
 
     start: Array  #: (n_x,) estimated state
@@ -88,7 +88,7 @@ class Planner:
     # The problem of a sample.
 
     def problem(self, estimate: Estimate, target: Target, interval: float,
-                previous: Array | None) -> Problem:
+                previous: Array | None) -> PlanningProblem:
         """
         Return the problem of an estimate and a target.
 
@@ -103,7 +103,7 @@ class Planner:
             float(grid.lengths[0]))
         rate = max(_fastest(self._slope), fastest, _fastest(self._jacobian(estimate.x)))
         steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
-        return Problem(
+        return PlanningProblem(
             estimate.x, estimate.w, target,
             None if previous is None else model.inputs.to_deviation(previous), grid, steps,
             terminal, grid.since_change * self._rate)
@@ -154,7 +154,7 @@ class Planner:
 
     # The first guess.
 
-    def first_guess(self, problem: Problem, memory: object) -> tuple[Array, Array]:
+    def first_guess(self, problem: PlanningProblem, memory: object) -> tuple[Array, Array]:
         """Return the plan of the sample before, one sample later, or one under a feedback."""
         match memory:
             # not of a model of another size
@@ -166,7 +166,7 @@ class Planner:
                 return inputs, nodes
         return self._under_feedback(problem)
 
-    def _under_feedback(self, problem: Problem) -> tuple[Array, Array]:
+    def _under_feedback(self, problem: PlanningProblem) -> tuple[Array, Array]:
         """Simulate the model under the state-dependent Riccati law with its limits."""
         model, target, x, last = self._model, problem.target, problem.start, problem.previous
         inputs, nodes = [], [x]
@@ -190,7 +190,7 @@ class Planner:
 
     # The quadratic program.
 
-    def improve(self, problem: Problem, u: Array, x: Array
+    def improve(self, problem: PlanningProblem, u: Array, x: Array
                 ) -> tuple[float, Array, Array] | Reason:
         """
         Solve the quadratic program about a plan.
@@ -214,7 +214,7 @@ class Planner:
             return reason(Code.PLAN_NOT_SOLVED, flag=f'daqp returns {flag}')
         return change, u + v.reshape(u.shape), nodes + by_inputs @ v
 
-    def _constraints(self, problem: Problem, u: Array, nodes: Array, by_inputs: Array
+    def _constraints(self, problem: PlanningProblem, u: Array, nodes: Array, by_inputs: Array
                      ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
         """Return A with lower <= (v, A v) <= upper for a change v, and which rows are soft."""
         last, lower, upper = problem.previous, self._lower, self._upper
@@ -242,7 +242,7 @@ class Planner:
 
     # The result.
 
-    def plan(self, problem: Problem, u: Array, x: Array) -> Plan:
+    def plan(self, problem: PlanningProblem, u: Array, x: Array) -> Plan:
         """Return a plan in the units of the signals, and its active limits."""
         model, first = self._model, u[0]
         step = np.zeros(model.n_u) if problem.previous is None else first - problem.previous

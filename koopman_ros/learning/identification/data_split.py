@@ -12,10 +12,10 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.datasets import Array, cut, Episode, Plant
+from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.learning.identification.drift import Drift, DriftModel, longest_step, Segments
 from koopman_ros.learning.identification.identify import Identified, Score, segments_of, split
-from koopman_ros.learning.identification.innovations_form import Predictor, Run
+from koopman_ros.learning.identification.innovations_form import FilterRun, Predictor
 from koopman_ros.learning.identification.output_error import output_error
 from koopman_ros.learning.identification.total_variation import noise_level
 from koopman_ros.learning.identification.weak_form import regress
@@ -24,7 +24,7 @@ _GROWTH = 2.0  # exponent by which roll-outs that judge an unstable plant may gr
 _SHORTEST = 20  # samples of a segment, whatever grows
 
 
-class Record:
+class SplitRecord:
     """
     The measurements of the first states of a plant, and their predictions.
 
@@ -33,7 +33,8 @@ class Record:
     :raises ValueError: when the episodes are too short.
     """
 
-    def __init__(self, plant: Plant, episodes: Sequence[Episode], seed: int, *, hidden: bool
+    def __init__(self, plant: PlantDescription, episodes: Sequence[Episode], seed: int, *,
+                 hidden: bool
                  ) -> None:
         self.plant, self._episodes = plant, episodes
         signals = len(plant.state_names) + len(plant.input_names)
@@ -55,7 +56,7 @@ class Record:
             raise ValueError('the episodes are too short for a filter to find what is not '
                              'measured: record longer without gaps')
         self.step = longest_step(self.parts)  #: longest of a roll-out
-        self._last: tuple[Predictor[Drift], Run] | None = None
+        self._last: tuple[Predictor[Drift], FilterRun] | None = None
         #: usual time between samples
         self.period = float(np.median(np.concatenate([np.diff(p.time) for p in self.parts])))
 
@@ -96,7 +97,7 @@ class Record:
         return Identified(drift, method, linear, tuple(scores), noise_level(known, drift),
                           tuple(known), tuple(held_out), len(drift.box.states) - n_y)
 
-    def _run(self, predictor: Predictor[Drift]) -> Run:
+    def _run(self, predictor: Predictor[Drift]) -> FilterRun:
         """Filter all episodes; the result of the last predictor is kept."""
         if self._last is None or self._last[0] is not predictor:
             self._last = predictor, predictor.run(self._episodes, self.step)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import brief
-from koopman_ros.core.datasets import Array, Episode, Plant
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials
@@ -34,7 +34,7 @@ _SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
 _STEP = 1e-4
 
 
-def box_of(plant: Plant, episodes: Sequence[Episode]) -> Box:
+def box_of(plant: PlantDescription, episodes: Sequence[Episode]) -> Box:
     """Return the episodes' range, its middle the origin; ValueError when a signal never moves."""
     return Box.of(plant, np.concatenate([episode.x for episode in episodes]),
                   np.concatenate([episode.u for episode in episodes]), nominal=False)

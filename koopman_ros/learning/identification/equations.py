@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, brief
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.learning.identification.drift import Drift
 from koopman_ros.model import Box
@@ -44,7 +44,7 @@ class Equations(Drift):
     __repr__ = brief
 
     @classmethod
-    def of(cls, plant: Any, sought: Sequence[Sought], known: Plant, x: Array, u: Array
+    def of(cls, plant: Any, sought: Sequence[Sought], known: PlantDescription, x: Array, u: Array
            ) -> Equations:
         """
         Return the equations with the constants to begin with; states that are measured come first.
@@ -184,7 +184,7 @@ def _built(plant: Any, sought: Sequence[Sought], theta: Array, nominal: Array | 
         sought, np.sin(theta).tolist(), strict=True)}, nominal)
 
 
-def _check(system: ControlAffineSystem, plant: Any, known: Plant) -> None:
+def _check(system: ControlAffineSystem, plant: Any, known: PlantDescription) -> None:
     """Raise ValueError unless the signals are states and all inputs of the equations."""
     for kind, whole in (('state', False), ('input', True)):
         own, given = (dict(zip(getattr(one, f'{kind}_names'), getattr(one, f'{kind}_units'),

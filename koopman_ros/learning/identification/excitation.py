@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from koopman_ros.core.datasets import Array, Episode, Plant
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
 
 # Samples over which inputs are averaged: the noise of a measured input moves no plant, and hides
 # that two inputs move together.
@@ -22,7 +22,7 @@ _SIGMAS = 5.0
 _MEDIAN = 0.6745  # of the magnitude of a normal deviate
 
 
-def check_inputs(plant: Plant, episodes: Sequence[Episode]) -> tuple[str, ...]:
+def check_inputs(plant: PlantDescription, episodes: Sequence[Episode]) -> tuple[str, ...]:
     """
     Check that the effect of each input can be estimated, where B is not known.
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.core.datasets import Array, Episode, Plant
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.core.solvers import RiccatiStatus, solve_riccati
-from koopman_ros.learning.identification.data_split import Record
+from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.learning.identification.identify import (
     EstimatedConstant,
@@ -46,7 +46,7 @@ _SINGULAR = 1e-12  # a direction with so small a share of the information has no
 _INVOLVED = 1e-3  # a constant with such a share of such a direction is not told by the record
 
 
-def estimate_parameters(plant: Plant, episodes: Sequence[Episode], equations: Any,
+def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], equations: Any,
                   ranges: Mapping[str, tuple[float, float] | None] | None = None, *,
                   seed: int = 0, watch: Watch = lambda *_: False) -> Identified:
     """
@@ -75,7 +75,7 @@ def estimate_parameters(plant: Plant, episodes: Sequence[Episode], equations: An
     start = Equations.of(equations, sought, plant, np.concatenate([e.x for e in episodes]),
                          np.concatenate([e.u for e in episodes]))
     n_y = len(plant.state_names)
-    record = Record(plant, episodes, seed, hidden=len(start.box.states) > n_y)
+    record = SplitRecord(plant, episodes, seed, hidden=len(start.box.states) > n_y)
     predictor = _within(record, _filter(record, start, n_y))
     predictor, refined = _refined(record, predictor, progress(
         f'{len(sought)} constants of {equations.__name__}'))
@@ -91,7 +91,7 @@ def estimate_parameters(plant: Plant, episodes: Sequence[Episode], equations: An
     return replace(found, constants=_estimates(sought, refined))
 
 
-def _filter(record: Record, model: Equations, n_y: int) -> Predictor[Equations]:
+def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equations]:
     """
     Return the equations with the gain that foresees the next measurements of all episodes best.
 
@@ -113,7 +113,7 @@ def _filter(record: Record, model: Equations, n_y: int) -> Predictor[Equations]:
     return min(tried, key=lambda one: one[:2])[2]
 
 
-def _refined(record: Record, start: Predictor[Equations], monitor: Callable[..., bool]
+def _refined(record: SplitRecord, start: Predictor[Equations], monitor: Callable[..., bool]
              ) -> tuple[Predictor[Equations], Refined[Equations]]:
     """
     Refine the constants on the segments to fit to, without a gain and with that of a filter.
@@ -133,7 +133,7 @@ def _refined(record: Record, start: Predictor[Equations], monitor: Callable[...,
     return Predictor(best.model, start.gain), best
 
 
-def _fitted(record: Record, start: Predictor[Equations], gain: Array, parts: Sequence[int],
+def _fitted(record: SplitRecord, start: Predictor[Equations], gain: Array, parts: Sequence[int],
             growth: float, monitor: Callable[..., bool]) -> Refined[Equations]:
     """
     Refine constants and the starts of segments.
@@ -150,7 +150,7 @@ def _fitted(record: Record, start: Predictor[Equations], gain: Array, parts: Seq
                             tolerance=_TOLERANCE, monitor=monitor)
 
 
-def _within(record: Record, predictor: Predictor[Equations]) -> Predictor[Equations]:
+def _within(record: SplitRecord, predictor: Predictor[Equations]) -> Predictor[Equations]:
     """Return the same in deviations that span the states as they are estimated."""
     drift, n_y = predictor.drift, predictor.gain.shape[1]
     old = drift.box.states

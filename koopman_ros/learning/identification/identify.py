@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.core.arrays import brief
-from koopman_ros.core.datasets import Array, cut, Episode, Plant
+from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.core.plugins import contained, plug_class, short_name
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.identification_methods import METHODS
@@ -147,7 +147,8 @@ class Identified:
     __repr__ = brief
 
 
-def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
+def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
+             degrees: Sequence[int] | None = None,
              methods: Mapping[str, IdentificationMethod] | None = None, seed: int = 0,
              watch: Watch = lambda *_: False, backend: Backend | None = None) -> Identified:
     """
@@ -238,7 +239,7 @@ class _Given:
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class _DegreeCandidate:
     """The best estimate of a degree, with the scores of all of them that were refined."""
 
     best: tuple[DriftModel, Score] | None
@@ -246,7 +247,7 @@ class _Candidate:
     failures: tuple[str, ...]  # reasons of methods that raised unexpectedly
 
 
-def _candidate(given: _Given, degree: int, tell: Tell) -> _Candidate:
+def _candidate(given: _Given, degree: int, tell: Tell) -> _DegreeCandidate:
     """Estimate a drift of a degree by every method, and refine the best."""
     def monitor(*_: object) -> bool:
         return tell(None)
@@ -256,15 +257,15 @@ def _candidate(given: _Given, degree: int, tell: Tell) -> _Candidate:
     rated = [(model, _score(model, given.chooser, method)) for method, model in estimates]
     model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
     if model is None or score is None:
-        return _Candidate(None, (), failures)
+        return _DegreeCandidate(None, (), failures)
     if not math.isfinite(score.cost):
-        return _Candidate((model, score), (), failures)
+        return _DegreeCandidate((model, score), (), failures)
     refined = output_error(model, given.fitter, learn_input_matrix=given.known is None,
                            monitor=monitor)
     polished = _score(refined, given.chooser, f'{OUTPUT_ERROR} from {score.method}')
     # the better estimate in theory needs no proof, only that it does no harm
     best = (refined, polished) if polished.cost <= _NEARLY * score.cost else (model, score)
-    return _Candidate(best, (*(score for _, score in rated), polished), failures)
+    return _DegreeCandidate(best, (*(score for _, score in rated), polished), failures)
 
 
 def segments_of(episodes: Sequence[Episode], signals: int) -> list[Episode]:

@@ -32,7 +32,7 @@ class Predictor(Generic[_Drift]):
     drift: _Drift
     gain: Array  #: (n_x, n_y) in deviations
 
-    def run(self, episodes: Sequence[Episode], step: float) -> Run:
+    def run(self, episodes: Sequence[Episode], step: float) -> FilterRun:
         """Filter episodes of measurements (N, n_y), from the starts that suit the first ones."""
         data = Segments.of(episodes, step)
         run = self._filter(data, self._starts(data))
@@ -40,7 +40,7 @@ class Predictor(Generic[_Drift]):
             raise ValueError('the estimate of the unmeasured states diverges')
         return _run(data, run)
 
-    def along(self, segments: Segments, starts: Array) -> Run:
+    def along(self, segments: Segments, starts: Array) -> FilterRun:
         """Filter segments from starts (M, n_x), in deviations."""
         return _run(segments, self._filter(segments, starts))
 
@@ -106,7 +106,7 @@ class Predictor(Generic[_Drift]):
 
 
 @dataclass(frozen=True)
-class Run:
+class FilterRun:
     """The result of a filter on all samples, in deviations."""
 
     foreseen: Array  #: (N, n_x) states before the samples
@@ -114,9 +114,9 @@ class Run:
     innovations: Array  #: (N, n_y)
 
 
-def _run(data: Segments, values: Sequence[Array]) -> Run:
+def _run(data: Segments, values: Sequence[Array]) -> FilterRun:
     # episode by episode, each in the order of its times
-    return Run(*(np.swapaxes(one, 0, 1)[data.measured.T] for one in values))
+    return FilterRun(*(np.swapaxes(one, 0, 1)[data.measured.T] for one in values))
 
 
 def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:

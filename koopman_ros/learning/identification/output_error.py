@@ -50,7 +50,7 @@ class Refinable(Protocol):
 
 
 @dataclass(frozen=True)
-class Weights:
+class ResidualScales:
     """A polynomial drift whose coefficients are refined, and B where it is learned."""
 
     drift: DriftModel
@@ -61,7 +61,7 @@ class Weights:
         """Coefficients, then B where it is learned."""
         return np.concatenate((self.drift.coefficients.ravel(), self.drift.B.ravel()[:self._n_B]))
 
-    def at(self, theta: Array) -> Weights:
+    def at(self, theta: Array) -> ResidualScales:
         """Return the same with other weights."""
         drift = self.drift
         n = drift.coefficients.size
@@ -105,7 +105,7 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
     :param learn_input_matrix: whether B is refined, too.
     :param monitor: called with the step and the cost after each step; True ends it.
     """
-    problem = _Problem(Weights(model, learn_input_matrix), segments)
+    problem = _Problem(ResidualScales(model, learn_input_matrix), segments)
     return problem.split(problem.solution(monitor))[0].drift
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.core.datasets import Array, Episode, Plant
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial, Tell
-from koopman_ros.learning.identification.data_split import Record
+from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.drift import DriftModel
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
@@ -30,7 +30,7 @@ from koopman_ros.learning.identification.innovations_form import (
     SETTLING,
     standardised,
 )
-from koopman_ros.learning.identification.output_error import innovations_form, Weights
+from koopman_ros.learning.identification.output_error import innovations_form, ResidualScales
 from koopman_ros.model import Box
 
 HIGHEST_DEGREE = 3
@@ -46,7 +46,7 @@ _Polynomial = Predictor[DriftModel]
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class _StructureCandidate:
     """A predictor, and how it foresees the segments to choose by."""
 
     predictor: _Polynomial
@@ -64,7 +64,7 @@ class _Candidate:
         return f'{INNOVATIONS_FORM}, {count} {"state" if count == 1 else "states"} not measured'
 
 
-def identify_unmeasured(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
+def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
                     highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
                     watch: Watch = lambda *_: False, backend: Backend | None = None
                     ) -> Identified:
@@ -92,12 +92,12 @@ def identify_unmeasured(plant: Plant, episodes: Sequence[Episode], hidden: int, 
     if callable(plant.B) or plant.input_matrix_degree:
         raise ValueError('where states are not measured, B must not depend on them: set '
                          'input_matrix_degree to 0')
-    record = Record(plant, episodes, seed, hidden=True)
+    record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
     total = hidden * highest_degree + 2
     words = {f'{count} {"state" if count == 1 else "states"} not measured': count
              for count in range(1, hidden + 1)}
-    candidates: list[_Candidate] = []
+    candidates: list[_StructureCandidate] = []
     under_way = dict.fromkeys(words, 0)  # degrees that were tried
 
     def told(name: str, degree: int | None) -> bool:
@@ -127,7 +127,7 @@ def identify_unmeasured(plant: Plant, episodes: Sequence[Episode], hidden: int, 
         progress('linear model')), warnings=warnings)
 
 
-def _plainest(candidates: Sequence[_Candidate]) -> _Candidate:
+def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
     """Return the smallest whose squared innovations are not clearly above the least."""
     scale = np.min([np.mean(one.innovations ** 2, axis=0) for one in candidates], axis=0)
     squares = [np.mean(one.innovations ** 2 / scale, axis=1) for one in candidates]
@@ -141,10 +141,10 @@ def _plainest(candidates: Sequence[_Candidate]) -> _Candidate:
     return min(able, key=lambda one: one.predictor.drift.coefficients.size)
 
 
-def _tried(shared: tuple[Record, int], count: int, tell: Tell) -> list[_Candidate]:
+def _tried(shared: tuple[SplitRecord, int], count: int, tell: Tell) -> list[_StructureCandidate]:
     """Return predictors with so many hidden states, of rising degree, until none is found."""
     record, highest_degree = shared
-    search, candidates = _Search(record), list[_Candidate]()
+    search, candidates = _Search(record), list[_StructureCandidate]()
     for degree in range(1, highest_degree + 1):
         def monitor(*_: object, degree: int = degree) -> bool:
             return tell(degree)
@@ -153,7 +153,7 @@ def _tried(shared: tuple[Record, int], count: int, tell: Tell) -> list[_Candidat
         try:
             found = search.refined(record.fit, raised(candidates[-1].predictor), monitor) if (
                 candidates) else search.linear(count, monitor)
-            candidates.append(_Candidate(
+            candidates.append(_StructureCandidate(
                 found, count, record.innovations(found, record.choose), search.deviation))
         except (ValueError, np.linalg.LinAlgError):
             break
@@ -167,7 +167,7 @@ class _Search:
     :ivar deviation: (n_y,) standard deviations of the innovations of the last one.
     """
 
-    def __init__(self, record: Record, deviation: Array | None = None) -> None:
+    def __init__(self, record: SplitRecord, deviation: Array | None = None) -> None:
         self.record, self._plant = record, record.plant
         self.deviation = np.ones(len(self._plant.state_names)) if deviation is None else deviation
 
@@ -191,7 +191,7 @@ class _Search:
         record = self.record
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
-            Weights(start.drift, self._plant.B is None), start.gain, record.segments(parts),
+            ResidualScales(start.drift, self._plant.B is None), start.gain, record.segments(parts),
             record.foreseen(start, parts), self.deviation,
             settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.core.datasets import Array, Plant, Samples
+from koopman_ros.core.datasets import Array, DriftSamples, PlantDescription
 from koopman_ros.learning.identification.drift import DriftModel, steady_point
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.residuals import deviations
@@ -33,7 +33,7 @@ _DEGREES = (5, 4, 3, 2)
 _ROWS, _MOST_COLUMNS = 2000, 130
 
 
-def check_rates(plant: Plant, samples: Samples) -> None:
+def check_rates(plant: PlantDescription, samples: DriftSamples) -> None:
     """
     Compare differences of the states with derivatives and times, where the latter are known.
 
@@ -80,7 +80,7 @@ def _middle_ratio(a: Array, b: Array) -> float:
     return float(np.median(a[large] / b[large])) if large.any() else np.nan
 
 
-def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
+def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box) -> None:
     """
     Look at the drift at the nominal point, where a lift has none.
 

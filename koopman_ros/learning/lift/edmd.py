@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros import __version__
-from koopman_ros.core.datasets import Array, Plant, Samples
+from koopman_ros.core.datasets import Array, DriftSamples, PlantDescription
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.model import (
@@ -26,7 +26,8 @@ class Linearisation:
 
     jacobian: Array  #: (n_x, n_x) df/dx there, in units
 
-    def learn(self, plant: Plant, samples: Samples, box: Box | None = None) -> LiftedModel:
+    def learn(self, plant: PlantDescription, samples: DriftSamples,
+              box: Box | None = None) -> LiftedModel:
         """Return the model in a box, the samples' by default; ValueError when B is unknown."""
         box = box or Box.of(plant, samples.x, samples.u)
         B = plant.input_matrix(plant.nominal_state)
@@ -48,7 +49,8 @@ class Edmd:
 
     degree: int = 3  #: highest total degree of the monomials
 
-    def learn(self, plant: Plant, samples: Samples, box: Box | None = None) -> LiftedModel:
+    def learn(self, plant: PlantDescription, samples: DriftSamples,
+              box: Box | None = None) -> LiftedModel:
         """Fit the model in the coordinates of a box, the samples' by default."""
         box = box or Box.of(plant, samples.x, samples.u)
         x, rate, u = deviations(box, samples)
@@ -69,5 +71,5 @@ class Edmd:
                            input_terms=terms)
 
 
-def _provenance(plant: Plant, samples: Samples) -> Provenance:
+def _provenance(plant: PlantDescription, samples: DriftSamples) -> Provenance:
     return Provenance(plant.name, None, samples.digest(), {}, __version__)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Plant
+from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.model import Box, InputTerms
 
 # A function B(x) is replaced by a polynomial of at most this degree, whose root mean square error
@@ -28,7 +28,7 @@ class InputModel:
     weights: Array | None  #: (n_x, n_u (1 + n_phi)) scaled, where they are known
 
     @staticmethod
-    def of(plant: Plant, box: Box, x: Array) -> InputModel:
+    def of(plant: PlantDescription, box: Box, x: Array) -> InputModel:
         """
         Return the input model of a plant, in the coordinates of a box.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from koopman_ros.core.arrays import brief
-from koopman_ros.core.datasets import Array, Samples
+from koopman_ros.core.datasets import Array, DriftSamples
 from koopman_ros.evaluation.closed_loop_test import Rate
 from koopman_ros.model import LiftedModel
 
@@ -58,7 +58,7 @@ class Figures:
         return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
-def evaluate(model: LiftedModel, samples: Samples) -> Figures:
+def evaluate(model: LiftedModel, samples: DriftSamples) -> Figures:
     """Evaluate all open-loop figures on held-out episodes; raises as :func:`fit`."""
     return Figures(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
                   rollout_rmse(model, samples))
@@ -91,7 +91,7 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
                cond=cond)
 
 
-def drift_error(model: LiftedModel, samples: Samples) -> float:
+def drift_error(model: LiftedModel, samples: DriftSamples) -> float:
     """Return `rx` of samples that need not tell the coordinates apart."""
     return _relative_error(model, *_drifts(model, samples.x, samples.dxdt, samples.u))
 
@@ -151,7 +151,7 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
     return model.states.to_physical(np.stack(path, axis=-2))
 
 
-def rollout_rmse(model: LiftedModel, samples: Samples) -> Array | None:
+def rollout_rmse(model: LiftedModel, samples: DriftSamples) -> Array | None:
     """
     Predict every episode from its first state; return the root mean square error (n_x,), in units.
 

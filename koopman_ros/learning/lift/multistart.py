@@ -23,7 +23,7 @@ Recipe = Growth | Algorithm1 | NeuralDrift
 
 
 @dataclass(frozen=True)
-class Progress:
+class MultistartProgress:
     """Progress of a training."""
 
     n_z: int  #: coordinates being learned
@@ -38,7 +38,7 @@ class Progress:
 
 # Called after steps and starts, and again while others work; True ends the training with the best
 # so far.
-Watch = Callable[[Progress], bool]
+Watch = Callable[[MultistartProgress], bool]
 
 
 class Tracker:
@@ -67,7 +67,8 @@ class Tracker:
 
     def _report(self, iteration: int, residual: float, checked: float = 0.0) -> bool:
         if self._watch is not None and not self.stop:
-            self.stop = self._watch(Progress(self.n_z, self.finished, self._total, iteration,
+            self.stop = self._watch(MultistartProgress(self.n_z, self.finished, self._total,
+                                                       iteration,
                                              residual, self._rw, checked))
         return self.stop
 

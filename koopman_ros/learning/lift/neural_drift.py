@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning.lift.incremental import linear_drift, Monitor, TrainedLift, xavier
 from koopman_ros.learning.lift.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
@@ -26,7 +26,7 @@ SMALLEST = (1e-9, 1e-6, 1e-3)
 _STILL = 1e-6
 
 
-def with_readout(model: LiftedModel, samples: Samples, smallest: float = SMALLEST[0]
+def with_readout(model: LiftedModel, samples: DriftSamples, smallest: float = SMALLEST[0]
                  ) -> LiftedModel:
     """
     Read the drift off the features phi of the lift: f(x) = readout phi(x), by least squares.
@@ -92,7 +92,7 @@ class NeuralDrift:
         b = torch.randn(self.hidden, generator=generator, dtype=torch.float64).to(data.x)
         A, B = linear_drift(data)
         theta = layout.join(Parameters(W, b, data.x.new_zeros((n_z, self.hidden)), A, B))
-        minimum = minimise(DriftProblem(layout, data).add_residuals, theta,
+        minimum = minimise(NeuralDriftProblem(layout, data).add_residuals, theta,
                            max_iterations=self.max_iterations, tolerance=self.tolerance,
                            monitor=monitor)
         # the read-out is fitted by itself; the A of the lift z = x is that of the linear fit
@@ -102,7 +102,7 @@ class NeuralDrift:
 
 
 @dataclass(frozen=True)
-class DriftProblem:
+class NeuralDriftProblem:
     """Least-squares problem of a drift: 0.5 times the mean of ||f - A x - V (h - h(0))||^2."""
 
     layout: Layout  #: of a free lift with as many coordinates as states

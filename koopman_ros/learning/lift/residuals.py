@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from koopman_ros.core.datasets import Array, Samples
+from koopman_ros.core.datasets import Array, DriftSamples
 from koopman_ros.learning.lift.levenberg_marquardt import NormalEquations
 from koopman_ros.learning.lift.moment_sums import feature_count, MomentSums
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
@@ -20,7 +20,7 @@ from koopman_ros.model import Box
 CHUNK = 1 << 18
 
 
-def deviations(box: Box, samples: Samples) -> tuple[Array, Array, Array]:
+def deviations(box: Box, samples: DriftSamples) -> tuple[Array, Array, Array]:
     """Scale samples to deviations: x (N, n_x), dx/dt (N, n_x), u (N, n_u)."""
     return (box.states.to_deviation(samples.x), samples.dxdt / box.states.scale,
             box.inputs.to_deviation(samples.u))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from koopman_ros.core.datasets import Array, Plant, Samples
+from koopman_ros.core.datasets import Array, DriftSamples, PlantDescription
 from koopman_ros.learning.lift.incremental import Growth, TrainedLift
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.prestabilization import Frame
@@ -30,7 +30,8 @@ class Scaling:
     pace: float
 
     @staticmethod
-    def of(plant: Plant, box: Box, samples: Samples, pre_feedback: float | None) -> Scaling:
+    def of(plant: PlantDescription, box: Box, samples: DriftSamples,
+           pre_feedback: float | None) -> Scaling:
         """
         Choose it by some samples.
 
@@ -43,7 +44,7 @@ class Scaling:
         rate = frame.enter(*plain)[1] if frame else deviations(box, samples)[1]
         return Scaling(box, inputs, frame, float(np.sqrt(np.mean(rate ** 2))) or 1.0)
 
-    def data(self, samples: Samples, device: str) -> ScaledSamples:
+    def data(self, samples: DriftSamples, device: str) -> ScaledSamples:
         """
         Scale samples, onto a device as torch names it.
 
@@ -110,7 +111,8 @@ def _listed(signals: Coordinates) -> str:
         signals.names, signals.units, strict=True)) or 'none'
 
 
-def _plain(box: Box, inputs: InputModel, samples: Samples) -> tuple[Array, Array, Array | None]:
+def _plain(box: Box, inputs: InputModel, samples: DriftSamples) -> tuple[Array, Array,
+                                                                         Array | None]:
     """Return states, rates less the known effect of inputs, and regressors of the rest."""
     x, rate, u = deviations(box, samples)
     return x, *inputs.apart(x, rate, u)

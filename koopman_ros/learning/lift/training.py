@@ -14,7 +14,7 @@ import numpy as np
 
 from koopman_ros import __version__
 from koopman_ros.core.arrays import brief
-from koopman_ros.core.datasets import Plant, Samples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
@@ -71,8 +71,8 @@ class _Candidate:
         return self.fit.rw + self.fit.rx
 
 
-def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
-          split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
+def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, seed: int = 0,
+          starts: int = 4, split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
           loops: int = LOOPS, device: str = 'cpu', threads: int = 1,
           backend: Backend | None = None, begin: LiftedModel | None = None) -> Trained:
     """
@@ -194,7 +194,8 @@ def _run_rounds(rounds: Sequence[int], tracker: Tracker,
     return path, interrupted
 
 
-def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[_Candidate],
+def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, DriftSamples],
+              path: list[_Candidate],
               interrupted: bool, tracker: Tracker, loops: int, refuse: bool,
               backend: Backend) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
@@ -251,7 +252,8 @@ def _ending(grown: TrainedLift, interrupted: bool) -> str:
         f'{100.0 * grown.decrease:.2g} % off the cost'))
 
 
-def reference_drift(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],
+def reference_drift(plant: PlantDescription, box: Box,
+                    parts: tuple[DriftSamples, DriftSamples, DriftSamples],
                     model: LiftedModel) -> Rate:
     """
     Return the drift that predicts the validation episodes best, on which a law is tried.
@@ -270,7 +272,7 @@ def reference_drift(plant: Plant, box: Box, parts: tuple[Samples, Samples, Sampl
     return rates[int(np.argmin(errors))]
 
 
-def training_states(box: Box, samples: Samples) -> TrainingStates | None:
+def training_states(box: Box, samples: DriftSamples) -> TrainingStates | None:
     """Return where the data are, held-out ones included; None for one state: its box says it."""
     states = box.states
     return None if len(states) == 1 else TrainingStates.of(
@@ -278,7 +280,7 @@ def training_states(box: Box, samples: Samples) -> TrainingStates | None:
 
 
 def _judged(grown: TrainedLift | str, model_of: Callable[[TrainedLift], LiftedModel],
-            parts: tuple[Samples, Samples, Samples]) -> _Candidate | str:
+            parts: tuple[DriftSamples, DriftSamples, DriftSamples]) -> _Candidate | str:
     """Return the candidate of a start, or the reason why there is none."""
     if isinstance(grown, str):
         return grown

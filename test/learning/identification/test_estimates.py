@@ -27,7 +27,7 @@ from koopman_ros.learning.identification import (
     total_variation,
     weak_form,
 )
-from koopman_ros.learning.identification.output_error import _Filter, _Problem, Weights
+from koopman_ros.learning.identification.output_error import _Filter, _Problem, ResidualScales
 from koopman_ros.learning.identification.total_variation import smoothed
 from koopman_ros.learning.identification.weak_form import _input_integral
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
@@ -48,7 +48,7 @@ def start_of(plant, records, degree, B=None):
 def test_normal_equations_against_differences(learn):
     records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (60, 45)]
     model, segments = start_of(PAIR, records, 2)
-    problem = _Problem(Weights(model, learn), segments)
+    problem = _Problem(ResidualScales(model, learn), segments)
     theta = problem.start()
     theta = theta + 0.03 * torch.from_numpy(np.random.default_rng(0).standard_normal(len(theta)))
     box, count = model.box, np.sum(segments.measured)
@@ -84,7 +84,7 @@ def test_normal_equations_of_a_filter_against_differences(learn, smooth):
     rng = np.random.default_rng(0)
     gain, starts = rng.uniform(0.1, 0.4, (2, 1)), rng.uniform(-0.5, 0.5, (2, 2))
     deviation, settling = np.array([0.3]), 5
-    problem = _Problem(Weights(model, learn), segments, _Filter(
+    problem = _Problem(ResidualScales(model, learn), segments, _Filter(
         gain, starts, deviation, settling, smooth, 1e-4))
     theta = problem.start()
     theta = theta + 0.03 * torch.from_numpy(rng.standard_normal(len(theta)))
@@ -121,7 +121,7 @@ def test_normal_equations_of_a_filter_against_differences(learn, smooth):
 
 def test_a_model_that_diverges_has_infinite_cost():
     model, segments = start_of(CUBIC, [CUBIC.excited(100, 0.1)], 3)
-    problem = _Problem(Weights(model, True), segments)
+    problem = _Problem(ResidualScales(model, True), segments)
     theta = problem.start() + 1e8
     assert normal_equations(problem.add_residuals, theta).cost == np.inf
     assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == np.inf

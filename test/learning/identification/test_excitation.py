@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.identification.excitation import check_inputs
 
@@ -17,9 +17,10 @@ SEEDS = range(4)
 SAMPLES = 1200
 
 
-def plant(count: int) -> Plant:
+def plant(count: int) -> PlantDescription:
     names = tuple(f'pump_{k + 1}' for k in range(count))
-    return Plant('tanks', ('level',), ('m',), names, ('V',) * count, 's', NONE[:1], NONE[:count],
+    return PlantDescription('tanks', ('level',), ('m',), names, ('V',) * count, 's', NONE[:1],
+                            NONE[:count],
                  None)
 
 

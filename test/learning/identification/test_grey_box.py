@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import estimate_parameters, EstimateStatus, Stopped
 from koopman_ros.learning.identification.equations import Equations
@@ -43,7 +43,8 @@ class Vessel(Constants):
 
 
 TRUE = Vessel(gain=1.2, leak=0.4)
-VESSEL = Plant('vessel', ('level',), ('m',), ('pump',), ('V',), 's', np.zeros(1), np.zeros(1),
+VESSEL = PlantDescription('vessel', ('level',), ('m',), ('pump',), ('V',), 's', np.zeros(1),
+                          np.zeros(1),
                None)
 
 
@@ -96,7 +97,8 @@ def test_of_a_disturbed_plant_a_filter_is_found_too():
 def test_two_tanks_all_of_which_is_measured():
     truth = TwoTanks(orifice_1=0.2e-4, orifice_2=0.16e-4, pump_gain=3e-6)
     system = truth.system()
-    plant = Plant('tanks', system.state_names[::-1], ('m', 'm'), system.input_names[::-1],
+    plant = PlantDescription('tanks', system.state_names[::-1], ('m', 'm'),
+                             system.input_names[::-1],
                   ('V', 'V'), 's', np.full(2, np.nan), np.full(2, np.nan), None)
     design = RandomStepDesign([3.0, 0.0], [9.0, 4.0], 0.4 * system.nominal_state,
                               1.8 * system.nominal_state, (15.0, 45.0), 4.0, rtol=1e-9)
@@ -142,7 +144,8 @@ def saddle(truth, seed, minutes=16.0, period=3.0):
 
 def test_reactor_at_its_saddle_from_its_temperature_alone():
     truth = TwoStateReactor(heat_transfer_coefficient=4.6e4, reaction_enthalpy=-4.8e4)
-    plant = Plant('saddle', ('temperature',), ('K',), ('coolant_temperature',), ('K',), 's',
+    plant = PlantDescription('saddle', ('temperature',), ('K',), ('coolant_temperature',), ('K',),
+                             's',
                   np.full(1, np.nan), np.full(1, np.nan), None)
     said = []
     found = estimate_parameters(
@@ -218,7 +221,7 @@ def test_derivatives_by_constants_and_states_against_those_by_hand():
 def test_where_inputs_act_by_the_state_and_signals_have_another_order_and_time(turned):
     system = FedReactor().system()
     order = slice(None, None, -1 if turned else None)
-    plant = Plant('fed', system.state_names[order], system.state_units[order],
+    plant = PlantDescription('fed', system.state_names[order], system.state_units[order],
                   system.input_names[order], system.input_units[order], 's', np.full(2, np.nan),
                   np.full(2, np.nan), None)
     rng = np.random.default_rng(0)
@@ -254,9 +257,11 @@ class Silent(Constants):
     (VESSEL, Vessel, {'leak': (0.5, 0.1)},
      r'the range of leak is \[0.5, 0.1\] 1/s, must rise and lie in \[0, 10\] 1/s'),
     (VESSEL, Vessel, {'leak': (0.5, 11.0)}, r'lie in \[0, 10\] 1/s'),
-    (Plant('vessel', ('depth',), ('m',), ('pump',), ('V',), 's', np.zeros(1), np.zeros(1), None),
+    (PlantDescription('vessel', ('depth',), ('m',), ('pump',), ('V',), 's', np.zeros(1),
+                      np.zeros(1), None),
      Vessel, {}, r'the record has the states depth \[m\], Vessel has level \[m\]'),
-    (Plant('vessel', ('level',), ('m',), ('tap',), ('V',), 's', np.zeros(1), np.zeros(1), None),
+    (PlantDescription('vessel', ('level',), ('m',), ('tap',), ('V',), 's', np.zeros(1),
+                      np.zeros(1), None),
      Vessel, {}, r'the record has the inputs tap \[V\], Vessel has pump \[V\]')])
 def test_what_does_not_fit_is_refused(plant, equations, ranges, words):
     with pytest.raises(ValueError, match=words):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from koopman_ros.core.datasets import Episode, Plant
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import identify_unmeasured, Stopped
 
-PLANT = Plant('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
+PLANT = PlantDescription('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
               np.zeros(1), None)
 PERIOD, NOISE = 0.2, 0.02
 A = np.array([[-0.5, 1.0], [-0.8, -0.2]])

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import kstest
 import torch
 
-from koopman_ros.core.datasets import Plant, Samples
+from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.learning import Algorithm1, Edmd, fit, Linearisation
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, normal_equations
 from koopman_ros.learning.lift.network import Layout
@@ -43,14 +43,15 @@ def van_der_pol(x, u):
     return np.stack([x[..., 1], (1.0 - x[..., 0] ** 2) * x[..., 1] - x[..., 0] + u[..., 0]], -1)
 
 
-VAN_DER_POL = Plant('Van der Pol', ('x1', 'x2'), ('1', '1'), ('u',), ('1',), 's', np.zeros(2),
+VAN_DER_POL = PlantDescription('Van der Pol', ('x1', 'x2'), ('1', '1'), ('u',), ('1',), 's',
+                               np.zeros(2),
                     np.zeros(1), np.array([[0.0], [1.0]]))
 
 
 def van_der_pol_samples(count=400, seed=0):
     rng = np.random.default_rng(seed)
     x, u = rng.uniform(-2.0, 2.0, (count, 2)), rng.uniform(-1.0, 1.0, (count, 1))
-    return Samples(x, van_der_pol(x, u), u, np.arange(count) // 40)
+    return DriftSamples(x, van_der_pol(x, u), u, np.arange(count) // 40)
 
 
 @pytest.mark.parametrize('degree', [3, 5])

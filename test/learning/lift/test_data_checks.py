@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from koopman_ros.core.datasets import Plant, Samples
+from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.learning import train
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.model import Box
 from support.small_plants import BENT, bent_samples, SMALL, TWO_STATE, two_state_samples
 
 # dx/dt = -2 (x - 3) + u - 0.5
-DECAY = Plant('decay', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
+DECAY = PlantDescription('decay', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
               np.array([0.5]), np.array([[1.0]]))
 
 
@@ -30,14 +30,14 @@ def decaying(noise=0.0, rate_noise=0.0):
         x[:, k + 1] = rest + np.exp(-0.2) * (x[:, k] - rest)
     rate = -2.0 * (x - 3.0) + u - 0.5
     x, rate = x + noise * rng.normal(size=x.shape), rate + rate_noise * rng.normal(size=x.shape)
-    return Samples(x.reshape(-1, 1), rate.reshape(-1, 1), u.reshape(-1, 1),
+    return DriftSamples(x.reshape(-1, 1), rate.reshape(-1, 1), u.reshape(-1, 1),
                    np.repeat(np.arange(5), 60), np.tile(0.1 * np.arange(60), 5))
 
 
 @pytest.mark.parametrize('samples', [
     decaying(), replace(decaying(), time=None), decaying(noise=0.1), decaying(rate_noise=2.0),
     # each step as long as the time constant is resolved coarsely, and yet no contradiction
-    Samples(*(a[np.arange(300) % 60 % 5 == 0] for a in (
+    DriftSamples(*(a[np.arange(300) % 60 % 5 == 0] for a in (
         decaying().x, decaying().dxdt, decaying().u, decaying().episode, decaying().time)))],
     ids=['exact', 'no times', 'noisy states', 'noisy rates', 'coarse'])
 def test_times_that_do_not_contradict_the_rates(samples):
@@ -52,7 +52,7 @@ def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period
     A = np.array([[0.0, 1.0], [-1.0, -2.0 * damping]])
     start = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
     x = np.stack([start @ expm(A * period * k).T for k in range(6)], axis=1).reshape(-1, 2)
-    samples = Samples(x, x @ A.T, np.zeros((240, 1)), np.repeat(np.arange(40), 6),
+    samples = DriftSamples(x, x @ A.T, np.zeros((240, 1)), np.repeat(np.arange(40), 6),
                       np.tile(period * np.arange(6), 40))
     check_rates(plant, samples)
     if period == 0.5:

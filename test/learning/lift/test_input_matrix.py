@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros.control import averaged, recentred, steady_state_target, Weights
 from koopman_ros.control.steady_state import partial_target, resting_state
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.evaluation import run_closed_loop
@@ -42,7 +42,7 @@ UNKNOWN = replace(KNOWN, B=None, input_matrix_degree=1)
 
 
 @cache
-def samples() -> Samples:
+def samples() -> DriftSamples:
     """Sample the reactor around its cold steady state, between half and one and a half feeds."""
     x0, u0 = PLANT.nominal_state, PLANT.nominal_input
     design = RandomStepDesign(u0 - HALF_U, u0 + HALF_U, x0 - HALF_X, x0 + HALF_X, (0.05, 0.2),

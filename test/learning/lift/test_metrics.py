@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
 
-from koopman_ros.core.datasets import Samples
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import (
     evaluate,
     Figures,
@@ -184,7 +184,7 @@ def linear_episodes(jacobian=JACOBIAN, lengths=(6, 9), shift=0.0, period=0.2):
         episode.append(np.full(length, number))
     x, u = np.concatenate(x), np.concatenate(u)
     dxdt = (x - model.states.center) @ jacobian.T + (u - model.inputs.center) @ B.T
-    return Samples(x, dxdt, u, np.concatenate(episode), np.concatenate(time))
+    return DriftSamples(x, dxdt, u, np.concatenate(episode), np.concatenate(time))
 
 
 def test_the_error_of_roll_outs_is_measured_over_all_episodes():

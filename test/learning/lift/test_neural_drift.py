@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.core.datasets import Samples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, split_by_episode
 from koopman_ros.learning import fit, Growth, NeuralDrift, NoUsefulLift, train
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.learning.lift.network import Layout
-from koopman_ros.learning.lift.neural_drift import DriftProblem, with_readout
+from koopman_ros.learning.lift.neural_drift import NeuralDriftProblem, with_readout
 from koopman_ros.learning.lift.residuals import ScaledSamples
 from support.random_lifts import random_lift
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
@@ -25,7 +25,7 @@ def samples_of(model, count=60, seed=1):
     rng = np.random.default_rng(seed)
     xi, v = rng.uniform(-1.5, 1.5, (count, model.n_x)), rng.normal(size=(count, model.n_u))
     rate = model.states.scale * (model.drift(xi) + v @ model.B.T)
-    return Samples(model.states.to_physical(xi), rate, model.inputs.to_physical(v),
+    return DriftSamples(model.states.to_physical(xi), rate, model.inputs.to_physical(v),
                    np.arange(count) // 10)
 
 
@@ -94,7 +94,7 @@ def test_training_keeps_the_read_out_that_is_better_on_validation_episodes(plant
     few = ~np.isin(samples.episode, training.episode) | (np.arange(len(samples.x)) % 11 == 0)
     noise = 0.3 * np.std(samples.dxdt) * np.random.default_rng(0).normal(size=samples.x.shape)
     noise[~np.isin(samples.episode, training.episode)] = 0.0
-    rough = Samples(samples.x[few], (samples.dxdt + noise)[few], samples.u[few],
+    rough = DriftSamples(samples.x[few], (samples.dxdt + noise)[few], samples.u[few],
                     samples.episode[few])
     assert train(plant, rough, recipe, starts=1, refuse=False).model.readout is None
 
@@ -108,7 +108,7 @@ def test_the_sums_of_a_drift_are_those_of_its_differentiated_residual(n_u):
     layout = Layout(3, 3, 5, False, n_u)
     theta = torch.randn(layout.size, generator=generator, dtype=torch.float64)
     data = ScaledSamples(x, f, u if n_u else None)
-    found = normal_equations(DriftProblem(layout, data).add_residuals, theta)
+    found = normal_equations(NeuralDriftProblem(layout, data).add_residuals, theta)
 
     def residual(theta):
         parts = layout.split(theta)

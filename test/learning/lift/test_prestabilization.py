@@ -10,7 +10,7 @@ import pytest
 
 from koopman_ros.control import feedback, Form, Weights
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.core.datasets import Plant, Samples
+from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning import Growth, train
 from koopman_ros.learning.lift.input_model import InputModel
@@ -18,10 +18,12 @@ from koopman_ros.learning.lift.prestabilization import Frame
 from koopman_ros.model import NetworkObservables
 
 # dx/dt = x + 0.3 x^2 + 2 u in deviations from 3 m and 0.5 m/s
-GROWING = Plant('growing', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
+GROWING = PlantDescription('growing', ('level',), ('m',), ('flow',), ('m/s',), 's',
+                           np.array([3.0]),
                 np.array([0.5]), np.array([[2.0]]))
 # of a pendulum about its upright position, x2' = 4 sin x1 - 0.2 x2 + 3 u
-UPRIGHT = Plant('upright', ('angle', 'rate'), ('rad', 'rad/s'), ('torque',), ('N m',), 's',
+UPRIGHT = PlantDescription('upright', ('angle', 'rate'), ('rad', 'rad/s'), ('torque',), ('N m',),
+                           's',
                 np.zeros(2), np.zeros(1), np.array([[0.0], [3.0]]))
 
 
@@ -38,7 +40,7 @@ def samples_of(plant, drift, half, count=400, B=None):
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-half, half, (count, len(half))), rng.uniform(-1.0, 1.0, (count, 1))
     pushed = u @ plant.B.T if B is None else (B(x) @ u[..., None])[..., 0]
-    return Samples(x + plant.nominal_state, drift(x) + pushed, u + plant.nominal_input,
+    return DriftSamples(x + plant.nominal_state, drift(x) + pushed, u + plant.nominal_input,
                    np.arange(count) // (count // 10))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.core.datasets import Plant, Samples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.learning import Edmd, evaluate, fit, Growth, train
 from koopman_ros.learning.lift import training
 from koopman_ros.learning.lift.incremental import least_squares
@@ -243,10 +243,11 @@ def test_b_is_learned(plant, samples):
 def test_a_plant_without_inputs(B):
     """The paper's first example, dx/dt = x^2, over [0, 5]."""
     system = scalar_example()
-    plant = Plant(system.name, system.state_names, system.state_units, (), (), 's', np.zeros(1),
+    plant = PlantDescription(system.name, system.state_names, system.state_units, (), (), 's',
+                             np.zeros(1),
                   np.zeros(0), B)
     x = np.random.default_rng(0).uniform(0.0, 5.0, (200, 1))
-    samples = Samples(x, x * x, np.zeros((200, 0)), np.arange(200) // 20)
+    samples = DriftSamples(x, x * x, np.zeros((200, 0)), np.arange(200) // 20)
     trained = train(plant, samples, Growth(2, max_iterations=150), starts=1)
     assert trained.law_check is None
     assert (trained.model.n_u, trained.model.B.shape) == (0, (1, 0))
