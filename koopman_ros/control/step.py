@@ -135,7 +135,8 @@ class ControlStep(Configuration):
         Return the result of a calculation; where it fails the command is held, later the safe one.
 
         This is the one place where a failure of an estimator, or of anything else that a step
-        calculates, is caught; that of a law is a reason for the next level (:class:`FallbackLevel`).
+        calculates, is caught; that of a law is a reason for the next level (see
+        :class:`FallbackLevel`).
 
         :param before: the state to hold from; its estimate restarts from the next measurement.
         :param time_ns: stamp of the last measurement.
