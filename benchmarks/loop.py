@@ -22,7 +22,7 @@ from koopman_ros.core.plots import table
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, NodeProcess
 
 PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')

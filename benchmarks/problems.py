@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.incremental import IncrementalTraining
 from koopman_ros.learning.lift.network import Layout, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.plants import one_state_reactor, two_state_example
@@ -74,7 +74,7 @@ def build(system: str, samples: int, hidden: int) -> PlanningCase:
     x, f = (x - plant.nominal_state) / scale, f / np.sqrt(np.mean(f ** 2))
     data = ScaledSamples(torch.from_numpy(x), torch.from_numpy(f))
     *before, _ = range(plant.n_x + 1, N_Z + 1)
-    growth = Growth(N_Z, hidden_first=hidden - _HIDDEN_MORE * len(before),
+    growth = IncrementalTraining(N_Z, hidden_first=hidden - _HIDDEN_MORE * len(before),
                     hidden_more=_HIDDEN_MORE, whitening=WHITENING)
     parent = growth.root(data)
     for n_z in before:

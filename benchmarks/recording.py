@@ -22,7 +22,7 @@ from benchmarks.process import processor_seconds
 from koopman_ros.core.plots import table
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records import BagMessage, BagWriter, message_definition, read_messages
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
 
 PACKAGES = ('mcap',)

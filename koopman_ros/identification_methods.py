@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from koopman_ros.core.declaration import NoParameters, parameter
-from koopman_ros.core.plugins import plug_class, short_name
+from koopman_ros.core.plugins import plugin_class, short_name
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,6 @@ def parameters_of(names: Sequence[str]) -> dict[str, type[Any]]:
         if name not in METHODS:
             # only a class of one's own needs what the contract imports
             from koopman_ros.learning.identification import IdentificationMethod
-            found[short_name(name)] = plug_class(
+            found[short_name(name)] = plugin_class(
                 name, 'identification method', METHODS, IdentificationMethod).Parameters
     return found

@@ -75,7 +75,7 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def end_by_force(seconds: float, code: int = 0, sentence: str = '') -> Callable[[], None]:
+def force_exit_after(seconds: float, code: int = 0, sentence: str = '') -> Callable[[], None]:
     """
     End the process after some seconds, with a sentence; return a function that cancels this.
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.declaration import (
     ANY,
     column,
@@ -137,7 +137,7 @@ class Tuning:
     #: own parameters of laws and estimators, by name
     plugins: Mapping[str, Any] = plugin_parameters()
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def of_plugin(self, name: str, kind: type[Any]) -> Any:
         """Return the own parameters of a plug-in by its name; those of `kind` by default."""

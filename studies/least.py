@@ -7,13 +7,13 @@ import casadi
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.evaluation.optimal_cost import Course, Task
+from koopman_ros.evaluation.optimal_cost import OptimalTrajectory, Task
 from studies.equations import Rates
 
 
 def least_course(task: Task, rates: Rates, lower: Array, upper: Array, *,
                  state_upper: Array | None = None, step: Array | None = None,
-                 guess: Course | None = None) -> Course:
+                 guess: OptimalTrajectory | None = None) -> OptimalTrajectory:
     """
     Find the course of least cost, without noise.
 
@@ -51,7 +51,8 @@ def least_course(task: Task, rates: Rates, lower: Array, upper: Array, *,
     opti.set_initial(u, inputs)
     opti.solver('ipopt', {'print_time': False}, {'print_level': 0, 'sb': 'yes', 'tol': 1e-10})
     found = opti.solve()
-    return Course(unit * np.asarray(found.value(x)).T, np.reshape(found.value(u), u.shape).T,
+    return OptimalTrajectory(unit * np.asarray(found.value(x)).T,
+                             np.reshape(found.value(u), u.shape).T,
                   float(found.value(opti.f)))
 
 

@@ -39,7 +39,7 @@ from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, 
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.ros.topics import CONTROLLER_INTERNALS, LOOP_QOS
 from koopman_ros.testing import HarnessError
 from studies.saddle import (

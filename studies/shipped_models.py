@@ -17,7 +17,7 @@ import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
-from koopman_ros.learning import Growth, roll_out, train
+from koopman_ros.learning import IncrementalTraining, roll_out, train
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.model import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import (
@@ -44,12 +44,12 @@ class Lift:
     design: RandomStepDesign  #: box, inputs and times, in the plant's units
     episodes: int  #: from random states within the box
     duration: float  #: of each, in the plant's time unit
-    recipe: Growth  #: a fixed number of steps, as above
+    recipe: IncrementalTraining  #: a fixed number of steps, as above
 
 
 # As many free coordinates as states fit all these plants better than identity coordinates (rw by
 # two orders and more) but the example, which has an exact lift with them.
-_FREE = Growth(2, identity=False, hidden_first=16, max_iterations=300, tolerance=0.0)
+_FREE = IncrementalTraining(2, identity=False, hidden_first=16, max_iterations=300, tolerance=0.0)
 LIFTS = {
     # about the stable steady state: conversions and temperatures in min, mol/L and K
     'two_state': Lift(RandomStepDesign(
@@ -103,8 +103,8 @@ def train_lifts(progress: Watch | None = None, starts: int = STARTS, loops: int 
     """Train the lifts of the one-state reactor, by n_z; the larger grows from the smaller."""
     # a fixed number of steps: where they end depends least on how a processor rounds
     trained = train(describe(SYSTEM), training_samples(SEED),
-                    Growth(max(LIFTED_SIZES), tolerance=0.0), seed=SEED, starts=starts,
-                    loops=loops, watch=progress)
+                    IncrementalTraining(max(LIFTED_SIZES), tolerance=0.0), seed=SEED,
+                    starts=starts, loops=loops, watch=progress)
     return {model.n_z: _with_roll_out(model) for model in trained.path
             if model.n_z in LIFTED_SIZES}
 

@@ -18,10 +18,10 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation import at, simulate
-from koopman_ros.evaluation.optimal_cost import cost_along, Course, optimum, Task
+from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory, optimum, Task
 from koopman_ros.evaluation.simulate import Simulation
 from koopman_ros.execution import Backend, backend_of, Tell
-from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
+from koopman_ros.learning import compare, fit, IncrementalTraining, NeuralDrift, TrainingFailed
 from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import (
@@ -46,7 +46,7 @@ DESIGN = RandomStepDesign(
 EPISODES, DURATION = 400, 0.1  # in min
 # A feedback under which the range has one steady state makes as many free coordinates as states
 # enough.
-LIFT = Growth(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
+LIFT = IncrementalTraining(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
               pre_feedback=0.05, other_whitenings=(10.0,))
 RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift(16), 'free lift': LIFT}
 STARTS = 2
@@ -141,7 +141,7 @@ def least_costs(model: LiftedModel) -> list[str]:
         loop = run(model, ('mpc', 'sdre'), LIMITS, MARGIN, begin, end, task.x0, LIMITED_SAMPLES)
         costs.append(least_course(
             task, EQUATIONS['two_state'], LIMITS.lower, LIMITS.upper, step=PERIOD * LIMITS.rate,
-            guess=Course(loop.states, loop.commands[:LIMITED_SAMPLES], 0.0)).cost)
+            guess=OptimalTrajectory(loop.states, loop.commands[:LIMITED_SAMPLES], 0.0)).cost)
     return ['the least', *(f'{cost:.2f}' for cost in costs), '']
 
 
@@ -169,7 +169,7 @@ def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
     begin = time.process_time()
     try:
         model, fresh = learn(seed), samples(1000 + seed, FRESH_EPISODES)
-    except NoUsefulLift as refusal:
+    except TrainingFailed as refusal:
         return f'seed {seed}: {refusal}'
     seconds = time.process_time() - begin
     found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)

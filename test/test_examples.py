@@ -22,7 +22,7 @@ from scipy.linalg import solve_continuous_are
 from sensor_msgs.msg import JointState
 
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
 from support.nodes import ros, type_support
 from support.tanks import LEVELS, PUMPS, TANKS

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control.laws import Plan
-from koopman_ros.core.message_fields import CARRIERS, place
+from koopman_ros.core.message_fields import KNOWN_TYPES, place
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
@@ -120,7 +120,7 @@ def test_interfaces_list_where_signals_are(system: str, column: int) -> None:
 
 def test_interfaces_list_the_message_types() -> None:
     text = (ROOT / 'docs' / 'interfaces.md').read_text()
-    for kind in CARRIERS:
+    for kind in KNOWN_TYPES:
         assert f'`{kind}`' in text
     rows = [row for row in _rows('interfaces.md') if '/msg/' in row[1] and len(row) == 4]
     for units, kind, field, there in rows:

@@ -25,7 +25,7 @@ from koopman_ros.control import Weights
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation import run_closed_loop
-from koopman_ros.learning import compare, Growth, NeuralDrift
+from koopman_ros.learning import compare, IncrementalTraining, NeuralDrift
 from koopman_ros.plants import (
     box_episodes,
     ControlAffineSystem,
@@ -89,7 +89,7 @@ design = RandomStepDesign(
     state_upper=1.4 * corner, hold_time=(0.01, 0.02), sample_period=0.01, rtol=1e-9)
 samples = box_episodes(beam, design, episodes=60, duration=0.05, seed=1, starts=(-corner, corner))
 recipes = {'neural drift': NeuralDrift(8, max_iterations=100),
-           'identity lift': Growth(3, hidden_first=8, max_iterations=40)}
+           'identity lift': IncrementalTraining(3, hidden_first=8, max_iterations=40)}
 found = compare(describe(beam), samples, recipes, starts=1, loops=16)
 print(found)
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
-from koopman_ros.evaluation import at, check_law, simulate
-from koopman_ros.learning import compare, Growth, NeuralDrift
+from koopman_ros.evaluation import at, evaluate_closed_loops, simulate
+from koopman_ros.learning import compare, IncrementalTraining, NeuralDrift
 from koopman_ros.plants import box_episodes, describe, plant_class, Process, RandomStepDesign
 
 # a notebook has arguments of its own
@@ -80,8 +80,8 @@ figure.savefig(OUT / 'pendulum_samples.png')
 # %%
 found = compare(describe(system), samples, {
     'neural drift': NeuralDrift(12, max_iterations=150),
-    'identity lift': Growth(4, hidden_first=8, max_iterations=40),
-    'free lift': Growth(2, identity=False, hidden_first=8, max_iterations=40)},
+    'identity lift': IncrementalTraining(4, hidden_first=8, max_iterations=40),
+    'free lift': IncrementalTraining(2, identity=False, hidden_first=8, max_iterations=40)},
     starts=1, loops=16)
 print(found)
 
@@ -127,7 +127,7 @@ for one in found.contenders:
 model = found.model
 print(f'10 N m: {found.chosen.law_check}; cost beside a linear law, median '
       f'{found.chosen.law_check.median_ratio:.3f}')
-checks = {torque: check_law(model, system.derivative, loops=32, limits=InputLimits(
+checks = {torque: evaluate_closed_loops(model, system.derivative, loops=32, limits=InputLimits(
     lower=np.array([-torque]), upper=np.array([torque]), rate=np.array([np.inf])))
     for torque in (4.0, 2.0)}
 for torque, check in checks.items():

@@ -24,7 +24,7 @@ from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
 from koopman_ros.evaluation import at, simulate
-from koopman_ros.learning import decide, learn_lift, roll_out, Thresholds
+from koopman_ros.learning import evaluate_model, learn_lift, roll_out, Thresholds
 from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.model import load, save
 from koopman_ros.plants import (
@@ -112,7 +112,7 @@ print(f'B:\n{found.drift.input_matrix.round(6)}, in truth\n{truth.B.round(6)} m/
 
 # %%
 trained = learn_lift(found, plant, 3, seed=0, starts=1)
-decision = decide(found, trained, None, Thresholds(), loops=16)
+decision = evaluate_model(found, trained, None, Thresholds(), loops=16)
 for name, error in (('lift', decision.rmse), ('identified drift', decision.drift_rmse),
                     ('best linear model', decision.linear_rmse), ('noise', decision.noise)):
     print(f'{name:18} {1e3 * error[0]:6.2f} mm {1e3 * error[1]:6.2f} mm')

@@ -13,7 +13,7 @@ import numpy as np
 from koopman_ros.control.estimates import StateEstimation
 from koopman_ros.control.fallback import build_levels, FallbackLevel
 from koopman_ros.control.supervisor import FallbackOrder
-from koopman_ros.core.arrays import Array, brief, kept
+from koopman_ros.core.arrays import Array, read_only, short_repr
 from koopman_ros.core.signals import Outputs
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import Tuning
@@ -32,7 +32,7 @@ class Configuration:
     tuning: Tuning  #: with one number for each signal
     outputs: Outputs | None = None  #: what is measured; every state by default
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'tuning', self.tuning.for_signals(
@@ -76,12 +76,12 @@ class Configuration:
     @cached_property
     def safe_input(self) -> Array:
         """What is commanded when no law can act, (n_u,) in input units."""
-        return kept(self.tuning.limits.within(self.tuning.safe_value))
+        return read_only(self.tuning.limits.within(self.tuning.safe_value))
 
     @cached_property
     def nominal_input(self) -> Array:
         """The nominal input (n_u,) within its limits, in input units."""
-        return kept(self.tuning.limits.within(self.model.inputs.center))
+        return read_only(self.tuning.limits.within(self.model.inputs.center))
 
     @cached_property
     def ranges(self) -> tuple[tuple[str, float, float], ...]:

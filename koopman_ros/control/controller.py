@@ -20,10 +20,10 @@ from koopman_ros.control.state import Mode, State
 from koopman_ros.control.step import ControlStep
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.control.timing import usual_interval
-from koopman_ros.core.arrays import Array, kept
+from koopman_ros.core.arrays import Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
-from koopman_ros.core.status import Code, Reason, reason, UNMEASURED
+from koopman_ros.core.status import Reason, reason, StatusCode, UNMEASURED
 from koopman_ros.estimation import equivalent_bias, Estimate
 
 
@@ -71,13 +71,14 @@ class Controller(ControlStep):
         ahead = setpoints.lies_ahead(effective_ns, state.time_ns)
         lost = _unmeasured(state.supervisor.reason)
         if lost is not None and not ahead:
-            return state, reason(Code.SETPOINT_UNMEASURED, signal=asked[0],
+            return state, reason(StatusCode.SETPOINT_UNMEASURED, signal=asked[0],
                                  value=float(value[0]), cause=lost)
         if ahead and len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED:
-            return state, reason(Code.SCHEDULE_FULL, most=setpoints.MAX_SCHEDULED)
+            return state, reason(StatusCode.SCHEDULE_FULL, most=setpoints.MAX_SCHEDULED)
         whole = np.full(len(every), np.nan)
         whole[[every.names.index(name) for name in asked]] = value
-        requested = setpoints.request(state.setpoint, kept(whole), effective_ns, state.time_ns)
+        requested = setpoints.request(state.setpoint, read_only(whole), effective_ns,
+                                      state.time_ns)
         refusal = self._infeasibility(state, setpoints.at_its_time(
             requested, effective_ns, state.time_ns), len(asked) == len(every))
         return (replace(state, setpoint=requested), None) if refusal is None else (state, refusal)
@@ -90,12 +91,12 @@ class Controller(ControlStep):
                 acting, w = self.estimation.level(state.supervisor), np.zeros(self.model.n_x)
                 # where a law acts that needs no model, none is trusted
                 if state.estimate is not None and not acting.law.model_free:
-                    w = self.estimation.rebase(state.estimate, acting, level).w
+                    w = self.estimation.transfer_estimate(state.estimate, acting, level).w
                 feasible = Feasibility(level, self.order.margins[0], w, state.target)
                 return feasible.infeasibility(
                     goal, (state.setpoint.requested, state.setpoint.active), state.command, whole)
         except BaseException as error:
-            return reason(Code.SETPOINT_NOT_TRIED, error=contained(error))
+            return reason(StatusCode.SETPOINT_NOT_TRIED, error=contained(error))
 
     def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
         """Return what of a set-point, requested already, is outside the trained range, or None."""
@@ -119,13 +120,13 @@ class Controller(ControlStep):
         :raises ValueError: for another size.
         """
         if state.mode is not Mode.MANUAL:
-            return state, reason(Code.NOT_IN_MANUAL_MODE)
+            return state, reason(StatusCode.NOT_IN_MANUAL_MODE)
         names = self.model.inputs.names
         value = numbers('manual input', value, names)
         for name, number in zip(names, value.tolist(), strict=True):
             if not math.isfinite(number):
-                return state, reason(Code.MANUAL_NOT_FINITE, signal=name, value=number)
-        return replace(state, manual_input=kept(value)), None
+                return state, reason(StatusCode.MANUAL_NOT_FINITE, signal=name, value=number)
+        return replace(state, manual_input=read_only(value)), None
 
     def set_mode(self, state: State, mode: Mode) -> State:
         """
@@ -139,7 +140,7 @@ class Controller(ControlStep):
         try:
             with np.errstate(all='ignore'):
                 if estimate is not None:
-                    estimate = self.estimation.rebase(
+                    estimate = self.estimation.transfer_estimate(
                         estimate, self.estimation.level(state.supervisor), self.best)
         except BaseException as error:
             contained(error)
@@ -159,9 +160,9 @@ class Controller(ControlStep):
         applied = numbers('applied input', applied, self.model.inputs.names)
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
-        return replace(state, command=kept(self.tuning.limits.within(applied)))
+        return replace(state, command=read_only(self.tuning.limits.within(applied)))
 
-    def hand_over(self, predecessor: Controller, state: State) -> State:
+    def switch_to(self, predecessor: Controller, state: State) -> State:
         """
         Take the place of a controller with another tuning or model, without a bump.
 
@@ -173,7 +174,7 @@ class Controller(ControlStep):
         every = self.best.controls_all and predecessor.best.controls_all
         try:
             with np.errstate(all='ignore'):
-                state = self.estimation.inherit(predecessor.estimation, state)
+                state = self.estimation.take_over(predecessor.estimation, state)
                 if not (same or every):
                     # what is measured next is held until there is another request
                     state = replace(state, setpoint=setpoints.Setpoint())
@@ -235,6 +236,6 @@ class Controller(ControlStep):
 
 def _unmeasured(why: Reason | None) -> Reason | None:
     """Return the reason of a hold for want of measurements, which lasts; else None."""
-    while why is not None and why.code is Code.HELD_TOO_LONG:
+    while why is not None and why.code is StatusCode.HELD_TOO_LONG:
         why = why.cause
     return why if why is not None and why.code in UNMEASURED else None

@@ -15,7 +15,7 @@ from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import check, Estimate, Standstill, Verdict
 from koopman_ros.model import LiftedModel
@@ -118,7 +118,8 @@ class StateEstimation:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
                 outside = self.model.distance(x)
-        elif verdict.fault.code is Code.FROZEN and predicted is not None and last is not None:
+        elif (verdict.fault.code is StatusCode.FROZEN and predicted is not None
+                and last is not None):
             # what the observer made of a sensor that does not move is no disturbance
             predicted = replace(predicted, w=last.standstill.w)
         return replace(
@@ -188,13 +189,14 @@ class StateEstimation:
         return predicted if predicted is not None and predicted.finite else replace(
             state.estimate, covariance=None)
 
-    def rebase(self, estimate: Estimate, before: FallbackLevel, now: FallbackLevel) -> Estimate:
+    def transfer_estimate(self, estimate: Estimate, before: FallbackLevel,
+                          now: FallbackLevel) -> Estimate:
         """Transfer an estimate from the model of one level to that of another."""
         if before is now or not now.estimator.remembers:
             return estimate
-        return now.estimator.rebased(estimate, before.model.drift(estimate.x))
+        return now.estimator.transferred(estimate, before.model.drift(estimate.x))
 
-    def inherit(self, predecessor: StateEstimation, state: State) -> State:
+    def take_over(self, predecessor: StateEstimation, state: State) -> State:
         """Carry an estimate over from other settings or another model."""
         estimate, old, new = state.estimate, predecessor.model, self.model
         if estimate is None:
@@ -222,7 +224,7 @@ class StateEstimation:
             covariance = covariance * change * change[:, None]
         moved = Estimate(
             x_new, factor * rate - new.forcing(x_new, _command(new, state)), covariance)
-        moved = estimator.rebased(moved, np.zeros_like(moved.w))
+        moved = estimator.transferred(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return replace(state, estimate=moved, accepted=None, recovery=None)
 

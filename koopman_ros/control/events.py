@@ -14,7 +14,7 @@ from typing import TypeAlias
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.state import Mode, State, StepReport
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.status import Code, Reason
+from koopman_ros.core.status import Reason, StatusCode
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Silence:
 
     stamp_ns: int  #: that time, in the time of the measurements' stamps
     #: why the command is held; None where it goes on from what is estimated
-    cause: Code | None = Code.NO_MEASUREMENT
+    cause: StatusCode | None = StatusCode.NO_MEASUREMENT
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from koopman_ros.core.arrays import Array, frozen
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
 
 _FOLLOWS_WITHIN = 1e-3  # of an input's range
@@ -93,9 +93,9 @@ class Experiment:
                 self.measured, measured.tolist(), self.measured_lower.tolist(),
                 self.measured_upper.tolist(), strict=True):
             if not np.isfinite(value):
-                return reason(Code.NOT_FINITE, signal=name, value=value)
+                return reason(StatusCode.NOT_FINITE, signal=name, value=value)
             if not lower <= value <= upper:
-                return reason(Code.EXPERIMENT_BOUNDS, signal=name, value=value, lower=lower,
+                return reason(StatusCode.EXPERIMENT_BOUNDS, signal=name, value=value, lower=lower,
                               upper=upper)
         return None
 
@@ -147,7 +147,7 @@ def advance(experiment: Experiment, progress: ExperimentProgress, measured: Arra
     if measured is not None and (why := experiment.refusal(measured)):
         progress = end(progress, ExperimentPhase.ABORTED, why)
     if ahead < -LATE_NANOSECONDS:
-        progress = end(progress, ExperimentPhase.ABORTED, reason(Code.CLOCK_WENT_BACK))
+        progress = end(progress, ExperimentPhase.ABORTED, reason(StatusCode.CLOCK_WENT_BACK))
         return replace(progress, time_ns=time_ns)
     if ahead <= 0:
         return progress

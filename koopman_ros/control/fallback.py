@@ -25,7 +25,7 @@ from koopman_ros.control.steady_state import partial_target, reachable_target
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.plugins import contained, plug_in
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import InputLimits, Tuning
@@ -56,7 +56,7 @@ class FallbackLevel:
         try:
             return self.law.unusable()
         except BaseException as error:
-            return reason(Code.LAW_RAISED, error=contained(error))
+            return reason(StatusCode.LAW_RAISED, error=contained(error))
 
     @property
     def controls_all(self) -> bool:
@@ -116,12 +116,12 @@ class FallbackLevel:
         try:
             target = self.target(setpoint, estimate.w, start)
             if target is None:
-                return None, LawResult(None, reason(Code.NO_STEADY_STATE))
+                return None, LawResult(None, reason(StatusCode.NO_STEADY_STATE))
             target = self._within_reach(target, estimate.w)
             return target, self._checked(
                 self.law.compute(estimate, target, memory, interval, previous))
         except BaseException as error:
-            return target, LawResult(None, reason(Code.LAW_RAISED, error=contained(error)))
+            return target, LawResult(None, reason(StatusCode.LAW_RAISED, error=contained(error)))
 
     def _checked(self, result: Any) -> LawResult:
         """Return a law's result within the range if its input, or its failure, can be used."""
@@ -135,7 +135,7 @@ class FallbackLevel:
         if u.shape != (self.model.n_u,):
             raise ValueError(f'it returned an input of shape {u.shape}, not ({self.model.n_u},)')
         if not np.isfinite(u).all():
-            return LawResult(None, reason(Code.COMMAND_NOT_FINITE), result.info)
+            return LawResult(None, reason(StatusCode.COMMAND_NOT_FINITE), result.info)
         within = self.limits.within(u)
         return replace(result, u=within, clipped=bool(result.clipped or np.any(within != u)))
 

@@ -14,7 +14,7 @@ from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.steady_state import nearest_steady_state, resting_state
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.model import Coordinates
 
 _HALVINGS = 24  # to 1e-7 of the way
@@ -69,8 +69,8 @@ class Feasibility:
         worst = int(np.argmax(np.abs(shares)))
         signal, value = self.box.names[worst], float(goal[worst])
         if nearest is None:
-            return reason(Code.NO_SETPOINT_HELD, signal=signal, value=value, cause=cause)
-        return reason(Code.SETPOINT_NOT_HELD, signal=signal, value=value, cause=cause,
+            return reason(StatusCode.NO_SETPOINT_HELD, signal=signal, value=value, cause=cause)
+        return reason(StatusCode.SETPOINT_NOT_HELD, signal=signal, value=value, cause=cause,
                       nearest=float(nearest[worst]),
                       held=tuple(zip(self.box.names, nearest.tolist(), strict=True)))
 
@@ -145,24 +145,24 @@ class Feasibility:
     def _cause(self, target: Target | None) -> Reason | None:
         """Return what keeps a target from being held, or None."""
         if target is None:
-            return reason(Code.NO_STEADY_STATE)
+            return reason(StatusCode.NO_STEADY_STATE)
         model = self.level.model
         u, slack = model.inputs.to_physical(target.u), _SLACK * model.inputs.scale
         for i, name in enumerate(model.inputs.names):
             lower, upper = self.level.limits.lower[i], self.level.limits.upper[i]
             if not lower - slack[i] <= u[i] <= upper + slack[i]:
-                return reason(Code.INPUT_NEEDED, signal=name, value=float(u[i]),
+                return reason(StatusCode.INPUT_NEEDED, signal=name, value=float(u[i]),
                               lower=float(lower), upper=float(upper))
         states = model.states
         x, half = states.to_physical(target.x), 0.5 * (states.upper - states.lower)
         reach = (self.margin + _SLACK) * half
         for i, name in enumerate(states.names):
             if not states.lower[i] - reach[i] <= x[i] <= states.upper[i] + reach[i]:
-                return reason(Code.STATE_LEAVES, signal=name, value=float(x[i]),
+                return reason(StatusCode.STATE_LEAVES, signal=name, value=float(x[i]),
                               lower=float(states.lower[i]), upper=float(states.upper[i]))
         if self._too_few_inputs:
             nearest = nearest_steady_state(model, target, self.w)
             if nearest is None or not np.all(
                     np.abs(nearest - target.x) * states.scale <= _NEAR * half):
-                return reason(Code.NO_STEADY_STATE)
+                return reason(StatusCode.NO_STEADY_STATE)
         return None

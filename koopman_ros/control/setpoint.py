@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.model import Coordinates
 
@@ -38,9 +38,9 @@ def refusal(box: Coordinates, value: Array) -> Reason | None:
     """Return why a set-point (n,), in the units of the box, is outside of it, or None."""
     for i, name in enumerate(box.names):
         if not np.isfinite(value[i]):
-            return reason(Code.SETPOINT_NOT_FINITE, signal=name, value=float(value[i]))
+            return reason(StatusCode.SETPOINT_NOT_FINITE, signal=name, value=float(value[i]))
         if not box.lower[i] <= value[i] <= box.upper[i]:
-            return reason(Code.SETPOINT_OUTSIDE, signal=name, value=float(value[i]),
+            return reason(StatusCode.SETPOINT_OUTSIDE, signal=name, value=float(value[i]),
                           lower=float(box.lower[i]), upper=float(box.upper[i]))
     return None
 

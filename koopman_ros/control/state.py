@@ -18,7 +18,7 @@ from koopman_ros.control.laws.base import NO_SOLUTION, Plan, SolutionInfo
 from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor
-from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.status import Reason
 from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
@@ -59,7 +59,7 @@ class State:
     #: next one is looked for; None at first, and where every state has a set-point
     target: Array | None = None
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def restarted(self, time_ns: int | None) -> State:
         """Return the state without what may have made a calculation fail, after a measurement."""
@@ -183,4 +183,4 @@ class StepReport:
     target: TargetReport | None = None  #: where the law goes, or None before the first measurement
     command: CommandReport = NO_COMMAND  #: the command
 
-    __repr__ = brief
+    __repr__ = short_repr

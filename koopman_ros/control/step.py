@@ -34,12 +34,12 @@ from koopman_ros.control.state import (
     TargetReport,
     WITHOUT_LAW,
 )
-from koopman_ros.control.supervisor import HOLD, MANUAL, Requested, SAFE, Supervisor
+from koopman_ros.control.supervisor import HOLD, LevelRequest, MANUAL, SAFE, Supervisor
 from koopman_ros.control.timing import afresh, StepTime, time_of_measurement, time_of_silence
-from koopman_ros.core.arrays import Array, kept
+from koopman_ros.core.arrays import Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import LATE_NANOSECONDS
 from koopman_ros.estimation import Estimate, Verdict
 
@@ -96,7 +96,7 @@ class ControlStep(Configuration):
             calculate, state, MeasurementReport(
                 Arrival.ACCEPTED, np.nan, missed=missed, clock_went_back=back), time, time_ns)
 
-    def hold(self, state: State, time_ns: int, cause: Code | None = Code.NO_MEASUREMENT
+    def hold(self, state: State, time_ns: int, cause: StatusCode | None = StatusCode.NO_MEASUREMENT
              ) -> tuple[State, Array | None, StepReport]:
         """
         Command without a measurement: hold, and later go to the safe input.
@@ -151,7 +151,7 @@ class ControlStep(Configuration):
                 state.estimate.check(self.model.n_x)
             return state, command, report
         except BaseException as error:
-            fault = reason(Code.CALCULATION_FAILED, error=contained(error))
+            fault = reason(StatusCode.CALCULATION_FAILED, error=contained(error))
             return self._command(
                 before.restarted(time_ns), Verdict(before.accepted, fault), measured, time)
 
@@ -179,11 +179,11 @@ class ControlStep(Configuration):
             why = supervisor.reason
             changes |= {'supervisor': supervisor, 'recovery': recovery}
             if state.estimate is not None:
-                changes['estimate'] = self.estimation.rebase(
+                changes['estimate'] = self.estimation.transfer_estimate(
                     state.estimate, self.estimation.level(state.supervisor),
                     self.estimation.level(supervisor))
             if target is not None and not self.best.controls_all:
-                changes['target'] = kept(np.concatenate((
+                changes['target'] = read_only(np.concatenate((
                     self.model.states.to_physical(target.x),
                     self.model.inputs.to_physical(target.u))))
         limited = limit(self.tuning.limits, wanted, state.command, time.counted)
@@ -197,7 +197,7 @@ class ControlStep(Configuration):
                 ) -> tuple[Supervisor, Target | None, LawResult | None]:
         """Find the level that acts; also give target and result of the last law tried, if any."""
         if verdict.fault is not None:
-            requested = Requested(HOLD, verdict.fault, passing=True)
+            requested = LevelRequest(HOLD, verdict.fault, passing=True)
         else:
             requested = state.supervisor.allowed(self.order, outside, self.ranges)
             while (level := self.levels.get(requested.level)) and level.unusable is not None:
@@ -208,7 +208,7 @@ class ControlStep(Configuration):
             level = self.levels.get(supervisor.level or '')
             if level is None or state.estimate is None or state.setpoint.active is None:
                 return supervisor, target, result
-            estimate = self.estimation.rebase(
+            estimate = self.estimation.transfer_estimate(
                 state.estimate, self.estimation.level(state.supervisor), level)
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
@@ -219,14 +219,14 @@ class ControlStep(Configuration):
                 continue
             # a poor law is better than none
             below = self.order.below(level.name)
-            if below not in self.levels or target is None or not level.model.lost_at(
+            if below not in self.levels or target is None or not level.model.failed_near(
                     estimate.x, target.x):
                 return supervisor, target, result
-            requested = Requested(below, reason(Code.LOST_HERE, level=level.name))
+            requested = LevelRequest(below, reason(StatusCode.LOST_HERE, level=level.name))
 
-    def _failed(self, level: FallbackLevel, why: Reason, passing: bool = False) -> Requested:
-        return Requested(self.order.below(level.name), reason(
-            Code.LAW_FAILED, level=level.name, cause=why), passing)
+    def _failed(self, level: FallbackLevel, why: Reason, passing: bool = False) -> LevelRequest:
+        return LevelRequest(self.order.below(level.name), reason(
+            StatusCode.LAW_FAILED, level=level.name, cause=why), passing)
 
     def _recovery(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> SafeStateRecovery | None:

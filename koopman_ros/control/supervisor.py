@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 
 # What follows when no law can act, in this order.
@@ -67,7 +67,7 @@ class FallbackOrder:
 
 
 @dataclass(frozen=True, slots=True)
-class Requested:
+class LevelRequest:
     """The best level that is possible now."""
 
     level: str  #: which
@@ -93,7 +93,7 @@ class Supervisor:
         return self.resumes or self.level
 
     def allowed(self, order: FallbackOrder, outside: float,
-                ranges: tuple[tuple[str, float, float], ...]) -> Requested:
+                ranges: tuple[tuple[str, float, float], ...]) -> LevelRequest:
         """
         Return what the distance from the training data, in half-ranges, allows.
 
@@ -103,11 +103,11 @@ class Supervisor:
             below = order.below(law) if law != order.laws[-1] else SAFE
             entered = order.depth(self.settled) >= order.depth(below)
             if outside > 0.0 and outside > (_HYSTERESIS * margin if entered else margin):
-                return Requested(below, reason(
-                    Code.OUTSIDE_TRAINING, ranges=ranges, margin=margin, level=law))
-        return Requested(order.laws[0])
+                return LevelRequest(below, reason(
+                    StatusCode.OUTSIDE_TRAINING, ranges=ranges, margin=margin, level=law))
+        return LevelRequest(order.laws[0])
 
-    def at(self, order: FallbackOrder, requested: Requested, time_ns: int) -> Supervisor:
+    def at(self, order: FallbackOrder, requested: LevelRequest, time_ns: int) -> Supervisor:
         """
         Fall back immediately; recover when it was possible for long enough.
 
@@ -119,10 +119,10 @@ class Supervisor:
             too_long = (time_ns - bad_since) / NANOSECONDS > order.hold_timeout
             if too_long:
                 assert why is not None
-                why = reason(Code.HELD_TOO_LONG, cause=why, timeout=order.hold_timeout)
+                why = reason(StatusCode.HELD_TOO_LONG, cause=why, timeout=order.hold_timeout)
             # the safe input once commanded stays until there is a law again
             if too_long or (self.level == SAFE and self.bad_since_ns is not None):
-                requested = Requested(SAFE, why)
+                requested = LevelRequest(SAFE, why)
         settled = order.levels[depth(self.settled)]
         if requested.passing and depth(settled) < depth(requested.level):
             return Supervisor(requested.level, why, settled, bad_since)
@@ -135,6 +135,6 @@ class Supervisor:
         if (time_ns - since) / NANOSECONDS >= order.recovery_time:
             return Supervisor(requested.level, why, None, bad_since)
         waiting = self.reason
-        if waiting is not None and waiting.code is not Code.RECOVERING:
-            waiting = reason(Code.RECOVERING, cause=waiting)
+        if waiting is not None and waiting.code is not StatusCode.RECOVERING:
+            waiting = reason(StatusCode.RECOVERING, cause=waiting)
         return Supervisor(settled, waiting, None, self.bad_since_ns, since)

@@ -24,7 +24,7 @@ def along_last(*parts: ArrayLike) -> Array:
     return joined
 
 
-def brief(holder: object) -> str:
+def short_repr(holder: object) -> str:
     """Describe a dataclass on one line: long arrays by their shape, other dataclasses by name."""
     shown = ', '.join(f'{field.name}={_brief(getattr(holder, field.name))}'
                       for field in fields(cast(Any, holder)) if field.repr)
@@ -68,7 +68,7 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     return array
 
 
-def kept(value: ArrayLike) -> Array:
+def read_only(value: ArrayLike) -> Array:
     """Return a read-only copy of numbers."""
     copy = np.array(value, dtype=np.float64)
     copy.setflags(write=False)

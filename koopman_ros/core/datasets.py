@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.units import check_time_unit
 
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
@@ -43,7 +43,7 @@ class PlantDescription:
     #: degree of the polynomial B(x) that is learned where B is None; 0 for a constant one
     input_matrix_degree: int = 0
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_time_unit(self.time_unit)
@@ -105,7 +105,7 @@ class Episode:
     #: (n_u,) whether each is linear between those times; empty where all are held
     linear: tuple[bool, ...] = ()
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for times, values in (('time', 'x'), ('input_time', 'u')):
@@ -237,7 +237,7 @@ class DriftSamples:
     #: roll-out can be judged)
     time: Array | None = None
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         episode = np.ascontiguousarray(self.episode)

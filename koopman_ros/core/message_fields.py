@@ -18,7 +18,7 @@ from koopman_ros.core.units import conversion, display_unit
 
 
 @dataclass(frozen=True)
-class Carrier:
+class FieldDefaults:
     """How messages of a type carry a number where nothing else is said."""
 
     field: str  #: where in the message; '{name}' stands for the name of the signal
@@ -28,17 +28,17 @@ class Carrier:
 
 
 # One row a message type; any other type can be named with the field. Units are those of REP 103.
-CARRIERS = {
-    'sensor_msgs/msg/Temperature': Carrier('temperature', 'degC', -273.15, 1e4),
-    'sensor_msgs/msg/FluidPressure': Carrier('fluid_pressure', 'Pa', -1e12, 1e12),
-    'sensor_msgs/msg/RelativeHumidity': Carrier('relative_humidity', '1', 0.0, 1.0),
-    'sensor_msgs/msg/Illuminance': Carrier('illuminance', 'lx', 0.0),
-    'sensor_msgs/msg/Range': Carrier('range', 'm'),
-    'sensor_msgs/msg/JointState': Carrier('position[{name}]'),
-    'std_msgs/msg/Float64': Carrier('data'),
-    'std_msgs/msg/Float64MultiArray': Carrier('data[0]'),
+KNOWN_TYPES = {
+    'sensor_msgs/msg/Temperature': FieldDefaults('temperature', 'degC', -273.15, 1e4),
+    'sensor_msgs/msg/FluidPressure': FieldDefaults('fluid_pressure', 'Pa', -1e12, 1e12),
+    'sensor_msgs/msg/RelativeHumidity': FieldDefaults('relative_humidity', '1', 0.0, 1.0),
+    'sensor_msgs/msg/Illuminance': FieldDefaults('illuminance', 'lx', 0.0),
+    'sensor_msgs/msg/Range': FieldDefaults('range', 'm'),
+    'sensor_msgs/msg/JointState': FieldDefaults('position[{name}]'),
+    'std_msgs/msg/Float64': FieldDefaults('data'),
+    'std_msgs/msg/Float64MultiArray': FieldDefaults('data[0]'),
 }
-_ANY = Carrier('')
+_ANY = FieldDefaults('')
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 # The type, and for named values the array, by the unit of a signal.
 _TYPES = {'K': ('sensor_msgs/msg/Temperature', ''), 'Pa': ('sensor_msgs/msg/FluidPressure', ''),
@@ -60,7 +60,7 @@ def full_type_name(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Place:
+class MessageField:
     """
     Where a number is on the wire.
 
@@ -79,7 +79,7 @@ class Place:
     @cached_property
     def range(self) -> tuple[float, float]:
         """Lowest and highest number that can be there; ValueError for a unit that is none here."""
-        usual = CARRIERS.get(self.type, _ANY)
+        usual = KNOWN_TYPES.get(self.type, _ANY)
         if self.field != usual.field:
             return -math.inf, math.inf
         here = conversion(usual.unit or self.unit, self.unit)
@@ -182,7 +182,8 @@ def _index_of(message: Any, key: str) -> int:
     return len(names)
 
 
-def place(topic: str, name: str, unit: str, given: Mapping[str, str] | None = None) -> Place:
+def place(topic: str, name: str, unit: str,
+          given: Mapping[str, str] | None = None) -> MessageField:
     """
     Return where a signal is, with what is given of ``topic``, ``type``, ``field`` and ``unit``.
 
@@ -195,15 +196,15 @@ def place(topic: str, name: str, unit: str, given: Mapping[str, str] | None = No
     said = {key: value for key, value in (given or {}).items() if value}
     kind, array = _TYPES.get(unit, (JOINT_STATE, ''))
     kind = full_type_name(said.get('type', kind))
-    carrier = CARRIERS.get(kind, _ANY)
+    carrier = KNOWN_TYPES.get(kind, _ANY)
     field = said.get('field') or (array if kind == JOINT_STATE and array else carrier.field)
     if not field:
         raise ValueError(f'where the number is in a {kind} is not known: name its field, e.g. '
                          'twist.linear.x or data[2]')
-    return Place(said.get('topic', topic), kind, field.replace('{name}', name),
+    return MessageField(said.get('topic', topic), kind, field.replace('{name}', name),
                  said.get('unit') or carrier.unit or display_unit(unit))
 
 
-def stem(name: str, unit: str) -> str:
+def base_name(name: str, unit: str) -> str:
     """Return the name of an input without its quantity: ``coolant`` of ``coolant_temperature``."""
     return name.removesuffix(f'_{_QUANTITIES.get(unit, "")}') or name

@@ -29,7 +29,7 @@ def config_directory() -> Path:
                             'again, or source the workspace it was built in')
 
 
-def predecessor(path: Path) -> Path:
+def backup_path(path: Path) -> Path:
     """Return where the model is kept that a training replaced in a file."""
     return path.with_suffix('.previous.safetensors')
 

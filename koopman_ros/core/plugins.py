@@ -14,7 +14,7 @@ _LONGEST = 200  # characters of an error's text that reach a status
 Base = TypeVar('Base')
 
 
-def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) -> Any:
+def load_plugin(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) -> Any:
     """
     Return a class or function by its name: a known one, or ``module:name`` of any module.
 
@@ -41,14 +41,14 @@ def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) ->
     return found
 
 
-def plug_class(name: str, kind: str, known: Mapping[str, type[Any] | str], base: type[Base]
+def plugin_class(name: str, kind: str, known: Mapping[str, type[Any] | str], base: type[Base]
                ) -> type[Base]:
     """
     Return the class of a plug-in, see :func:`plug`, which fulfils the contract of its base.
 
     :raises ValueError: for one that is no subclass, or lacks a method, naming it.
     """
-    found = plug(name, kind, known)
+    found = load_plugin(name, kind, known)
     if not (isinstance(found, type) and issubclass(found, base)):
         raise ValueError(f'the {kind} {name!r} is no subclass of {base.__module__}.'
                          f'{base.__name__}: derive its class from that')
@@ -67,7 +67,7 @@ def plug_in(name: str, kind: str, known: Mapping[str, type[Any] | str], base: ty
 
     :raises ValueError: as :func:`plug_class`, and where it cannot be constructed.
     """
-    found: Any = plug_class(name, kind, known, base)
+    found: Any = plugin_class(name, kind, known, base)
     try:
         made: Base = found(*arguments, arguments[-1].of_plugin(name, found.Parameters))
         return made

@@ -18,7 +18,7 @@ Value: TypeAlias = (
     '| tuple[tuple[str, float, float], ...]')
 
 
-class Code(Enum):
+class StatusCode(Enum):
     """
     What is the matter: its identifier in records, and the sentence that people read.
 
@@ -30,7 +30,7 @@ class Code(Enum):
 
     template: str
 
-    def __new__(cls, identifier: str, template: str = '') -> Code:
+    def __new__(cls, identifier: str, template: str = '') -> StatusCode:
         """Keep the identifier as the value, by which a code is found."""
         code = object.__new__(cls)
         code._value_ = identifier
@@ -142,14 +142,14 @@ class Code(Enum):
 
 
 #: Why the command is held where nothing is measured.
-UNMEASURED = (Code.NO_MEASUREMENT, Code.STAMPS_STAND, Code.TWO_SOURCES)
+UNMEASURED = (StatusCode.NO_MEASUREMENT, StatusCode.STAMPS_STAND, StatusCode.TWO_SOURCES)
 
 
 @dataclass(frozen=True)
 class Reason:
     """A code with its values."""
 
-    code: Code  #: what is the matter
+    code: StatusCode  #: what is the matter
     #: numbers in the signal's own unit, names, and the reason behind this one as `cause`; `signal`
     #: names the signal whose unit they have
     values: Mapping[str, Value] = field(default_factory=dict)
@@ -161,7 +161,7 @@ class Reason:
         return cause if isinstance(cause, Reason) else None
 
 
-def reason(code: Code, **values: Value) -> Reason:
+def reason(code: StatusCode, **values: Value) -> Reason:
     """Return a reason with its values by name."""
     return Reason(code, values)
 
@@ -176,7 +176,7 @@ def level_words(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Words:
+class StatusFormatter:
     """The renderer of reasons."""
 
     displays: Displays  #: units and digits of the signals
@@ -189,7 +189,7 @@ class Words:
 
 
 class _Formatter(string.Formatter):
-    def __init__(self, words: Words, about: Reason) -> None:
+    def __init__(self, words: StatusFormatter, about: Reason) -> None:
         self._words = words
         self._display = words.displays[str(about.values.get('signal', ''))]
 

@@ -19,13 +19,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.parameters.signal_topics import Wiring
+from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.signals import Heard, Inlet, Outlet
+from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import deferred_interrupt, Harness, HarnessError
 
 _START_TIME = 1.0  # s of plant time at the first measurement
@@ -51,7 +51,7 @@ class Scenario:
     controller: Mapping[str, object] = field(default_factory=dict)
 
     @property
-    def wiring(self) -> Wiring:
+    def wiring(self) -> SignalTopics:
         """Where its signals are on the wire."""
         wiring = preset_wiring(self.system)
         assert wiring is not None
@@ -89,7 +89,8 @@ class Operator:
         self.last_stamp_ns = 0
         self._wiring = wiring = scenario.wiring
         states, inputs = wiring.signals.states, wiring.signals.inputs
-        self._setpoints: Outlet | None = Outlet(wiring.setpoints, states, self._publisher)
+        self._setpoints: SignalPublisher | None = SignalPublisher(wiring.setpoints, states,
+                                                                  self._publisher)
         self._listen(wiring.measured, states, partial(self._on_part, self._measured))
         self._listen(wiring.active_setpoints, states, lambda heard: self._active.update(
             heard.values), topics.LATCHED_QOS)
@@ -99,10 +100,11 @@ class Operator:
     def _publisher(self, topic: str, kind: Any) -> Publisher:
         return self.harness.node.create_publisher(kind, topic, topics.LOOP_QOS)
 
-    def _listen(self, places: Mapping[str, Place], units: Mapping[str, str],
-                hear: Callable[[Heard], None], qos: QoSProfile = topics.LOOP_QOS) -> Inlet:
+    def _listen(self, places: Mapping[str, MessageField], units: Mapping[str, str],
+                hear: Callable[[SignalSample], None],
+                qos: QoSProfile = topics.LOOP_QOS) -> SignalSubscriber:
         node = self.harness.node
-        return Inlet(node, lambda topic, callback, kind: node.create_subscription(
+        return SignalSubscriber(node, lambda topic, callback, kind: node.create_subscription(
             kind, topic, callback, qos), places, units, hear)
 
     @property
@@ -129,7 +131,7 @@ class Operator:
     def request_setpoints(self, setpoints: Mapping[str, float], seconds: float) -> None:
         """Publish set-points, stamped with the plant time in s from which they hold."""
         if self._setpoints is None:
-            self._setpoints = Outlet(
+            self._setpoints = SignalPublisher(
                 self._wiring.setpoints, self._wiring.signals.states, self._publisher)
             self.harness.wait_until(lambda: self.found_loop, 'nobody hears the set-points')
         stamp = FIRST_STAMP_NS + round(seconds * NANOSECONDS)
@@ -188,7 +190,7 @@ class Operator:
         if not model.exists():
             raise HarnessError(status.message)
 
-    def _on_part(self, parts: dict[int, dict[str, float]], heard: Heard) -> None:
+    def _on_part(self, parts: dict[int, dict[str, float]], heard: SignalSample) -> None:
         """Take a message, and show the row that it makes whole."""
         stamp = heard.stamp_ns
         parts.setdefault(stamp, {}).update(heard.values)
@@ -204,7 +206,7 @@ def _check(service: str, response: SetBool.Response | Trigger.Response) -> None:
         raise HarnessError(f'{service}: {response.message}')
 
 
-def foreign(harness: Harness, wiring: Wiring) -> str:
+def foreign(harness: Harness, wiring: SignalTopics) -> str:
     """
     Say which other nodes of the domain are in the way of a loop that has not started, or ''.
 

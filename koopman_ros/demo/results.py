@@ -15,9 +15,9 @@ import matplotlib.figure  # noqa: F401
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import conversion, NANOSECONDS
-from koopman_ros.parameters.signal_topics import Wiring
+from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.records import read_series
 
 if TYPE_CHECKING:
@@ -59,11 +59,11 @@ class DemoRun:
         return float(np.max(np.abs(np.diff(self.commanded[signal][rows]))))
 
 
-def read_run(wiring: Wiring, *bags: Path) -> DemoRun:
+def read_run(wiring: SignalTopics, *bags: Path) -> DemoRun:
     """Read the bags of one run, in their order."""
     stamps: Array = np.empty(0)
 
-    def series(places: Mapping[str, Place], units: Mapping[str, str]) -> dict[str, Array]:
+    def series(places: Mapping[str, MessageField], units: Mapping[str, str]) -> dict[str, Array]:
         """Read signals whose messages have the same stamps."""
         nonlocal stamps
         found = {}

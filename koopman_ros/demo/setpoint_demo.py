@@ -24,12 +24,18 @@ from koopman_ros.core.units import conversion, display_unit, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import run_loop, running_loop, Scenario
 from koopman_ros.demo.results import DemoRun, read_run
-from koopman_ros.evaluation.optimal_cost import cost_along, Course, linear_law, optimum, Task
+from koopman_ros.evaluation.optimal_cost import (
+    cost_along,
+    linear_law,
+    OptimalTrajectory,
+    optimum,
+    Task,
+)
 from koopman_ros.model import load
 from koopman_ros.model.coordinates import Coordinates
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.signal_topics import preset, shipped, Signals
+from koopman_ros.parameters.signal_topics import bundled_plants, plant_defaults, Signals
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.plants import steady_state
@@ -66,8 +72,9 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     """Run the loop of a plant, compare it, and write and return its figures."""
     begin = time.monotonic()
     wiring = preset_wiring(name)
-    if wiring is None or 'duration' not in (own := preset(name, 'demo')):
-        raise ValueError(f'there is no demo of {name!r}: choose one of {", ".join(shipped())}')
+    if wiring is None or 'duration' not in (own := plant_defaults(name, 'demo')):
+        raise ValueError(f'there is no demo of {name!r}: choose one of '
+                         f'{", ".join(bundled_plants())}')
     signals = wiring.signals
     plan = ParameterTable(_Parameters, signals={'states': signals.states}, defaults=own
                           ).snapshot({})
@@ -93,7 +100,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
                    plan.duration) as table:
         run_loop(scenario, bag, logs, table.show)
 
-    model = load(model_path(str(preset(name, 'controller')['model'])))
+    model = load(model_path(str(plant_defaults(name, 'controller')['model'])))
     tuning = table_of(model, {'system': name}).snapshot({}).tuning
     run = read_run(wiring, bag)
     first = round(plan.step_time / plant.sample_period)
@@ -130,8 +137,8 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     return result
 
 
-def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, Course], signals: Signals,
-          scenario: Scenario, box: Coordinates, tuning: Tuning) -> None:
+def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTrajectory],
+          signals: Signals, scenario: Scenario, box: Coordinates, tuning: Tuning) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
     count = len(signals.states) + len(signals.inputs)
     learned: dict[str, Any] = {
@@ -181,7 +188,8 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, Course], s
 def run_with_panel(plant: str, port: int, output: Path, speed: float) -> dict[str, object]:
     """Run the loop of a plant until Ctrl-C, with the panel."""
     if preset_wiring(plant) is None:
-        raise ValueError(f'there is no demo of {plant!r}: choose one of {", ".join(shipped())}')
+        raise ValueError(f'there is no demo of {plant!r}: choose one of '
+                         f'{", ".join(bundled_plants())}')
     logs = output / 'logs'
     logs.mkdir(parents=True, exist_ok=True)
     scenario = Scenario({}, plant, duration=0.0, speed=min(speed or _PANEL_SPEED, _PANEL_SPEED))

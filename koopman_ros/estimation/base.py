@@ -138,7 +138,7 @@ class Estimator(ABC):
         :param u: (n_u,) input that is assumed to hold the plant there, or None.
         """
 
-    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+    def transferred(self, estimate: Estimate, rate: Array) -> Estimate:
         """
         Take over an estimate from another model, so that the plant's estimated rate stays.
 

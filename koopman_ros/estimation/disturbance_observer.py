@@ -91,7 +91,7 @@ class MeasuredState(DisturbanceObserver):
         """Take the measurement as it is."""
         return Estimate(x, np.zeros_like(x))
 
-    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+    def transferred(self, estimate: Estimate, rate: Array) -> Estimate:
         """Keep the state."""
         return Estimate(estimate.x, np.zeros_like(estimate.w))
 

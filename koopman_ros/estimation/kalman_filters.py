@@ -217,7 +217,7 @@ class ExtendedKalmanFilter(Estimator):
         started = self.correct(Estimate(x, w), x, 0.0)
         return replace(started, innovation=None)
 
-    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+    def transferred(self, estimate: Estimate, rate: Array) -> Estimate:
         """Let the disturbance make up for the difference between the two models, where it can."""
         w = self._onto_directions.dot(estimate.w + rate - self.model.drift(estimate.x))
         return replace(estimate, w=self.bounded(w))

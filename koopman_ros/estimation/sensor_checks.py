@@ -12,7 +12,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.tuning import SensorLimits
 
@@ -70,7 +70,8 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     i = int(np.argmax(excess))
     if excess[i] > 1.0:
         return Verdict(replace(last, jumped=True), reason(
-            Code.JUMPED, signal=outputs.names[i], before=float(last.value[i]), value=float(y[i]),
+            StatusCode.JUMPED, signal=outputs.names[i], before=float(last.value[i]),
+            value=float(y[i]),
             seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
     # back after a jump, and further than noise brings it
     moved = last.jumped and bool(np.any(change > limits.jump))
@@ -88,7 +89,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     i = int(np.argmax(stood))
     if stood[i] > limits.stuck_sensor_timeout > 0.0:
         return Verdict(accepted, reason(
-            Code.FROZEN, signal=outputs.names[i], value=float(y[i]),
+            StatusCode.FROZEN, signal=outputs.names[i], value=float(y[i]),
             timeout=limits.stuck_sensor_timeout, change=0.5 * float(limits.jump[i])))
     return Verdict(accepted, moved=moved)
 
@@ -97,7 +98,8 @@ def _out_of_range(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | 
     for name, value, lower, upper in zip(
             outputs.names, y.tolist(), limits.lower.tolist(), limits.upper.tolist(), strict=True):
         if not np.isfinite(value):
-            return reason(Code.NOT_FINITE, signal=name, value=value)
+            return reason(StatusCode.NOT_FINITE, signal=name, value=value)
         if not lower <= value <= upper:
-            return reason(Code.OUTSIDE_SENSOR, signal=name, value=value, lower=lower, upper=upper)
+            return reason(StatusCode.OUTSIDE_SENSOR, signal=name, value=value, lower=lower,
+                          upper=upper)
     return None

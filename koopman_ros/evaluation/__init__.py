@@ -3,8 +3,13 @@
 
 """Evaluation of controllers and models: simulated loops, comparisons, optimal cost; no ROS."""
 
-from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck
-from koopman_ros.evaluation.model_comparison import compare, ModelComparison, Recent, Windows
+from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops
+from koopman_ros.evaluation.model_comparison import (
+    compare,
+    MeasurementBuffer,
+    ModelComparison,
+    PredictionWindows,
+)
 from koopman_ros.evaluation.simulate import (
     at,
     Change,
@@ -15,27 +20,27 @@ from koopman_ros.evaluation.simulate import (
     Plant,
     restart,
     run_closed_loop,
+    ScheduledChange,
     Sensor,
     simulate,
     Simulation,
-    Timed,
 )
 
 __all__ = [
     'Change',
     'ClosedLoop',
-    'LawCheck',
+    'ClosedLoopTest',
     'Loop',
+    'MeasurementBuffer',
     'ModelComparison',
     'Plant',
-    'Recent',
+    'PredictionWindows',
+    'ScheduledChange',
     'Sensor',
     'Simulation',
-    'Timed',
-    'Windows',
     'at',
-    'check_law',
     'compare',
+    'evaluate_closed_loops',
     'exchange',
     'perfect',
     'restart',

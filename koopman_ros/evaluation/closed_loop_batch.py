@@ -42,7 +42,7 @@ _DIFFERENCE = 1e-5  # step of a difference quotient, in scaled deviations
 
 
 @dataclass(frozen=True)
-class Loops:
+class LoopBatch:
     """What all loops have in common."""
 
     plant: DriftPlant
@@ -58,7 +58,7 @@ class Loops:
         return Weights.physical(
             self.plant.model, self.tuning.state_weight, self.tuning.input_weight)
 
-    def within(self, limits: InputLimits) -> Loops:
+    def within(self, limits: InputLimits) -> LoopBatch:
         """Return the loops with other limits of the inputs."""
         return replace(self, tuning=replace(self.tuning, limits=limits))
 
@@ -81,7 +81,7 @@ class Loops:
                     self.samples, self.steps, tell)
 
 
-def judge_loops(given: Loops, cases: tuple[Array, Array, Array], tell: Tell
+def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
                 ) -> tuple[Any, ...] | None:
     """
     Run some of the loops; None where `tell` ended them.

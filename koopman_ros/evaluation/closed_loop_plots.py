@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend
 from koopman_ros.core.units import shown, unit_label
-from koopman_ros.evaluation.closed_loop_test import LawCheck, MOST_COST
+from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, MOST_COST
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ __all__ = ['draw_loops', 'plot_law_check']
 _PANEL = 5.0  # inches
 
 
-def plot_law_check(check: LawCheck, path: Path) -> Path:
+def plot_law_check(check: ClosedLoopTest, path: Path) -> Path:
     """
     Draw the loops of a check as PNG, a panel for each state.
 
@@ -40,7 +40,7 @@ def plot_law_check(check: LawCheck, path: Path) -> Path:
     return path
 
 
-def draw_loops(axes: Axes, check: LawCheck, i: int) -> None:
+def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
     """Draw where each loop began and was to end in state i, and what became of it there."""
     states, failed = check.states, check.failed
     name, unit = states.names[i].replace('_', ' '), states.units[i]

@@ -19,12 +19,12 @@ from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation.closed_loop_batch import (
     DriftPlant,
     judge_loops,
-    Loops,
+    LoopBatch,
     MOST_EXCESS,
     Rate,
 )
 from koopman_ros.execution import Backend, Serial
-from koopman_ros.model import Coordinates, LiftedModel, TriedLoops
+from koopman_ros.model import Coordinates, LiftedModel, VerifiedLoops
 from koopman_ros.model.training_data import MAX_TRIED_LOOPS
 from koopman_ros.tuning import InputLimits, Tuning
 
@@ -59,7 +59,7 @@ _RESOLUTION = 1e-9  # what is left of a step, in scaled deviations
 
 
 @dataclass(frozen=True, eq=False)
-class LawCheck:
+class ClosedLoopTest:
     """N closed loops under a model's law from states to set-points within its training box."""
 
     states: Coordinates  #: names and units
@@ -95,14 +95,14 @@ class LawCheck:
         return np.isinf(self.ratios)
 
     @property
-    def tried(self) -> TriedLoops | None:
+    def tried(self) -> VerifiedLoops | None:
         """The loops as a model keeps them, so that another law acts in the lost ones; or None."""
         lost = self.lost[:MAX_TRIED_LOOPS]
         if not lost.any():
             return None
         starts, setpoints = (self.states.to_deviation(x[:MAX_TRIED_LOOPS])
                              for x in (self.starts, self.setpoints))
-        return TriedLoops(starts, setpoints, lost)
+        return VerifiedLoops(starts, setpoints, lost)
 
     @property
     def loops(self) -> int:
@@ -175,11 +175,11 @@ class LawCheck:
         return f'<LawCheck: {self}>'
 
 
-def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
+def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
               law: type[Law] = StateDependentRiccati,
               limits: InputLimits | None = None, interval: float = 0.0, loops: int = LOOPS,
               watch: Callable[[float], bool] = lambda _: False,
-              backend: Backend | None = None) -> LawCheck | None:
+              backend: Backend | None = None) -> ClosedLoopTest | None:
     """
     Let a model's law control a drift that the model was not learned from, all over its box.
 
@@ -219,7 +219,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     samples = math.ceil(_DURATION / (slowest * interval))
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
-    given = Loops(plant, replace(tuning, limits=limits), law, interval, samples,
+    given = LoopBatch(plant, replace(tuning, limits=limits), law, interval, samples,
                   math.ceil(_STEPS * interval * fastest))
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
@@ -244,7 +244,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     # a law that does not arrive counts where another one does
     counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
     x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
-    return LawCheck(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
+    return ClosedLoopTest(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
                     int(np.sum(hopeless)))
 
 

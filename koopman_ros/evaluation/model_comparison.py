@@ -31,7 +31,7 @@ _GAP = 3.0  # so many usual steps without a row end a window
 _SHARE_OF_MOTION, _SHARE_OF_BOX = 0.1, 5e-4
 
 
-class Recent:
+class MeasurementBuffer:
     """
     The last measurements of all states and the inputs that acted between them.
 
@@ -72,7 +72,7 @@ class Recent:
         self._rows.append((event.stamp_ns, event.measured, np.asarray(mean)))
         self._row_ns, self._impulse = event.stamp_ns, 0.0
 
-    def windows(self, seconds: float) -> Windows | None:
+    def windows(self, seconds: float) -> PredictionWindows | None:
         """Cut what is younger into windows, or return None where it is too little for one."""
         oldest = self._time_ns - round(seconds * NANOSECONDS)
         # where measurements are that rare, they are all there is
@@ -89,11 +89,11 @@ class Recent:
         # the last one ends with the last row
         places = np.arange(len(steps) - K, -1, -max(1, K // 2))[:, None] + np.arange(K)
         places = places[(steps[places] <= _GAP * usual).all(axis=1)]
-        return Windows(x, u, steps, places) if len(places) else None
+        return PredictionWindows(x, u, steps, places) if len(places) else None
 
 
 @dataclass(frozen=True)
-class Windows:
+class PredictionWindows:
     """N measurements in M windows of K steps each."""
 
     x: Array  #: (N, n_y) measured, in units
@@ -159,7 +159,7 @@ class Windows:
         return every
 
 
-def _predicted(controller: Controller, windows: Windows) -> Array:
+def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
     """
     Return the mean squared errors (., n_y) of predicting windows from what is known before them.
 
@@ -228,7 +228,7 @@ class ModelComparison:
 
 
 def compare(present: Controller, candidate: Controller,
-            windows: Windows) -> ModelComparison | None:
+            windows: PredictionWindows) -> ModelComparison | None:
     """
     Let the models of two controllers predict; None where the present one never can.
 

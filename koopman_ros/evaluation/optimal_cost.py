@@ -34,7 +34,7 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class OptimalTrajectory:
     """What a plant did in a task."""
 
     states: Array  #: (samples + 1, n_x)
@@ -52,7 +52,7 @@ def cost_along(task: Task, states: Array, inputs: Array) -> float:
     return float(np.sum(_after_a_period(task, y, inputs)[:, -1]))
 
 
-def linear_law(task: Task) -> Course:
+def linear_law(task: Task) -> OptimalTrajectory:
     """
     Apply the linear-quadratic law of the plant linearised at its nominal point.
 
@@ -72,7 +72,7 @@ def linear_law(task: Task) -> Course:
     return _constant_law(task, system.nominal_input + u, K, system.nominal_state + x)
 
 
-def optimum(task: Task) -> Course:
+def optimum(task: Task) -> OptimalTrajectory:
     """
     Find the inputs of least cost by the iterated linear-quadratic regulator (Gauss-Newton).
 
@@ -104,12 +104,12 @@ def optimum(task: Task) -> Course:
                      f'would fall by {gain:.3g}: shorten the horizon or the period')
 
 
-def _constant_law(task: Task, u: Array, K: Array, x: Array) -> Course:
+def _constant_law(task: Task, u: Array, K: Array, x: Array) -> OptimalTrajectory:
     return _roll_out(task, np.tile(u, (task.samples, 1)), np.tile(K, (task.samples, 1, 1)),
                      np.tile(x, (task.samples, 1)))
 
 
-def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> Course:
+def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> OptimalTrajectory:
     """Apply inputs[k] - K[k] (x - about[k]): (N, n_u), (N, n_u, n_x) and (N or more, n_x)."""
     states, applied = np.empty((len(inputs) + 1, task.system.n_x)), np.empty_like(inputs)
     y = np.append(task.x0, 0.0)
@@ -119,7 +119,7 @@ def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> Course:
             applied[k] = u - K[k].dot(states[k] - about[k])
             y = _after_a_period(task, y, applied[k])
     states[-1] = y[:-1]
-    return Course(states, applied, float(y[-1]) if np.all(np.isfinite(y)) else math.inf)
+    return OptimalTrajectory(states, applied, float(y[-1]) if np.all(np.isfinite(y)) else math.inf)
 
 
 def _after_a_period(task: Task, y: Array, u: Array) -> Array:
@@ -138,7 +138,7 @@ def _after_a_period(task: Task, y: Array, u: Array) -> Array:
     return y
 
 
-def _improvement(task: Task, course: Course) -> tuple[Array, Array, float]:
+def _improvement(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, float]:
     """Return a change of the inputs, its gains (N, n_u, n_x), and how far the cost would fall."""
     n = task.system.n_x
     F, g, H = _expansion(task, course)
@@ -155,7 +155,7 @@ def _improvement(task: Task, course: Course) -> tuple[Array, Array, float]:
     return change, gains, gain
 
 
-def _expansion(task: Task, course: Course) -> tuple[Array, Array, Array]:
+def _expansion(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, Array]:
     """
     Expand all samples at once by state and input at their beginning, p = n_x + n_u in number.
 

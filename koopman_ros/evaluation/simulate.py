@@ -16,9 +16,9 @@ from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.state import State, StepReport
 from koopman_ros.control.steady_state import nearest_steady_state, partial_target
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.signals import per_signal
-from koopman_ros.core.status import Code, reason, Words
+from koopman_ros.core.status import reason, StatusCode, StatusFormatter
 from koopman_ros.core.units import Displays, NANOSECONDS
 from koopman_ros.model import LiftedModel
 
@@ -56,29 +56,29 @@ class Loop:
     state: State  #: what it remembers
     plant: Plant  #: under it
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 Change: TypeAlias = Callable[[Loop], Loop]
 
 
 @dataclass(frozen=True)
-class Timed:
+class ScheduledChange:
     """What happens at a time."""
 
     seconds: float  #: from the start of the simulation
     what: Event | Change  #: an event of the controller, or a function of the loop
 
 
-def at(seconds: float, what: Event | Change) -> Timed:
+def at(seconds: float, what: Event | Change) -> ScheduledChange:
     """Say what happens at a time in s, before the measurement of that time."""
-    return Timed(seconds, what)
+    return ScheduledChange(seconds, what)
 
 
 def exchange(controller: Controller) -> Change:
     """Let another controller take over, with another tuning or model."""
     return lambda loop: replace(
-        loop, controller=controller, state=controller.hand_over(loop.controller, loop.state))
+        loop, controller=controller, state=controller.switch_to(loop.controller, loop.state))
 
 
 def restart(loop: Loop) -> Loop:
@@ -110,7 +110,7 @@ class Simulation:
     failure: str  #: why the plant could not go on to the end; empty when it could
     loop: Loop  #: after the last sample, to go on from
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def levels(self) -> tuple[str, ...]:
@@ -118,7 +118,7 @@ class Simulation:
         return tuple(report.level for report in self.reports)
 
 
-def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (), *,
+def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledChange] = (), *,
              duration: float, period: float = 1.0, C: Array | None = None,
              noise: Array | None = None, seed: int = 0, sensor: Sensor = perfect,
              input_sensor: Sensor | None = None, state: State | None = None,
@@ -207,7 +207,7 @@ def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, StepReport 
         model = loop.controller.model
         units = dict(zip((*model.states.names, *model.inputs.names),
                          (*model.states.units, *model.inputs.units), strict=True))
-        raise ValueError(Words(Displays(units))(outcome.refused))
+        raise ValueError(StatusFormatter(Displays(units))(outcome.refused))
     plant = loop.plant
     if outcome.command is not None:
         plant = plant.commanded(outcome.command, plant.time_ns)
@@ -228,7 +228,7 @@ class ClosedLoop:
     cost: float  #: integral of e' Q e + v' R v; infinite when the loop failed
     failure: str = ''  #: why it ended early, empty when it did not
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def distance(self, model: LiftedModel) -> float:
         """Return how far the path leaves the training box, in halves of its width."""
@@ -315,7 +315,8 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
         xi = model.states.to_deviation(x)
         found = law(model, xi, target, weights)
         if not found.solved:
-            raise _Failed(Words(Displays({}))(reason(Code(found.riccati.status.value))))
+            words = StatusFormatter(Displays({}))
+            raise _Failed(words(reason(StatusCode(found.riccati.status.value))))
         return xi, found.u
 
     def flow(_: float, y: Array) -> Array:

@@ -148,16 +148,16 @@ class _ReplayRun:
         if self._other is not None:
             same = self._other.digest == record.fields['model']['digest']
             self._other_controller = self._tuned(controller.model if same else self._other.model)
-            self._other_state = self._other_controller.hand_over(controller, self._state)
+            self._other_state = self._other_controller.switch_to(controller, self._state)
 
     def _exchange(self, record: records.EventRecord, state: State) -> None:
         """Put other parameters or another model in force."""
         before = self._controller
-        self._state = self._put_in_force(record, before.model).hand_over(before, state)
+        self._state = self._put_in_force(record, before.model).switch_to(before, state)
         if self._other is not None and 'parameters' in record.fields:
             before = self._other_controller
             self._other_controller = self._tuned(before.model)
-            self._other_state = self._other_controller.hand_over(before, self._other_state)
+            self._other_state = self._other_controller.switch_to(before, self._other_state)
 
     def _put_in_force(self, record: records.EventRecord, model: LiftedModel | None) -> Controller:
         self._parameters |= record.fields.get('parameters', {})

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from koopman_ros import __version__
 from koopman_ros.control import events, Mode, State
 from koopman_ros.core.plugins import loaded_class
-from koopman_ros.core.status import Code, Reason
+from koopman_ros.core.status import Reason, StatusCode
 
 VERSION = 1
 
@@ -125,7 +125,7 @@ def state_of(record: EventRecord) -> State:
 
 def _written(value: Any) -> Any:
     """Return an array, an enum, a number or None as it stands in the fields of an event."""
-    if isinstance(value, Code):
+    if isinstance(value, StatusCode):
         return value.value
     if isinstance(value, Enum):
         return value.name.lower()
@@ -137,7 +137,7 @@ def _read(name: str, value: Any) -> Any:
     if name == 'mode':
         return Mode[value.upper()]
     if name == 'cause':
-        return None if value is None else Code(value)
+        return None if value is None else StatusCode(value)
     if name == 'signals':
         return None if value is None else tuple(map(str, value))
     return value if value is None or isinstance(value, (int, float)) else float_array(value)

@@ -31,7 +31,7 @@ class SchedulerLost(RuntimeError):  # noqa: N818
     """The Dask scheduler does not answer."""
 
 
-def never(_: str, __: Any) -> bool:
+def never_stop(_: str, __: Any) -> bool:
     """Watch without requesting an end."""
     return False
 
@@ -41,7 +41,7 @@ class Backend(ABC):
 
     @abstractmethod
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
+            watch: Watch = never_stop, apart: bool = False) -> Generator[tuple[str, Found]]:
         """
         Yield the name and the result of each task, in the order of the items.
 
@@ -72,7 +72,7 @@ class Serial(Backend):
     """Run one task after the other in this process."""
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
+            watch: Watch = never_stop, apart: bool = False) -> Generator[tuple[str, Found]]:
         """Run tasks, see :meth:`Backend.run`."""
         ended = False
 

@@ -30,7 +30,7 @@ from koopman_ros.execution.backends import (
     Backend,
     Found,
     Item,
-    never,
+    never_stop,
     SchedulerLost,
     Task,
     Watch,
@@ -60,7 +60,7 @@ class _Pool(Backend):
     """Tasks on workers, whose executor and messages the subclasses provide."""
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
+            watch: Watch = never_stop, apart: bool = False) -> Generator[tuple[str, Found]]:
         """Run tasks, see :meth:`Backend.run`."""
         names, ready, following = list(items), dict[int, Any](), 0
         with contextlib.closing(self._completed(

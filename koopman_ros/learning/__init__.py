@@ -7,52 +7,52 @@ From records of a plant to an accepted model; in torch, never in a node.
 Nodes start ``python -m koopman_ros.learning``.
 """
 
-from koopman_ros.learning.acceptance import decide, Decision, Thresholds
+from koopman_ros.learning.acceptance import AcceptanceResult, evaluate_model, Thresholds
 from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
 from koopman_ros.learning.fleet import retrain_fleet, TrainingOutcome
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.edmd import Edmd, Linearisation
-from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.incremental import IncrementalTraining
 from koopman_ros.learning.lift.metrics import (
     evaluate,
-    Figures,
     Fit,
     fit,
+    LiftMetrics,
     roll_out,
     rollout_rmse,
 )
 from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
-from koopman_ros.learning.lift.training import NoUsefulLift, train, Trained
+from koopman_ros.learning.lift.training import train, Trained, TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison, compare, Judge, ModelCandidate
 from koopman_ros.learning.pipeline import retrain, Retrained
 from koopman_ros.learning.report import write_report
 from koopman_ros.learning.task import TrainingTask
 
 __all__ = [
+    'AcceptanceResult',
     'Algorithm1',
     'ClassComparison',
-    'Decision',
     'Edmd',
-    'Figures',
     'Fit',
-    'Growth',
+    'IncrementalTraining',
     'Judge',
+    'LiftMetrics',
     'Linearisation',
     'ModelCandidate',
     'MultistartProgress',
     'NeuralDrift',
-    'NoUsefulLift',
     'Retrained',
     'Thresholds',
     'Trained',
+    'TrainingFailed',
     'TrainingOutcome',
     'TrainingTask',
     'compare',
     'compare_classes',
-    'decide',
     'drift_samples',
     'evaluate',
+    'evaluate_model',
     'fit',
     'learn_lift',
     'retrain',

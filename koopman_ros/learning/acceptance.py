@@ -9,9 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros.control.usable import unusable
-from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.units import Display, display_unit, SECONDS_PER_TIME_UNIT
-from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
+from koopman_ros.evaluation.closed_loop_test import (
+    ClosedLoopTest,
+    evaluate_closed_loops,
+    LOOPS,
+    Rate,
+)
 from koopman_ros.execution import Backend
 from koopman_ros.learning.identification import (
     Drift,
@@ -21,7 +26,7 @@ from koopman_ros.learning.identification import (
     Stopped,
 )
 from koopman_ros.learning.identification.drift import prediction_error, Segments
-from koopman_ros.learning.lift.metrics import Figures, lifted_rate
+from koopman_ros.learning.lift.metrics import lifted_rate, LiftMetrics
 from koopman_ros.learning.lift.training import Trained
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.model import Coordinates, LiftedModel
@@ -72,12 +77,12 @@ class HeldOut:
         return self.rmse(lifted_rate(model, self._seconds))
 
     def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
-                  backend: Backend | None = None) -> LawCheck:
+                  backend: Backend | None = None) -> ClosedLoopTest:
         """Close a model's loop on the estimated drift; Stopped where `watch` ended it."""
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
-        found = check_law(model, self._found.drift.rate, loops=loops, watch=watch,
+        found = evaluate_closed_loops(model, self._found.drift.rate, loops=loops, watch=watch,
                           interval=period * self._seconds, backend=backend)
         if found is None:
             raise Stopped
@@ -91,8 +96,8 @@ class HeldOut:
         return (f'its error on held-out records, {_text(rmse, model)}, is not '
                 f'{100.0 * margin:.0f} % below that of {name}, {_text(other, model)}')
 
-    def reasons(self, model: LiftedModel, rmse: Array, figures: Figures, law_check: LawCheck,
-                linear: bool) -> tuple[str, ...]:
+    def reasons(self, model: LiftedModel, rmse: Array, figures: LiftMetrics,
+                law_check: ClosedLoopTest, linear: bool) -> tuple[str, ...]:
         """
         Say why a model must not be used whatever the present one is.
 
@@ -111,7 +116,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Decision:
+class AcceptanceResult:
     """Acceptance or refusal of a lift, with its figures on held-out segments."""
 
     reasons: tuple[str, ...]  #: why it is refused; empty when it is accepted
@@ -121,9 +126,9 @@ class Decision:
     current_rmse: Array | None  #: (n_x,) the same of the present lift, None without one
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
-    law_check: LawCheck  #: closed loops on the estimated drift
+    law_check: ClosedLoopTest  #: closed loops on the estimated drift
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def accepted(self) -> bool:
@@ -131,9 +136,10 @@ class Decision:
         return not self.reasons
 
 
-def decide(found: Identified, learned: Trained | ClassComparison, current: LiftedModel | None,
+def evaluate_model(found: Identified, learned: Trained | ClassComparison,
+                   current: LiftedModel | None,
            thresholds: Thresholds, *, loops: int = LOOPS,
-           watch: Callable[[float], bool] = lambda _: False) -> Decision:
+           watch: Callable[[float], bool] = lambda _: False) -> AcceptanceResult:
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
@@ -156,7 +162,8 @@ def decide(found: Identified, learned: Trained | ClassComparison, current: Lifte
         reasons = (*filter(None, [beside]), *reasons)
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
-    return Decision(reasons, warnings, rmse, drift_rmse, current_rmse, held_out.linear_rmse,
+    return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
+                            held_out.linear_rmse,
                     found.noise, law_check)
 
 

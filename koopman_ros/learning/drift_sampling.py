@@ -16,7 +16,7 @@ from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance import HeldOut, Thresholds
 from koopman_ros.learning.identification import Drift, fitted_starts, Identified, longest_step
 from koopman_ros.learning.identification.drift import Segments, steady_point
-from koopman_ros.learning.lift.incremental import Growth
+from koopman_ros.learning.lift.incremental import IncrementalTraining
 from koopman_ros.learning.lift.metrics import ROUNDING
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.learning.lift.training import train, Trained
@@ -108,7 +108,7 @@ def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: in
     :raises ValueError: when the episodes hold no steady state.
     """
     known, samples = _estimated(found, plant)
-    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch,
+    return train(known, samples, IncrementalTraining(n_z), seed=seed, starts=starts, watch=watch,
                  loops=0)
 
 
@@ -172,7 +172,8 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     # the mean square of so many white errors strays by this share
     chance = float(np.mean(noise ** 2)) * np.sqrt(2.0 / held_out.count)
     alone = model_class != BEST
-    return compare(known, samples, {**usual_recipes(len(noise)), IDENTITY_LIFT: Growth(n_z)},
+    return compare(known, samples,
+                   {**usual_recipes(len(noise)), IDENTITY_LIFT: IncrementalTraining(n_z)},
                    choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
                    watch=watch, judge=Judge(judged, max(chance, ROUNDING)), device=device,
                    backend=backend, begin=begin)

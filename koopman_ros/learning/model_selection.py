@@ -15,19 +15,19 @@ import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.core.plots import table
-from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS
+from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.learning.lift.edmd import Edmd
-from koopman_ros.learning.lift.incremental import Growth
-from koopman_ros.learning.lift.metrics import evaluate, Figures, fit, ROUNDING
+from koopman_ros.learning.lift.incremental import IncrementalTraining
+from koopman_ros.learning.lift.metrics import evaluate, fit, LiftMetrics, ROUNDING
 from koopman_ros.learning.lift.multistart import MultistartProgress, Recipe, Watch
 from koopman_ros.learning.lift.neural_drift import NeuralDrift, with_readout, with_units_of
 from koopman_ros.learning.lift.training import (
-    NoUsefulLift,
     reference_drift,
     train,
     training_states,
+    TrainingFailed,
 )
 from koopman_ros.model import Box, LiftedModel, model_file
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
@@ -44,8 +44,8 @@ class ModelCandidate:
     name: str  #: of the class
     model: LiftedModel | None  #: the best of the class, None when training refused all
     rx: float  #: relative mean-square error of its drift on the validation episodes; else infinite
-    figures: Figures | None  #: its figures on the test episodes, which chose nothing
-    law_check: LawCheck | None  #: its law in closed loops, where there are any
+    figures: LiftMetrics | None  #: its figures on the test episodes, which chose nothing
+    law_check: ClosedLoopTest | None  #: its law in closed loops, where there are any
     seconds: float  #: that it took to learn
     refusal: str = ''  #: why it should not be used; empty when it may be
     #: mean-square error of its predictions of a record beyond the noise, relative to the states'
@@ -84,7 +84,7 @@ class ClassComparison:
         return self.chosen.model
 
     @property
-    def figures(self) -> Figures:
+    def figures(self) -> LiftMetrics:
         """The figures of that model."""
         assert self.chosen.figures is not None
         return self.chosen.figures
@@ -124,8 +124,9 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
     units = 8 if n_x == 1 else 16
     return {
         NEURAL_DRIFT: NeuralDrift(units),
-        IDENTITY_LIFT: Growth(n_x + 3, hidden_first=units, max_iterations=300),
-        FREE_LIFT: Growth(n_x, identity=False, hidden_first=units, max_iterations=300)}
+        IDENTITY_LIFT: IncrementalTraining(n_x + 3, hidden_first=units, max_iterations=300),
+        FREE_LIFT: IncrementalTraining(n_x, identity=False, hidden_first=units,
+                                       max_iterations=300)}
 
 
 def compare(plant: PlantDescription, samples: DriftSamples,
@@ -215,7 +216,7 @@ def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING)
     if not able:
         tried = [one for one in contenders if one.model is not None]
         if not tried:
-            raise NoUsefulLift('no class has a model: ' + '; '.join(
+            raise TrainingFailed('no class has a model: ' + '; '.join(
                 f'{one.name}: {one.refusal}' for one in contenders))
         return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
     limit = _FACTOR * max(min(one.error for one in able), resolution)
@@ -225,7 +226,7 @@ def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING)
 def _of_kind(recipes: Mapping[str, Recipe], name: str, lift: LiftedModel) -> bool:
     """Return whether a class is that of a lift, as far as its coordinates tell."""
     recipe = recipes.get(name)
-    return isinstance(recipe, Growth) and recipe.identity == lift.identity
+    return isinstance(recipe, IncrementalTraining) and recipe.identity == lift.identity
 
 
 def _rounds(recipe: Recipe, n_x: int) -> int:
@@ -281,7 +282,7 @@ class _Learner:
                 refusal = str(error)
         best = plainest(tried).model if tried else None
         if best is None:
-            raise NoUsefulLift(refusal)
+            raise TrainingFailed(refusal)
         return best
 
     def with_units_of(self, drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
@@ -311,7 +312,7 @@ class _Learner:
             model = one.model
             if not loops or model is None or not model.n_u:
                 return one
-            law_check = check_law(model, reference_drift(
+            law_check = evaluate_closed_loops(model, reference_drift(
                 self._plant, self._box, self._parts, model), loops=loops, backend=backend)
             refused = law_check is not None and not law_check.accepted
             return replace(one, law_check=law_check,

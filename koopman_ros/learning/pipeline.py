@@ -14,12 +14,17 @@ import shutil
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.paths import predecessor
+from koopman_ros.core.paths import backup_path
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
-from koopman_ros.learning.acceptance import decide, Decision, Thresholds, uncovered_setpoints
+from koopman_ros.learning.acceptance import (
+    AcceptanceResult,
+    evaluate_model,
+    Thresholds,
+    uncovered_setpoints,
+)
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import compare_classes
 from koopman_ros.learning.identification import (
@@ -34,14 +39,14 @@ from koopman_ros.learning.identification import (
 )
 from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.scaling import checked_device
-from koopman_ros.learning.lift.training import NoUsefulLift
+from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
 from koopman_ros.learning.record import read_record, RecordSource, Reduction
-from koopman_ros.learning.task import FIRST, known, TrainingTask
+from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plants import plant_class
-from koopman_ros.records import Account
+from koopman_ros.records import ImportReport
 from koopman_ros.records.limits import bounded_reading
 
 # A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
@@ -61,11 +66,11 @@ class Retrained:
     """Result of a retraining."""
 
     task: TrainingTask  #: the task
-    account: Account  #: counts of used and dropped measurements
+    account: ImportReport  #: counts of used and dropped measurements
     found: Identified  #: the estimated drift
     #: the classes that were learned, None when there is no model worth judging
     learned: ClassComparison | None
-    decision: Decision | None  #: its figures, None without a lift
+    decision: AcceptanceResult | None  #: its figures, None without a lift
     reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
     #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
     coverage: Mapping[tuple[str, str], float]
@@ -74,7 +79,7 @@ class Retrained:
     model_file: str = ''  #: where the lift was written, or an empty string
     reduction: Reduction | None = None  #: the part of a long record that is used
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def accepted(self) -> bool:
@@ -192,7 +197,7 @@ def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = l
     thresholds = _checked(task)
     current, sibling = (load(path) if path else None
                         for path in (task.model, task.warm_start_model))
-    plant, states, inputs = known(task, current)
+    plant, states, inputs = resolve_signals(task, current)
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
@@ -276,7 +281,7 @@ def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
 
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
            on_progress: OnProgress, backend: Backend
-           ) -> tuple[ClassComparison | None, Decision | None, tuple[str, ...]]:
+           ) -> tuple[ClassComparison | None, AcceptanceResult | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
     task, found = bare.task, bare.found
     reasons: tuple[str, ...] = ()
@@ -284,17 +289,17 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
     for begin in (None,) if sibling is None else (sibling, None):
         course = _Course(on_progress)
         learned: ClassComparison | None = None
-        decision: Decision | None = None
+        decision: AcceptanceResult | None = None
         try:
             learned = compare_classes(
                 found, bare.plant, thresholds, model_class=task.model_class,
                 n_z=task.coordinates, seed=task.seed, starts=task.starts, watch=course.learning,
                 judging=course.judging, device=task.device, backend=backend, begin=begin)
-        except NoUsefulLift as error:
+        except TrainingFailed as error:
             reasons = (str(error),)
         _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
         if learned is not None:
-            decision = decide(found, learned, bare.present, thresholds)
+            decision = evaluate_model(found, learned, bare.present, thresholds)
             decision = replace(decision, warnings=(*decision.warnings, *warnings))
             reasons = decision.reasons
         if not reasons:
@@ -348,8 +353,8 @@ class _Course:
         return False
 
 
-def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, covered: float,
-                     episodes: list[Episode], model_class: str) -> LiftedModel:
+def _with_provenance(model: LiftedModel, found: Identified, decision: AcceptanceResult,
+                     covered: float, episodes: list[Episode], model_class: str) -> LiftedModel:
     sha = hashlib.sha256()
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
@@ -373,7 +378,7 @@ def _place(output: Path, accepted: bool) -> Path:
     if not accepted:
         return output.with_suffix('.refused.safetensors')
     if output.exists():
-        previous = predecessor(output)
+        previous = backup_path(output)
         previous.unlink(missing_ok=True)
         # a second name, so that there is a model under the first one at every moment
         try:

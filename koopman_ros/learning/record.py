@@ -17,7 +17,7 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
 from koopman_ros.records import (
-    Account,
+    ImportReport,
     loop_episodes,
     RecordedInput,
     RecordedState,
@@ -47,7 +47,7 @@ class RecordSource:
 
     def size(self) -> int:
         """Return about how many samples there are, as the bags count their messages."""
-        contents = [summary(bag).counts for bag in distinct(self.bags, Account())]
+        contents = [summary(bag).counts for bag in distinct(self.bags, ImportReport())]
         return min(sum(counts.get(state.place.topic, 0) for counts in contents)
                    for state in self.states)
 
@@ -76,7 +76,7 @@ class TrainingRecord:
     """Episodes to learn from and to judge by."""
 
     episodes: list[Episode]
-    account: Account
+    account: ImportReport
     reduction: Reduction | None = None  #: None where they are all that there are
 
 
@@ -98,7 +98,7 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
         return TrainingRecord(*loop_episodes(source.bags, source.states, source.inputs,
                                      tolerance_ns=source.tolerance_ns,
                                      least_jumps=source.least_jumps))
-    account = Account()
+    account = ImportReport()
     bags = {str(bag): (number, str(bag))
             for number, bag in enumerate(distinct(source.bags, account))}
     n_x, n_u = len(source.states), len(source.inputs)
@@ -148,7 +148,8 @@ def _told(function: Callable[[_Numbered, Tick], Any], bag: _Numbered, tell: Tell
     return function(bag, tick)
 
 
-def _streamed(source: RecordSource, bag: str, account: Account, tick: Tick) -> Iterable[Episode]:
+def _streamed(source: RecordSource, bag: str, account: ImportReport,
+              tick: Tick) -> Iterable[Episode]:
     for episode in stream_episodes([bag], source.states, source.inputs, account,
                                    tolerance_ns=source.tolerance_ns,
                                    least_jumps=source.least_jumps):
@@ -157,9 +158,10 @@ def _streamed(source: RecordSource, bag: str, account: Account, tick: Tick) -> I
 
 
 def _surveyed(source: RecordSource, numbered: _Numbered, tick: Tick) -> tuple[RecordStatistics,
-                                                                              Account]:
+                                                                              ImportReport]:
     """Look through one bag."""
-    account, survey = Account(), RecordStatistics.empty(len(source.states), len(source.inputs))
+    account, survey = ImportReport(), RecordStatistics.empty(len(source.states),
+                                                             len(source.inputs))
     for episode in _streamed(source, numbered[1], account, tick):
         survey.add(episode)
     return survey, account
@@ -171,6 +173,6 @@ def _selected(source: RecordSource, start: Selection, seed: int, numbered: _Numb
     number, bag = numbered
     rng = np.random.default_rng([seed, number])
     selection = start.empty()
-    for episode in _streamed(source, bag, Account(), tick):
+    for episode in _streamed(source, bag, ImportReport(), tick):
         selection.offer(number, episode, rng)
     return selection

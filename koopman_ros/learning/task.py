@@ -15,7 +15,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import PlantDescription
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import IDENTITY_LIFT
@@ -82,17 +82,17 @@ class TrainingTask:
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrainingTask:
         """Return the task of its fields as JSON has them; as :meth:`from_json`."""
-        states = tuple(RecordedState(**{**signal, 'place': Place(**signal['place'])})
+        states = tuple(RecordedState(**{**signal, 'place': MessageField(**signal['place'])})
                        for signal in values['states'])
         inputs = tuple(RecordedInput(**{
-            **signal, 'command': Place(**signal['command']),
-            'measured': Place(**signal['measured']) if signal.get('measured') else None})
+            **signal, 'command': MessageField(**signal['command']),
+            'measured': MessageField(**signal['measured']) if signal.get('measured') else None})
             for signal in values['inputs'])
         return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
                       'inputs': inputs, 'methods': tuple(values.get('methods', cls.methods))})
 
 
-def known(task: TrainingTask, current: LiftedModel | None
+def resolve_signals(task: TrainingTask, current: LiftedModel | None
           ) -> tuple[PlantDescription, Sequence[RecordedState], Sequence[RecordedInput]]:
     """
     Return the plant as far as the task describes it, and its signals in order.

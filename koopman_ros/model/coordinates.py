@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 
 
@@ -34,7 +34,7 @@ class Coordinates:
     lower: Array  #: (n,) lower corner of the training box, in units
     upper: Array  #: (n,) upper corner of the training box, in units
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -129,7 +129,7 @@ class Box:
     inputs: Coordinates  #: the inputs' likewise
     time_unit: str  #: ``'s'`` or ``'min'``
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @staticmethod
     def of(plant: PlantDescription, x: Array, u: Array, *, nominal: bool = True) -> Box:

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.model.observables import PolynomialObservables
 
 
@@ -28,7 +28,7 @@ class InputTerms:
 
     coefficients: Array  #: (n_phi, n_x, n_u) in scaled coordinates, 1/time unit
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         C = frozen(self.coefficients, 'input terms', (None, None, None))

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import check_time_unit, SECONDS_PER_TIME_UNIT
 from koopman_ros.model.coordinates import Coordinates
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.observables import NetworkObservables, Observables
-from koopman_ros.model.training_data import TrainingStates, TriedLoops
+from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.model_classes import (
     FREE_LIFT,
     IDENTITY_LIFT,
@@ -101,9 +101,9 @@ class LiftedModel:
     #: (n_u, n_x) gain K of the pre-feedback that A holds under, in scaled coordinates, or None
     pre_feedback: Array | None = None
     #: closed loops of the model's law; None where they are not known, or none failed
-    tried_loops: TriedLoops | None = None
+    tried_loops: VerifiedLoops | None = None
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         n_x, n_u, n_z = self.n_x, self.n_u, self.observables.n_z
@@ -264,13 +264,13 @@ class LiftedModel:
         return replace(self, observables=NetworkObservables.linear(self.n_x), A=slope,
                        readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
 
-    def lost_at(self, x: Array, x_ref: Array) -> bool:
+    def failed_near(self, x: Array, x_ref: Array) -> bool:
         """
         Tell whether the law failed in the tested loop nearest to a state and a set-point.
 
         Both (n_x,) in scaled deviations; see :attr:`tried_loops`.
         """
-        return self.tried_loops is not None and self.tried_loops.lost_at(
+        return self.tried_loops is not None and self.tried_loops.failed_near(
             x, x_ref, self.states.half_widths)
 
     def distance(self, x: Array) -> float:

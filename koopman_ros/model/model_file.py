@@ -22,7 +22,7 @@ from koopman_ros.model.coordinates import Coordinates
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.lifted_model import LiftedModel, Provenance
 from koopman_ros.model.observables import NetworkObservables, PolynomialObservables
-from koopman_ros.model.training_data import TrainingStates, TriedLoops
+from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.model_classes import CLASSES
 
 FORMAT_VERSION = 1
@@ -229,8 +229,8 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
             NetworkObservables(tensors.pop('W'), tensors.pop('b'), tensors.pop('V'),
                                identity=_of_type(bool, about, 'identity')))
     terms, known = tensors.pop('input_terms', None), tensors.pop('training_states', None)
-    tried = None if 'tried_loops.starts' not in tensors else TriedLoops(
-        *(tensors.pop(f'tried_loops.{one.name}') for one in fields(TriedLoops)))
+    tried = None if 'tried_loops.starts' not in tensors else VerifiedLoops(
+        *(tensors.pop(f'tried_loops.{one.name}') for one in fields(VerifiedLoops)))
     origin = dict(about['provenance'])
     origin['metrics'] = {name: float(value) for name, value in origin['metrics'].items()}
     origin['reasons'] = tuple(_of_type(list, origin, 'reasons'))

@@ -12,7 +12,7 @@ from typing import final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 
 
 class Observables(ABC):
@@ -83,7 +83,7 @@ class NetworkObservables(Observables):
     V: Array  #: (n_z - n_x, h) output weights with `identity`, else (n_z, h)
     identity: bool  #: whether z starts with the state
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         W = frozen(self.W, 'W', (None, None))
@@ -178,7 +178,7 @@ class PolynomialObservables(Observables):
     exponents: NDArray[np.int64]  #: (n_z, n_x); row i is the monomial prod_j x_j^exponents[i, j]
     identity: bool = field(default=True, init=False)
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         given = np.asarray(self.exponents)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 
 MAX_TRAINING_STATES = 256
 MAX_TRIED_LOOPS = 1024
@@ -32,7 +32,7 @@ class TrainingStates:
     #: training box
     fill_distance: float
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         shape = np.shape(self.states)
@@ -78,7 +78,7 @@ class TrainingStates:
 
 
 @dataclass(frozen=True)
-class TriedLoops:
+class VerifiedLoops:
     """
     The closed loops that a model's law was tested in, and which of them failed.
 
@@ -90,7 +90,7 @@ class TriedLoops:
     #: (N,) whether the law did not arrive, or had no gain, where a linear law arrived
     lost: NDArray[np.bool_]
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         shape = np.shape(self.starts)
@@ -110,7 +110,7 @@ class TriedLoops:
         """Number of states."""
         return self.starts.shape[1]
 
-    def lost_at(self, x: Array, x_ref: Array, half_widths: Array) -> bool:
+    def failed_near(self, x: Array, x_ref: Array, half_widths: Array) -> bool:
         """
         Tell whether the loop nearest to a state and a set-point, (n_x,) each and scaled, failed.
 

@@ -18,11 +18,11 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.control import events, MANUAL, Mode, StepReport
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import stem
+from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.evaluation import Recent
+from koopman_ros.evaluation import MeasurementBuffer
 from koopman_ros.event_log import records
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.model_checks import (
@@ -32,17 +32,16 @@ from koopman_ros.parameters.model_checks import (
     rests_outside,
 )
 from koopman_ros.parameters.signal_topics import (
-    preset,
-    shipped,
+    bundled_plants,
+    plant_defaults,
     signals_of,
+    SignalTopics,
     system_of,
-    Wiring,
     words_of,
 )
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import controller_status as status
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.control_loop import Commanded, ControlLoop
 from koopman_ros.ros.controller_messages import RecordPublisher, ReportPublisher
 from koopman_ros.ros.diagnostics import TaskReport
@@ -53,7 +52,8 @@ from koopman_ros.ros.measurements import Measurements, Sample
 from koopman_ros.ros.model_reload import ModelReload
 from koopman_ros.ros.operator_requests import OperatorRequests
 from koopman_ros.ros.process import events_executor, run
-from koopman_ros.ros.signals import Outlet
+from koopman_ros.ros.signals import SignalPublisher
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.ros.timing import Timing
 from koopman_ros.ros.watchdog import PERIOD, Watchdog
 
@@ -74,11 +74,11 @@ class ControllerNode(ManagedNode):
         self._watchdog: Watchdog | None = None
         given = self.given()
         system = system_of(given)
-        model = str(given.get('model') or preset(system, 'controller').get('model', ''))
+        model = str(given.get('model') or plant_defaults(system, 'controller').get('model', ''))
         if not model:
             raise ConfigurationError(
                 f'there is no model of the system {system!r}: name one in model, or in system one '
-                f'of {", ".join(shipped())}')
+                f'of {", ".join(bundled_plants())}')
         loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
@@ -102,7 +102,7 @@ class ControllerNode(ManagedNode):
             self, loaded, signals, self._model_situation,
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
-        self._timing, self._recent = Timing(self), Recent()
+        self._timing, self._recent = Timing(self), MeasurementBuffer()
         self._loop = ControlLoop(
             built(parameters, loaded.model), self._timing, parameters.measurement_timeout,
             lambda command, stamp_ns: self._commands.send(
@@ -117,7 +117,7 @@ class ControllerNode(ManagedNode):
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
         self._counts = status.Counts()
         self._measured = np.full(len(signals.states), np.nan)
-        self._connect(Wiring(signals, parameters.states, parameters.inputs))
+        self._connect(SignalTopics(signals, parameters.states, parameters.inputs))
         self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
         self._diagnostics = self.diagnostics.add_group(self._statuses, status.TASKS)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
@@ -128,12 +128,12 @@ class ControllerNode(ManagedNode):
         self._watchdog = Watchdog(self._on_busy)
         self._watchdog.start()
 
-    def _connect(self, wiring: Wiring) -> None:
+    def _connect(self, wiring: SignalTopics) -> None:
         """Make publishers, subscriptions, services and the timer of the watch."""
         single = self._single(wiring)
-        self._matching = matching = topics.Matching(
+        self._matching = matching = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), single)
-        self._commands = Outlet(wiring.commands, self._signals.inputs, matching.publish)
+        self._commands = SignalPublisher(wiring.commands, self._signals.inputs, matching.publish)
         self._reports = ReportPublisher(matching, wiring)
         self._measurements = Measurements(
             self, matching, wiring, single, self._settings.synchronisation_tolerance,
@@ -174,11 +174,11 @@ class ControllerNode(ManagedNode):
             self._watchdog.end()
             self._models.end()
 
-    def _single(self, wiring: Wiring) -> dict[str, str]:
+    def _single(self, wiring: SignalTopics) -> dict[str, str]:
         """Return what is done on topics on which only one node may publish."""
         own = self._signals.defaults().values()
         return {place.topic: f'{verb} the {what}' for verb, places in (
-            ('command', {stem(name, self._signals.inputs[name]): place
+            ('command', {base_name(name, self._signals.inputs[name]): place
                          for name, place in wiring.commands.items()}),
             ('publish', wiring.measured)) for what, place in places.items()
             # a message of named values may be one of several that make up a sample, but not on
@@ -227,7 +227,7 @@ class ControllerNode(ManagedNode):
         if commanded is not None:
             self._tell(commanded)
         if self._loop.state.command is None or not self.active or all(
-                map(topics.heard, self._commands.publishers)):
+                map(topics.has_subscribers, self._commands.publishers)):
             self._received = time.monotonic()
         if self._untold:
             self._say(self._report, time.monotonic())
@@ -289,7 +289,7 @@ class ControllerNode(ManagedNode):
             self._counts, self._timing, self._measurements.assembler, self._measured,
             complaint=self._matching.complaint or self._measurements.complaint,
             unheard=[publisher.topic_name for publisher in self._commands.publishers
-                     if not topics.heard(publisher)],
+                     if not topics.has_subscribers(publisher)],
             unheard_for=time.monotonic() - self._received,
             setpoint_received=self._requests.setpoint_received,
             request=self._requests.complaint,

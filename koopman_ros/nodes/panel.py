@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.status import Code, reason
+from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.core.units import conversion, Display, display_unit, NANOSECONDS, printed
 from koopman_ros.event_log import records
 from koopman_ros.model import load
@@ -46,18 +46,18 @@ from koopman_ros.panel.trend_backfill import backfill, read_past
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.panel import panel_signals, panel_table
-from koopman_ros.parameters.signal_topics import Wiring, words_of
+from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
-from koopman_ros.ros.remote import RemoteNode
-from koopman_ros.ros.repeated import RepeatedValues
-from koopman_ros.ros.signals import Heard, Inlet
+from koopman_ros.ros.remote_node import RemoteNode
+from koopman_ros.ros.repeated_values import RepeatedValues
+from koopman_ros.ros.signals import SignalSample, SignalSubscriber
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 
 # The panel never slows a publisher.
 _WATCHING = topics.profile(100, reliable=False)
@@ -87,7 +87,7 @@ class PanelNode(LoopNode):
         present = load(model_path(str(name))) if (name := given.get('model')) else None
         self.settings = settings = self.declare_table(panel_table(present, given))
         self._signals = signals = panel_signals(present, given)
-        self._wiring = wiring = Wiring(signals, settings.states, settings.inputs)
+        self._wiring = wiring = SignalTopics(signals, settings.states, settings.inputs)
         read = settings.read(signals)
         nodes = {PLANT: PLANT, CONTROLLER: settings.controller, TRAINER: settings.trainer}
         self.view = LoopViewModel(signals, read, settings.span, time.time(), {
@@ -126,11 +126,12 @@ class PanelNode(LoopNode):
         self.get_logger().info(f'the panel is at {self._server.address}')
 
     def _subscribe(self) -> None:
-        matching = self._matching = topics.Matching(self, lambda: None)
+        matching = self._matching = topics.EndpointMonitor(self, lambda: None)
         for kind, qos in (('measured', _WATCHING), ('predicted', _WATCHING),
                           ('applied', _WATCHING), ('commands', _WATCHING),
                           ('active_setpoints', topics.LATCHED_QOS)):
-            Inlet(self, lambda topic, hear, of, qos=qos: matching.subscribe(topic, hear, of, qos),
+            SignalSubscriber(self, lambda topic, hear, of,
+                             qos=qos: matching.subscribe(topic, hear, of, qos),
                   getattr(self._wiring, kind), self._signals.units, partial(self._on_signal, kind))
         matching.subscribe(topics.CONTROLLER_INTERNALS, self._on_internals, qos=_WATCHING)
         matching.subscribe(topics.PREDICTED_TRAJECTORY, self._on_plan, qos=_WATCHING)
@@ -198,7 +199,7 @@ class PanelNode(LoopNode):
 
     # Messages.
 
-    def _on_signal(self, kind: str, heard: Heard) -> None:
+    def _on_signal(self, kind: str, heard: SignalSample) -> None:
         self.view.take_signals(kind, heard.values, heard.stamp_ns / NANOSECONDS, time.time())
 
     def _on_internals(self, message: JointState) -> None:
@@ -361,12 +362,12 @@ class PanelNode(LoopNode):
 
     def _refusal(self, codes: Sequence[str], name: str, value: float) -> str:
         """Write the reason of a refused set-point; '' if more is known to the controller alone."""
-        if codes[:1] != (Code.SETPOINT_OUTSIDE.value,) or name not in self._training_ranges:
+        if codes[:1] != (StatusCode.SETPOINT_OUTSIDE.value,) or name not in self._training_ranges:
             return ''
         low, high = self._training_ranges[name]
         if low <= value <= high:
-            return self._words(reason(Code.SETPOINT_OUTSIDE, signal=name, value=value, lower=low,
-                                      upper=high))
+            return self._words(reason(StatusCode.SETPOINT_OUTSIDE, signal=name, value=value,
+                                      lower=low, upper=high))
         read = self.view.read[name]
         to_read = conversion(self._signals.states[name], read)
         return f'outside {to_read(low):.6g} to {to_read(high):.6g} {read}, the trained range'

@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from koopman_ros import plants
-from koopman_ros.core.message_fields import stem
+from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import (
     display_unit,
     LAST_STAMP_SECONDS,
@@ -24,16 +24,16 @@ from koopman_ros.core.units import (
     shown,
 )
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
-from koopman_ros.parameters.signal_topics import PLANT_KINDS, SIGNALS, Wiring
+from koopman_ros.parameters.signal_topics import PLANT_KINDS, SIGNALS, SignalTopics
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import events_executor, run
-from koopman_ros.ros.signals import Heard, Inlet, Outlet
+from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
 from koopman_ros.ros.simulated_plant import SimulatedPlant
+from koopman_ros.ros.time_conversion import stamp_message
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
@@ -81,20 +81,20 @@ class PlantNode(ManagedNode):
         self._commanded = dict.fromkeys(signals.inputs, self._wall_start)
 
         self._heard: dict[str, float] = {}  # of the commands for the last measurement
-        wiring = Wiring(signals, parameters.states, parameters.inputs, PLANT_KINDS)
+        wiring = SignalTopics(signals, parameters.states, parameters.inputs, PLANT_KINDS)
         # the subscriptions first: a controller that hears the measurement has then seen them, too
-        self._matching = matching = topics.Matching(
+        self._matching = matching = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), {
-                place.topic: f'command the {stem(name, signals.inputs[name])}'
+                place.topic: f'command the {base_name(name, signals.inputs[name])}'
                 for name, place in wiring.commands.items()} | {
                 place.topic: f'publish the {name}' for name, place in wiring.measured.items()})
-        self._command_inlet = Inlet(
+        self._command_inlet = SignalSubscriber(
             self, matching.subscribe, wiring.commands, signals.inputs, self._on_command)
         self._clock_publisher = matching.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
             parameters.publish_clock and not self._real_time) else None
         # the states last: who has found them has found the inputs, too
-        self._applied = Outlet(wiring.applied, signals.inputs, self._latched)
-        self._states = Outlet(wiring.measured, signals.states, matching.publish)
+        self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
+        self._states = SignalPublisher(wiring.measured, signals.states, matching.publish)
         counted = {wiring.measured[name].topic
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
         self._counted = [publisher for publisher in self._states.publishers
@@ -214,7 +214,7 @@ class PlantNode(ManagedNode):
     def _publish(self, sample: int) -> None:
         """Publish the plant as it stands, the states, which are answered, last."""
         stamp, frame_id = stamp_message(self._plant.time_ns), self._settings.frame_id
-        if self._clock_publisher is not None and topics.heard(self._clock_publisher):
+        if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
         self._applied.send(self._plant.inputs, stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
@@ -231,7 +231,7 @@ class PlantNode(ManagedNode):
             return False
         return True
 
-    def _on_command(self, heard: Heard) -> None:
+    def _on_command(self, heard: SignalSample) -> None:
         if not self.active:
             return
         lockstep = self._settings.lockstep
@@ -256,7 +256,7 @@ class PlantNode(ManagedNode):
             self._rejected += 1
             unit = self._signals.inputs[wrong[0]]
             self._rejection = (
-                f'{stem(wrong[0], unit)} command {shown(self._heard[wrong[0]], unit)} '
+                f'{base_name(wrong[0], unit)} command {shown(self._heard[wrong[0]], unit)} '
                 f'{display_unit(unit)} is not finite and was rejected: the last good one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
@@ -329,7 +329,7 @@ class PlantNode(ManagedNode):
         return TaskReport(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
             **self._plant.figures(),
-            **{f'{stem(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
+            **{f'{base_name(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
                for (name, unit), value in zip(self._signals.inputs.items(),
                                               self._plant.commanded.tolist(), strict=True)},
             'measurements': self._sample,

@@ -19,10 +19,10 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import player_table
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
+from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _POLL_PERIOD_NS = 10_000_000  # for what no message announces
 _PROGRESS_PERIOD = 3.0  # s

@@ -6,7 +6,7 @@
 import sys
 
 from koopman_ros.execution.training import JobState
-from koopman_ros.parameters.signal_topics import SIGNALS, Wiring
+from koopman_ros.parameters.signal_topics import SIGNALS, SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import (
     trainer_signals,
@@ -49,7 +49,7 @@ class TrainerNode(ManagedNode):
             name: getattr(settings, name) for name in SIGNALS})
         self.diagnostics.hardware_id = settings.system if present is None else (
             present.provenance.plant or settings.system)
-        wiring = Wiring(signals, settings.states, settings.inputs)
+        wiring = SignalTopics(signals, settings.states, settings.inputs)
         for kind in wiring.kinds:
             # what is in none of its messages is refused now, and not when a bag holds nothing
             list(by_topic(getattr(wiring, kind)))

@@ -14,9 +14,9 @@ from typing import Any
 
 from koopman_ros.panel.alarms import (
     Alarm,
+    AlarmLogEntry,
     Alarms,
     AlarmState,
-    Entry,
     MAX_TEXT,
     MAX_WHO,
     Priority,
@@ -115,7 +115,7 @@ def _unused(path: Path) -> Path:
     return found
 
 
-def _parsed(text: str) -> tuple[list[Alarm], list[Entry]]:
+def _parsed(text: str) -> tuple[list[Alarm], list[AlarmLogEntry]]:
     found = json.loads(text)
     if found.get('version') != VERSION:
         raise ValueError(f'its version is {found.get("version")!r}, must be {VERSION}')
@@ -131,10 +131,10 @@ def _alarm(key: str, text: str, priority: str, state: str, since: float,
                  sanitize_text(acknowledged_by, MAX_WHO))
 
 
-def _entry(time: float, key: str, priority: str, text: str, what: str, who: str) -> Entry:
+def _entry(time: float, key: str, priority: str, text: str, what: str, who: str) -> AlarmLogEntry:
     if what not in _EVENTS:
         raise ValueError(f'{what!r} must be one of {", ".join(_EVENTS)}')
-    return Entry(_finite(time), sanitize_text(key, MAX_TEXT), Priority[priority],
+    return AlarmLogEntry(_finite(time), sanitize_text(key, MAX_TEXT), Priority[priority],
                  sanitize_text(text, MAX_TEXT), what, sanitize_text(who, MAX_WHO))
 
 

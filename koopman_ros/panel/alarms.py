@@ -55,7 +55,7 @@ class Alarm:
 
 
 @dataclass(frozen=True)
-class Entry:
+class AlarmLogEntry:
     """Entry of the journal."""
 
     time: float  #: wall time
@@ -134,7 +134,7 @@ class Alarms:
         self._records: dict[str, _Record] = {}
         # keys whose delay or shelving runs
         self._running: set[str] = set()
-        self._journal: deque[Entry] = deque(maxlen=kept)
+        self._journal: deque[AlarmLogEntry] = deque(maxlen=kept)
         self._last = -math.inf
         self._lock = threading.Lock()
         self.noted = 0  #: number of all entries of the journal so far
@@ -229,7 +229,8 @@ class Alarms:
             return tuple(record.alarm() for record in self._records.values() if (
                 record.state is not AlarmState.NORMAL or record.shelved_until is not None))
 
-    def restore(self, alarms: Iterable[Alarm], journal: Iterable[Entry], now: float) -> None:
+    def restore(self, alarms: Iterable[Alarm], journal: Iterable[AlarmLogEntry],
+                now: float) -> None:
         """
         Replace all alarms by those of before a restart.
 
@@ -254,7 +255,7 @@ class Alarms:
                 self._tidy(record)
             self._advance(now)
 
-    def journal(self, since: float) -> tuple[Entry, ...]:
+    def journal(self, since: float) -> tuple[AlarmLogEntry, ...]:
         """Return the entries since a time, the newest first."""
         with self._lock:
             return tuple(entry for entry in reversed(self._journal) if entry.time >= since)
@@ -328,5 +329,5 @@ class Alarms:
 
     def _note(self, time: float, record: _Record, what: str, who: str = '') -> None:
         self.noted += 1
-        self._journal.append(Entry(time, record.key, record.priority, record.text, what,
+        self._journal.append(AlarmLogEntry(time, record.key, record.priority, record.text, what,
                                    sanitize_text(who, MAX_WHO)))

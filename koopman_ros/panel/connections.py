@@ -77,7 +77,7 @@ class Listener(socket.socket):
         return True
 
 
-class Seldom(logging.Filter):
+class RateLimiter(logging.Filter):
     """
     Passes a number of records of a logger in a period, and drops the rest.
 

@@ -24,7 +24,7 @@ from koopman_ros.panel.training_report import (
     report_base,
     report_time,
 )
-from koopman_ros.parameters.signal_topics import EVENT_LOG, Wiring
+from koopman_ros.parameters.signal_topics import EVENT_LOG, SignalTopics
 
 LAST = 3600.0  # s of the end of a bag that are compared
 _PERIOD = 1.0  # s between two looks at the files of a report
@@ -40,7 +40,7 @@ class LearningWatch:
     :param resolve: full name of a topic.
     """
 
-    def __init__(self, system: str, wiring: Wiring, namespace: str,
+    def __init__(self, system: str, wiring: SignalTopics, namespace: str,
                  resolve: Callable[[str], str]) -> None:
         self.learning = Learning()
         self._system, self._wiring = system, wiring

@@ -35,7 +35,7 @@ type="password" autocomplete="current-password" required><button>Log in</button>
 </body></html>"""
 
 
-class Doorkeeper:
+class AccessControl:
     """
     Visitors of the panel by the session of their requests.
 
@@ -69,7 +69,7 @@ class Doorkeeper:
                        lambda: self.session(scope, use=False) is not None, self.users is not None)
 
 
-def add_login(app: FastAPI, source: Source, keeper: Doorkeeper) -> None:
+def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
     """Serve the pages by which users log in and out."""
     def form(message: str = '', status: int = 200) -> HTMLResponse:
         shown = f'<p role="alert">{escape(message)}</p>' if message else ''

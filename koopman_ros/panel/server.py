@@ -24,9 +24,9 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from koopman_ros.panel.access import Users
 from koopman_ros.panel.alarm_page import alarm_page
-from koopman_ros.panel.connections import BACKLOG, Listener, Seldom
+from koopman_ros.panel.connections import BACKLOG, Listener, RateLimiter
 from koopman_ros.panel.layout import PageLayout, Source
-from koopman_ros.panel.login import add_login, Doorkeeper
+from koopman_ros.panel.login import AccessControl, add_login
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.origins import is_loopback, refusal
 from koopman_ros.panel.overview import overview
@@ -52,10 +52,10 @@ _PAGES: dict[str, Callable[[PageLayout], None]] = {
     '/tuning': tuning_page}
 
 
-class _Gate:
+class _AuthMiddleware:
     """Middleware that refuses requests of other origins, and those of nobody who is logged in."""
 
-    def __init__(self, app: Any, keeper: Doorkeeper, listener: Listener) -> None:
+    def __init__(self, app: Any, keeper: AccessControl, listener: Listener) -> None:
         self._app, self._keeper, self._listener = app, keeper, listener
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
@@ -143,8 +143,8 @@ class PanelServer:
         shown = f'[{host}]' if ':' in host else host
         port = self._socket.getsockname()[1]
         self.address = f'{"https" if certificate else "http"}://{shown}:{port}'
-        keeper = Doorkeeper(found)
-        seldom = Seldom()
+        keeper = AccessControl(found)
+        seldom = RateLimiter()
         for name in _LOGS:
             logging.getLogger(name).addFilter(seldom)
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
@@ -154,7 +154,7 @@ class PanelServer:
             _add_page(path, fill, source, keeper)
         ui.run_with(app, title='panel', favicon='⚙', binding_refresh_interval=None,
                     show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
-        app.add_middleware(_Gate, keeper=keeper, listener=self._socket)
+        app.add_middleware(_AuthMiddleware, keeper=keeper, listener=self._socket)
         _guard_sockets(keeper)
         # browsers send the cookies of a host to all its ports, and a proxy may serve several hosts
         machine = zlib.crc32(socket.gethostname().encode())
@@ -241,7 +241,7 @@ def _bound(host: str, port: int) -> Listener:
     return own
 
 
-def _add_page(path: str, fill: Callable[[PageLayout], None], source: Source, keeper: Doorkeeper
+def _add_page(path: str, fill: Callable[[PageLayout], None], source: Source, keeper: AccessControl
               ) -> None:
     @ui.page(path)
     def build(request: Request) -> None:
@@ -258,7 +258,7 @@ def _add_pictures(app: FastAPI, source: Source) -> None:
         return Response(found, 200 if found else 404, {'cache-control': 'no-store'}, 'image/png')
 
 
-def _guard_sockets(keeper: Doorkeeper) -> None:
+def _guard_sockets(keeper: AccessControl) -> None:
     """Let a socket act on pages of its own session: NiceGUI checks the id of a page alone."""
     sockets = core.sio
 

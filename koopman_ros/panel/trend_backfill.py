@@ -8,12 +8,12 @@ import math
 import time
 from typing import Any
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import conversion, NANOSECONDS
 from koopman_ros.event_log.records import parse, RecordError
 from koopman_ros.panel.faceplates import pen
 from koopman_ros.panel.view_model import LoopViewModel
-from koopman_ros.parameters.signal_topics import EVENT_LOG, Wiring
+from koopman_ros.parameters.signal_topics import EVENT_LOG, SignalTopics
 from koopman_ros.records import BagReadError, read_messages
 from koopman_ros.records.series import stamped_number
 
@@ -23,7 +23,7 @@ _BATCH = 200  # messages between two pauses for other threads
 _PAUSE = 0.001  # s
 
 
-def read_past(path: str, wiring: Wiring, read: Mapping[str, str],
+def read_past(path: str, wiring: SignalTopics, read: Mapping[str, str],
               resolve: Callable[[str], str], span: float,
               ended: Callable[[], bool] = lambda: False) -> LoopViewModel:
     """
@@ -38,7 +38,7 @@ def read_past(path: str, wiring: Wiring, read: Mapping[str, str],
     :raises BagReadError: for a file that is no bag.
     """
     signals = wiring.signals
-    places: dict[str, list[tuple[str, str, Place, Any]]] = {}
+    places: dict[str, list[tuple[str, str, MessageField, Any]]] = {}
     for kind in _KINDS:
         for name, place in getattr(wiring, kind).items():
             places.setdefault(resolve(place.topic), []).append(

@@ -19,7 +19,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, pen, Range, StateFaceplate
 from koopman_ros.panel.layout import box, label, PageLayout
 from koopman_ros.panel.snapshot import Snapshot
-from koopman_ros.panel.trends import Mark
+from koopman_ros.panel.trends import TrendMark
 
 #: length and period of the updates in s
 SPANS = {'10 min': (600.0, 1.0), '1 h': (3600.0, 2.0), '8 h': (28800.0, 5.0)}
@@ -78,7 +78,7 @@ class TrendChart:
         self._page = page
         self._charts = _charts(page.source.snapshot)
         self._span, self._whole, self._due, self._zoomed = '10 min', False, 0.0, _ALL
-        self.marks: Sequence[Mark] = ()  #: events in the time shown
+        self.marks: Sequence[TrendMark] = ()  #: events in the time shown
         # a time that is not known yet may be either
         simulated = page.source.snapshot.time < _EPOCH
         self._chart = ui.echart(_options(self._charts, height, zoom, simulated)).props(
@@ -211,7 +211,7 @@ def _ends(spans: Sequence[Range]) -> dict[str, float]:
             'max': round(max(high for _, high in spans), 6)}
 
 
-def _lines(own: _Pen, face: Faceplate, marks: Sequence[Mark]) -> dict[str, Any]:
+def _lines(own: _Pen, face: Faceplate, marks: Sequence[TrendMark]) -> dict[str, Any]:
     """Return the limits of a signal as horizontal lines, and events as vertical ones."""
     ranges = {'trained': face.training, 'limit': face.limits} if (
         own.kind in ('measured', 'commands')) else {}

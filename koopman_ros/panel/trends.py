@@ -25,7 +25,7 @@ _Places = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True)
-class Mark:
+class TrendMark:
     """An event in the trends."""
 
     time: float
@@ -105,7 +105,7 @@ class Trends:
     def __init__(self, span: float = 8 * 3600.0, points: int = 600_000) -> None:
         self._span, self._points = span, points
         self._pens: dict[str, _RecordedPen] = {}
-        self._marks: dict[str, list[Mark]] = {}
+        self._marks: dict[str, list[TrendMark]] = {}
         self._lock = threading.Lock()
 
     def add(self, pen: str, time: float, value: float) -> None:
@@ -127,7 +127,7 @@ class Trends:
         """Add an event; too many of a kind drop its oldest."""
         with self._lock:
             marks = self._marks.setdefault(kind, [])
-            insort(marks, Mark(time, kind, sanitize_text(text, MAX_TEXT)), key=_time)
+            insort(marks, TrendMark(time, kind, sanitize_text(text, MAX_TEXT)), key=_time)
             if len(marks) > MAX_MARKS:
                 del marks[0]
 
@@ -159,7 +159,7 @@ class Trends:
                 found[name] = pen.times[chosen], pen.values[chosen]
         return found
 
-    def marks(self, begin: float, end: float) -> tuple[Mark, ...]:
+    def marks(self, begin: float, end: float) -> tuple[TrendMark, ...]:
         """Return the events from one time to another, in order."""
         with self._lock:
             found = [mark for marks in self._marks.values() for mark in
@@ -178,7 +178,7 @@ class Trends:
         return self._pens.setdefault(name, _RecordedPen(self._span, self._points))
 
 
-def _time(mark: Mark) -> float:
+def _time(mark: TrendMark) -> float:
     return mark.time
 
 

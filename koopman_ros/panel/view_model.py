@@ -12,7 +12,7 @@ import re
 from types import MappingProxyType
 from typing import Any
 
-from koopman_ros.core.paths import predecessor
+from koopman_ros.core.paths import backup_path
 from koopman_ros.core.status import level_words
 from koopman_ros.core.units import conversion, display_unit, printed
 from koopman_ros.panel.conditions import Conditions
@@ -191,7 +191,7 @@ class LoopViewModel:
                 self._digest = str(fields['model']['digest'])
                 if self._digest != before and name.endswith('.safetensors'):
                     # the file was read again, after another training has replaced it
-                    self._previous_model = str(predecessor(Path(name)))
+                    self._previous_model = str(backup_path(Path(name)))
             case 'parameters':
                 self._mark('model' if 'model' in fields else 'parameter',
                            ', '.join(map(str, fields['parameters'])))

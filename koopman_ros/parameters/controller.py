@@ -21,7 +21,7 @@ from koopman_ros.core.declaration import (
     parameter,
     per_signal,
 )
-from koopman_ros.core.plugins import plug_class, short_name
+from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.estimation import Estimator, ESTIMATORS
@@ -30,12 +30,12 @@ from koopman_ros.parameters.signal_topics import (
     DEFAULT_SYSTEM,
     InputPlaces,
     named_units,
-    preset,
+    plant_defaults,
     Signals,
     signals_of,
+    SignalTopics,
     StatePlaces,
     system_of,
-    Wiring,
 )
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.tuning import Tuning
@@ -104,14 +104,14 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
                 f'linear_model_margin = {tuning.linear_model_margin}: change the other one first')
     try:
         for law in tuning.fallback_order:
-            plug_class(law, 'law', LAWS, Law)
+            plugin_class(law, 'law', LAWS, Law)
     except ValueError as error:
         return f'fallback_order = {list(tuning.fallback_order)}: {error}'
     try:
-        plug_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
+        plugin_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
     except ValueError as error:
         return f'estimator = {tuning.estimator!r}: {error}'
-    return Wiring(signals, values.states, values.inputs).check()
+    return SignalTopics(signals, values.states, values.inputs).check()
 
 
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
@@ -120,10 +120,10 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     # what is no plug-in, the check of the parameters refuses
     for name in dict.fromkeys((*LAWS, *given.get('fallback_order', ()))):
         with contextlib.suppress(ValueError):
-            found[short_name(name)] = plug_class(name, 'law', LAWS, Law).Parameters
+            found[short_name(name)] = plugin_class(name, 'law', LAWS, Law).Parameters
     for name in dict.fromkeys((*ESTIMATORS, *filter(None, (given.get('estimator'),)))):
         with contextlib.suppress(ValueError):
-            found[short_name(name)] = plug_class(
+            found[short_name(name)] = plugin_class(
                 name, 'estimator', ESTIMATORS, Estimator).Parameters
     return found
 
@@ -156,7 +156,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     :raises ConfigurationError: for signals, given or of a preset, that the model has not.
     """
     system = system_of(given)
-    own = preset(system, 'controller')
+    own = plant_defaults(system, 'controller')
     found = signals_of(model)
     named = [named_units(tuple(filter(None, given.get(kind, ()))) or own.get(kind, ()))
              for kind in ('states_measured', 'inputs_commanded')]

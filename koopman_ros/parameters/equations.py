@@ -40,8 +40,8 @@ def refused(equations: str, texts: Sequence[str]) -> str:
         ranges = named_ranges(texts)
         if equations:
             # a trainer that only records does without
-            from koopman_ros.plants import plant_class, sought_of
-            sought_of(plant_class(equations), ranges)
+            from koopman_ros.plants import estimated_parameters_of, plant_class
+            estimated_parameters_of(plant_class(equations), ranges)
     except ValueError as error:
         return f'physical_model = {equations!r} with estimated_constants = {list(texts)}: {error}'
     return '' if equations or not ranges else (

@@ -15,9 +15,9 @@ from koopman_ros.control import Controller, State
 from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import display_unit, NANOSECONDS, shown
-from koopman_ros.evaluation import compare, Windows
+from koopman_ros.evaluation import compare, PredictionWindows
 from koopman_ros.model import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.signal_topics import Signals, signals_of, words_of
@@ -58,7 +58,7 @@ class ModelCheckContext:
     parameters: ControllerParameters
     state: State
     measured: Array  #: (n_y,) last measurement; NaN before the first
-    recent: Windows | None  #: what was measured lately; None while that is too little
+    recent: PredictionWindows | None  #: what was measured lately; None while that is too little
 
     def controller(self, model: LiftedModel) -> Controller:
         """Return what would act with a model; ModelFileError where that cannot be."""
@@ -120,7 +120,7 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
         # of this thread alone, for a busy machine says nothing of a model
         begun = time.thread_time()
         state, _, report = controller.step(state, model.states.center, k * NANOSECONDS)
-        if report.reason is not None and report.reason.code is Code.CALCULATION_FAILED:
+        if report.reason is not None and report.reason.code is StatusCode.CALCULATION_FAILED:
             raise ModelFileError(f'{path}: a control step with the model fails '
                                  f'({report.reason.values["error"]}): train it again')
         try:

@@ -14,11 +14,11 @@ from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
     DEFAULT_SYSTEM,
     InputPlaces,
-    preset,
+    plant_defaults,
     Signals,
+    SignalTopics,
     StatePlaces,
     system_of,
-    Wiring,
 )
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import trainer_signals
@@ -99,7 +99,7 @@ class PanelParameters:
 
 def panel_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Signals:
     """Return the signals of the parameters, of a bundled plant, or of a model."""
-    return trainer_signals(present, {**preset(system_of(given), 'panel'), **given})
+    return trainer_signals(present, {**plant_defaults(system_of(given), 'panel'), **given})
 
 
 def panel_table(present: LiftedModel | None = None,
@@ -134,8 +134,8 @@ def panel_table(present: LiftedModel | None = None,
             except ValueError as error:
                 return (f'{name}.shown_unit = {read[name]!r} must be a unit of the dimension of '
                         f'{unit}: {error}')
-        return Wiring(signals, values.states, values.inputs).check()
+        return SignalTopics(signals, values.states, values.inputs).check()
 
     return ParameterTable(
         PanelParameters, check, signals={'states': signals.states, 'inputs': signals.inputs},
-        defaults={**signals.defaults(), **preset(system, 'panel'), 'system': system})
+        defaults={**signals.defaults(), **plant_defaults(system, 'panel'), 'system': system})

@@ -19,11 +19,11 @@ from koopman_ros.parameters.signal_topics import (
     DEFAULT_SYSTEM,
     LONGEST_FRAME_ID,
     MeasuredPlace,
+    plant_defaults,
     PLANT_KINDS,
-    preset,
     Signals,
+    SignalTopics,
     system_of,
-    Wiring,
 )
 from koopman_ros.parameters.table import (
     ConfigurationError,
@@ -143,7 +143,7 @@ class PlantTable(ParameterTable[PlantParameters]):
             groups={'constants': [Specification(
                 item.name, item.default, item.unit, item.description, item.lower, item.upper)
                 for item in constants_of(self.plant)]},
-            defaults={**own, **preset(system, 'plant'), 'system': system})
+            defaults={**own, **plant_defaults(system, 'plant'), 'system': system})
 
     def system(self, values: PlantParameters, nominal_state: Array | None = None
                ) -> ControlAffineSystem:
@@ -180,4 +180,4 @@ def _cross_check(signals: Signals, values: PlantParameters) -> str:
     if unknown := set(filter(None, values.measured)) - set(signals.states):
         return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}, the '
                 f'states are {", ".join(signals.states)}: choose among them')
-    return Wiring(signals, values.states, values.inputs, PLANT_KINDS).check()
+    return SignalTopics(signals, values.states, values.inputs, PLANT_KINDS).check()

@@ -15,9 +15,9 @@ from types import MappingProxyType
 from typing import Any
 
 from koopman_ros.core.declaration import parameter
-from koopman_ros.core.message_fields import Place, place, SIGNAL_NAME, stem
+from koopman_ros.core.message_fields import base_name, MessageField, place, SIGNAL_NAME
 from koopman_ros.core.paths import config_directory
-from koopman_ros.core.status import Words
+from koopman_ros.core.status import StatusFormatter
 from koopman_ros.core.units import check_unit, conversion, Display, Displays
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.table import ConfigurationError
@@ -145,7 +145,7 @@ class Signals:
                        f'{name}.active_setpoint_topic': (
                            f'{of}active_setpoint' if controlled else '')}
         for name, unit in self.inputs.items():
-            command = f'{stem(name, unit)}_setpoint'
+            command = f'{base_name(name, unit)}_setpoint'
             topics |= {f'{name}.topic': name, f'{name}.command_topic': command,
                        f'{name}.manual_topic': f'manual_{command}'}
         return topics
@@ -169,13 +169,14 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
                    {} if len(states) == len(every) else every)
 
 
-def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
+def words_of(signals: Signals,
+             shown: Mapping[str, Display] = MappingProxyType({})) -> StatusFormatter:
     """Return the words for some signals; `shown` are those not written as they usually are."""
-    return Words(Displays(signals.units, {'K': Display('K', 'degC', '.2f'), **shown}))
+    return StatusFormatter(Displays(signals.units, {'K': Display('K', 'degC', '.2f'), **shown}))
 
 
 @dataclass(frozen=True)
-class Wiring:
+class SignalTopics:
     """
     The places of all signals.
 
@@ -188,41 +189,41 @@ class Wiring:
     kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
 
     @cached_property
-    def measured(self) -> dict[str, Place]:
+    def measured(self) -> dict[str, MessageField]:
         """Where the states are measured."""
         return {name: self._state(name, said.topic) for name, said in self.states.items()}
 
     @cached_property
-    def predicted(self) -> dict[str, Place]:
+    def predicted(self) -> dict[str, MessageField]:
         """Where it is said what was expected of them."""
         return {name: self._state(name, said.predicted_topic)
                 for name, said in self.states.items()}
 
     @cached_property
-    def setpoints(self) -> dict[str, Place]:
+    def setpoints(self) -> dict[str, MessageField]:
         """Where the set-points of the controlled states are asked for."""
         return {name: self._state(name, self.states[name].setpoint_topic)
                 for name in self.signals.controlled}
 
     @cached_property
-    def active_setpoints(self) -> dict[str, Place]:
+    def active_setpoints(self) -> dict[str, MessageField]:
         """Where it is said what is tracked."""
         return {name: self._state(name, self.states[name].active_setpoint_topic)
                 for name in self.signals.controlled}
 
     @cached_property
-    def commands(self) -> dict[str, Place]:
+    def commands(self) -> dict[str, MessageField]:
         """Where the inputs are commanded."""
         return {name: self._command(name, said.command_topic)
                 for name, said in self.inputs.items()}
 
     @cached_property
-    def manual(self) -> dict[str, Place]:
+    def manual(self) -> dict[str, MessageField]:
         """Where an operator commands them."""
         return {name: self._command(name, said.manual_topic) for name, said in self.inputs.items()}
 
     @cached_property
-    def applied(self) -> dict[str, Place]:
+    def applied(self) -> dict[str, MessageField]:
         """Where it is measured what acts."""
         return {name: _at(name, said.topic, self.signals.inputs[name], said)
                 for name, said in self.inputs.items()}
@@ -249,10 +250,10 @@ class Wiring:
         return tuple(dict.fromkeys(
             found.topic for kind in self.kinds for found in getattr(self, kind).values()))
 
-    def _state(self, name: str, topic: str) -> Place:
+    def _state(self, name: str, topic: str) -> MessageField:
         return _at(name, topic, self.signals.states[name], self.states[name])
 
-    def _command(self, name: str, topic: str) -> Place:
+    def _command(self, name: str, topic: str) -> MessageField:
         said = self.inputs[name]
         same = not said.command_type or said.command_type == said.type
         return _place(topic, name, self.signals.inputs[name], {
@@ -261,12 +262,12 @@ class Wiring:
             'unit': said.command_unit or (said.unit if same else '')})
 
 
-def _at(name: str, topic: str, unit: str, said: MeasuredPlace) -> Place:
+def _at(name: str, topic: str, unit: str, said: MeasuredPlace) -> MessageField:
     return _place(topic, name, unit, {
         'type': said.type, 'field': said.field, 'unit': said.unit})
 
 
-def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Place:
+def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> MessageField:
     try:
         found = place(topic, name, unit, given)
         conversion(found.unit, unit)
@@ -296,12 +297,12 @@ def system_of(given: Mapping[str, Any]) -> str:
     return str(given.get('system', DEFAULT_SYSTEM))
 
 
-def shipped() -> list[str]:
+def bundled_plants() -> list[str]:
     """Return the names of the plants that have a parameter file."""
     return sorted(file.stem for file in (config_directory() / _PRESETS).glob('*.yaml'))
 
 
-def preset(system: str, node: str) -> dict[str, Any]:
+def plant_defaults(system: str, node: str) -> dict[str, Any]:
     """
     Return the defaults of a node, by parameter, from the file of a plant that is shipped.
 

@@ -40,14 +40,14 @@ from koopman_ros.parameters.signal_topics import (
     EVENT_LOG,
     InputPlaces,
     named_units,
+    plant_defaults,
     PREDICTED_TRAJECTORY,
-    preset,
     refusal,
     Signals,
     signals_of,
+    SignalTopics,
     StatePlaces,
     system_of,
-    Wiring,
 )
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 
@@ -265,7 +265,7 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     :raises ConfigurationError: where nothing says what the signals are.
     """
     system = system_of(given)
-    own = preset(system, 'trainer')
+    own = plant_defaults(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
     defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, CONTROLLER_INTERNALS,
@@ -309,7 +309,7 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
     return Signals(measured, named_units(inputs), controlled or tuple(measured))
 
 
-def _wiring(signals: Signals, given: Mapping[str, Any]) -> Wiring:
+def _wiring(signals: Signals, given: Mapping[str, Any]) -> SignalTopics:
     """Return the places of signals, the usual ones but for those that parameters name."""
     said = {**signals.defaults(), **given}
 
@@ -317,7 +317,7 @@ def _wiring(signals: Signals, given: Mapping[str, Any]) -> Wiring:
         return kind(**{row.name: said[f'{name}.{row.name}'] for row in fields(kind)
                        if f'{name}.{row.name}' in said})
 
-    return Wiring(signals, {name: own(StatePlaces, name) for name in signals.states},
+    return SignalTopics(signals, {name: own(StatePlaces, name) for name in signals.states},
                   {name: own(InputPlaces, name) for name in signals.inputs})
 
 
@@ -357,7 +357,7 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.physical_model and values.input_matrix != (0.0,):
         return 'input_matrix must be a single 0 where physical_model says what the inputs do'
     return (refused(values.physical_model, values.estimated_constants)
-            or Wiring(signals, values.states, values.inputs).check())
+            or SignalTopics(signals, values.states, values.inputs).check())
 
 
 @dataclass(frozen=True)
@@ -421,8 +421,8 @@ def player_table(given: Mapping[str, Any] = MappingProxyType({})
     return ParameterTable(PlayerParameters, _check_player, defaults=defaults)
 
 
-def preset_wiring(system: str) -> Wiring | None:
+def preset_wiring(system: str) -> SignalTopics | None:
     """Return the places of the signals of a plant that is shipped, or None for another."""
-    if not (own := preset(system, 'trainer')):
+    if not (own := plant_defaults(system, 'trainer')):
         return None
     return _wiring(trainer_signals(None, own), own)

@@ -5,6 +5,7 @@
 
 from koopman_ros.plants.catalogue import build, plant_class, PLANTS
 from koopman_ros.plants.constants import Constant, constant, Constants, constants_of
+from koopman_ros.plants.estimated_parameters import estimated_parameters_of, EstimatedParameter
 from koopman_ros.plants.excitation import (
     box_episodes,
     ExcitationError,
@@ -27,7 +28,6 @@ from koopman_ros.plants.simulation import (
     sample_derivatives,
     simulate,
 )
-from koopman_ros.plants.sought import Sought, sought_of
 from koopman_ros.plants.system import (
     ControlAffineSystem,
     describe,
@@ -36,10 +36,37 @@ from koopman_ros.plants.system import (
     steady_state,
 )
 
-__all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
-           'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
-           'Process', 'RandomStepDesign', 'ReactorParameters', 'Sought', 'advance',
-           'box_episodes', 'build', 'constant', 'constants_of', 'describe', 'equilibrium_input',
-           'one_state_reactor', 'plant_class', 'random_steps', 'recoverable',
-           'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate', 'sought_of',
-           'steady_state', 'two_state_example', 'two_state_reactor']
+__all__ = [
+    'PLANTS',
+    'Actuator',
+    'Constant',
+    'Constants',
+    'ControlAffineSystem',
+    'EquilibriumError',
+    'EstimatedParameter',
+    'ExcitationError',
+    'IntegrationError',
+    'IntegrationFailure',
+    'Process',
+    'RandomStepDesign',
+    'ReactorParameters',
+    'advance',
+    'box_episodes',
+    'build',
+    'constant',
+    'constants_of',
+    'describe',
+    'equilibrium_input',
+    'estimated_parameters_of',
+    'one_state_reactor',
+    'plant_class',
+    'random_steps',
+    'recoverable',
+    'sample_derivatives',
+    'scalar_example',
+    'sensor_noise',
+    'simulate',
+    'steady_state',
+    'two_state_example',
+    'two_state_reactor',
+]

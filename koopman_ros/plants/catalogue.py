@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from koopman_ros.core.plugins import contained, plug
+from koopman_ros.core.plugins import contained, load_plugin
 from koopman_ros.plants.constants import in_plant_units
 from koopman_ros.plants.system import ControlAffineSystem
 
@@ -37,7 +37,7 @@ def plant_class(name: str) -> Any:
     :raises ValueError: for a name that stands for no plant; it lists those that there are.
     """
     if name in PLANTS or ':' in name:
-        return plug(name, 'plant', PLANTS)
+        return load_plugin(name, 'plant', PLANTS)
     # in here: no other name needs it
     from importlib.metadata import entry_points
 
@@ -47,7 +47,7 @@ def plant_class(name: str) -> Any:
         raise ValueError(f'there is no plant {name!r}: choose one of {", ".join(known)}, or write '
                          'module:Class; a package that offers one by name must be built, and its '
                          'workspace sourced')
-    return plug(name, 'plant', known)
+    return load_plugin(name, 'plant', known)
 
 
 def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | None = None

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ControlAffineSystem
@@ -41,7 +41,7 @@ class Process:
     #: commands that take effect later, by rising time: (time in ns, number of the input, value)
     pending: tuple[tuple[int, int, float], ...] = ()
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def followed(self) -> Array:

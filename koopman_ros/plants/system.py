@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.core.arrays import Array, brief, frozen
+from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 
@@ -55,7 +55,7 @@ class ControlAffineSystem:
     #: highest such states (n_x,); none by default
     state_upper: Array = field(default_factory=lambda: np.array(np.inf))
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.time_unit not in SECONDS_PER_TIME_UNIT:

@@ -5,7 +5,7 @@
 
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.episodes import loop_episodes, stream_episodes
-from koopman_ros.records.import_spec import Account, RecordedInput, RecordedState
+from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
 from koopman_ros.records.mcap_file import BagReadError
 from koopman_ros.records.message_definitions import (
     message_definition,
@@ -17,8 +17,21 @@ from koopman_ros.records.series import read_series, Series
 from koopman_ros.records.writer import BagWriter
 
 __all__ = [
-    'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter', 'MessageDefinition',
-    'MessageDefinitionError', 'RecordedInput', 'RecordedState', 'Series', 'in_log_order',
-    'loop_episodes', 'message_definition', 'read_messages', 'read_series', 'stream_episodes',
+    'BagMessage',
+    'BagReadError',
+    'BagSummary',
+    'BagWriter',
+    'ImportReport',
+    'MessageDefinition',
+    'MessageDefinitionError',
+    'RecordedInput',
+    'RecordedState',
+    'Series',
+    'in_log_order',
+    'loop_episodes',
+    'message_definition',
+    'read_messages',
+    'read_series',
+    'stream_episodes',
     'summary',
 ]

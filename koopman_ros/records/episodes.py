@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import Conversion, conversion, NANOSECONDS
 from koopman_ros.records import applied_inputs, segments
 from koopman_ros.records.align import align_by_timestamp, AlignedSamples, named
 from koopman_ros.records.applied_inputs import Applied
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.import_spec import (
-    Account,
     EpisodeBreaks,
+    ImportReport,
     places_of,
     RecordedInput,
     RecordedState,
@@ -29,7 +29,7 @@ from koopman_ros.records.import_spec import (
 from koopman_ros.records.mcap_file import BagReadError
 from koopman_ros.records.reader import BagSummary, read_messages, summary
 from koopman_ros.records.segments import Clock, NO_STAMP, Segment, Times
-from koopman_ros.records.series import check_places, spikes_and_jumps, stamped_number
+from koopman_ros.records.series import check_places, outliers_and_steps, stamped_number
 
 # A gap is longer than this many usual periods.
 _GAP_PERIODS = 3.5
@@ -43,19 +43,21 @@ _SAME_PACE_SECONDS = 1.0
 
 def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
                   inputs: Sequence[RecordedInput], *, tolerance_ns: int = 0,
-                  least_jumps: Sequence[float] | None = None) -> tuple[list[Episode], Account]:
+                  least_jumps: Sequence[float] | None = None) -> tuple[list[Episode],
+                                                                       ImportReport]:
     """
     Return all episodes of some bags, see :func:`stream_episodes`, and what was made of the bags.
 
     :raises BagReadError: as it does.
     """
-    account = Account()
+    account = ImportReport()
     return list(stream_episodes(bags, states, inputs, account, tolerance_ns=tolerance_ns,
                                 least_jumps=least_jumps)), account
 
 
 def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
-                    inputs: Sequence[RecordedInput], account: Account, *, tolerance_ns: int = 0,
+                    inputs: Sequence[RecordedInput], account: ImportReport, *,
+                    tolerance_ns: int = 0,
                     least_jumps: Sequence[float] | None = None) -> Iterator[Episode]:
     """
     Yield the episodes of some bags: times in s since the first measurement of each.
@@ -96,7 +98,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     account.dropped = +account.dropped
 
 
-def distinct(bags: Sequence[str | os.PathLike[str]], account: Account
+def distinct(bags: Sequence[str | os.PathLike[str]], account: ImportReport
              ) -> Iterator[str | os.PathLike[str]]:
     """Yield each bag once, however it is named."""
     read: set[str] = set()
@@ -115,7 +117,7 @@ class _Loop:
     bag: str
     states: Sequence[RecordedState]
     inputs: Sequence[RecordedInput]
-    account: Account
+    account: ImportReport
     tolerance_ns: int
     least_jumps: Sequence[float]
     breaks: EpisodeBreaks = field(default_factory=EpisodeBreaks)
@@ -125,8 +127,8 @@ class _Loop:
         self.content: BagSummary = summary(self.bag)
         self.inputs = [self._without_missing(signal) for signal in self.inputs]
         #: conversions to the units of the signals, by place, those of the states first
-        self.scales: dict[Place, Conversion] = {}
-        self._ranges: dict[Place, tuple[float, float]] = {}
+        self.scales: dict[MessageField, Conversion] = {}
+        self._ranges: dict[MessageField, tuple[float, float]] = {}
         signals: list[RecordedState | RecordedInput] = [*self.states, *self.inputs]
         for signal in signals:
             for place in places_of(signal):
@@ -153,7 +155,7 @@ class _Loop:
                                       'last complete record')
         counts, n_x = self.content.counts, len({signal.place for signal in self.states})
         places = list(self.scales)
-        topics: dict[str, list[tuple[int, Place, tuple[float, float]]]] = {}
+        topics: dict[str, list[tuple[int, MessageField, tuple[float, float]]]] = {}
         for number, place in enumerate(places):
             topics.setdefault(place.topic, []).append((number, place, self._ranges[place]))
         size = segments.portion(max(counts[place.topic] for place in places[:n_x]))
@@ -179,7 +181,7 @@ class _Loop:
                                       'could not be read')
         yield self._checked(segment)
 
-    def _accepted(self, message: BagMessage, place: Place, lowest: float, highest: float
+    def _accepted(self, message: BagMessage, place: MessageField, lowest: float, highest: float
                   ) -> tuple[int, float] | None:
         """Return stamp [ns] and number at a place; None, counted, for no valid number."""
         stamp_ns, value = stamped_number(self.bag, message, place)
@@ -285,7 +287,7 @@ class _Loop:
 
     def _leaps(self, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return where each state (N, n_x) has a spike, and where it jumps."""
-        found = [spikes_and_jumps(x[:, j], least / self.scales[signal.place].factor)
+        found = [outliers_and_steps(x[:, j], least / self.scales[signal.place].factor)
                  for j, (signal, least) in enumerate(
                      zip(self.states, self.least_jumps, strict=True))]
         spikes, jumps = zip(*found, strict=True)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 
 # The reason for the end of an episode, for the first and for the largest of several.
 _ENDS = {'set back': ('time was set back by {}', 'at most by {}'),
@@ -21,7 +21,7 @@ class RecordedState:
 
     name: str  #: of the signal
     unit: str  #: in the episodes
-    place: Place  #: where its measurements are
+    place: MessageField  #: where its measurements are
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class RecordedInput:
 
     name: str  #: of the signal
     unit: str  #: in the episodes
-    command: Place  #: where it is commanded
-    measured: Place | None = None  #: where it is measured behind its actuator, if it is
+    command: MessageField  #: where it is commanded
+    measured: MessageField | None = None  #: where it is measured behind its actuator, if it is
     delay: float = 0.0  #: dead time of the actuator, after which a command begins to act, in s
 
 
 @dataclass
-class Account:
+class ImportReport:
     """The result of an import in numbers and notes."""
 
     measurements: int = 0  #: number of measurements read, of all states
@@ -44,7 +44,7 @@ class Account:
     dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
     notes: list[str] = field(default_factory=list)  #: anything else, in sentences
 
-    def add(self, other: 'Account') -> None:
+    def add(self, other: 'ImportReport') -> None:
         """Take in that of other bags."""
         self.measurements += other.measurements
         self.used += other.used
@@ -58,7 +58,7 @@ class Account:
                 *self.notes]
 
 
-def places_of(signal: RecordedState | RecordedInput) -> list[Place]:
+def places_of(signal: RecordedState | RecordedInput) -> list[MessageField]:
     """Return the places of a signal."""
     if isinstance(signal, RecordedState):
         return [signal.place]

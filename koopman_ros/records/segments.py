@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
 
 Times = NDArray[np.int64]
@@ -84,12 +84,12 @@ class Clock:
 class Segment:
     """The numbers at some places between two resets of time, or a portion of them."""
 
-    def __init__(self, places: Sequence[Place], n_x: int) -> None:
+    def __init__(self, places: Sequence[MessageField], n_x: int) -> None:
         #: the last stamp [ns] that belongs to this portion, None when it is the last one
         self.until_ns: int | None = None
         #: by place of commands: times [ns] at which commands of earlier portions began to act,
         #: and their values; without dead time
-        self.applied: dict[Place, tuple[Times, Array]] = {}
+        self.applied: dict[MessageField, tuple[Times, Array]] = {}
         self._places = places
         self._states = places[:n_x]
         self._latest_ns = [NO_STAMP] * n_x
@@ -111,7 +111,7 @@ class Segment:
         back_ns = self._latest_ns[number] - stamp_ns
         return back_ns if back_ns > LATE_NANOSECONDS else 0
 
-    def of(self, place: Place) -> Entries:
+    def of(self, place: MessageField) -> Entries:
         """Return the numbers at a place."""
         return Entries(*map(np.array, self._columns[self._places.index(place)]))
 

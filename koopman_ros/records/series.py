@@ -10,7 +10,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.message_fields import CARRIERS, Place
+from koopman_ros.core.message_fields import KNOWN_TYPES, MessageField
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.mcap_file import BagReadError, reason
@@ -36,7 +36,7 @@ class Series:
     unit: str  #: of the numbers
 
 
-def read_series(path: str | os.PathLike[str], place: Place | str, *, recover: bool = False
+def read_series(path: str | os.PathLike[str], place: MessageField | str, *, recover: bool = False
                 ) -> Series:
     """
     Return a signal of a bag as arrays; `recover` is that of `read_messages`.
@@ -60,16 +60,16 @@ def read_series(path: str | os.PathLike[str], place: Place | str, *, recover: bo
                   np.array([value for _, value in numbers], dtype=np.float64), place.unit)
 
 
-def _usual(path: str | os.PathLike[str], content: BagSummary, topic: str) -> Place:
+def _usual(path: str | os.PathLike[str], content: BagSummary, topic: str) -> MessageField:
     """Return where the number is in messages of a topic whose type tells it."""
-    known = {name: row for name, row in CARRIERS.items() if row.unit}
+    known = {name: row for name, row in KNOWN_TYPES.items() if row.unit}
     kind = content.types.get(topic, next(iter(known)))
     if kind not in known:
         raise _other_type(path, topic, kind, ' or '.join(known))
-    return Place(topic, kind, known[kind].field, known[kind].unit)
+    return MessageField(topic, kind, known[kind].field, known[kind].unit)
 
 
-def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iterable[Place]
+def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iterable[MessageField]
                  ) -> None:
     """Raise BagReadError for a topic that a bag does not hold, or that is of another type."""
     for place in places:
@@ -81,7 +81,7 @@ def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iter
             raise _other_type(path, place.topic, content.types[place.topic], place.type)
 
 
-def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Place
+def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: MessageField
                    ) -> tuple[int | None, float | None]:
     """
     Return stamp [ns] and number of a message: None where its type has none, or an array lacks it.
@@ -114,7 +114,7 @@ def _other_type(path: str | os.PathLike[str], topic: str, found: str, wanted: st
                         'name another topic, or its type')
 
 
-def spikes_and_jumps(values: NDArray[np.float64], least: float = 0.0
+def outliers_and_steps(values: NDArray[np.float64], least: float = 0.0
                      ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """
     Find changes that no plant makes: samples that leap away and back, and jumps to another level.

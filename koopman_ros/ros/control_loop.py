@@ -13,7 +13,7 @@ import numpy as np
 from koopman_ros.control import Controller, events, HOLD, Mode, SAFE, Setpoint, State, StepReport
 from koopman_ros.control.events import Event, EventOutcome, Measurement, Silence
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros.timing import Timing
@@ -21,8 +21,8 @@ from koopman_ros.ros.timing import Timing
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _OVERDUE = 3.0  # usual intervals after which a measurement no longer decides the next command
 _SETTLED = 1e-4  # of an input's range: such a change of the command in a watch step is none
-_CAUSES = {None: Code.NO_MEASUREMENT, Advance.OLD: Code.STAMPS_STAND,
-           Advance.TWO_SOURCES: Code.TWO_SOURCES}
+_CAUSES = {None: StatusCode.NO_MEASUREMENT, Advance.OLD: StatusCode.STAMPS_STAND,
+           Advance.TWO_SOURCES: StatusCode.TWO_SOURCES}
 # A step that the watchdog has overtaken so often is given up, and its measurement with it.
 _ATTEMPTS = 2
 
@@ -54,7 +54,7 @@ class ControlLoop:
         self._send, self._record = send, record
         self.state, self.lock, self.active = State(), threading.Lock(), False
         # why the watch holds the command, and whether the law still changes it in a silence
-        self._held_for: Code | None = None
+        self._held_for: StatusCode | None = None
         self._settling = False
 
     def begin(self, timing: Timing) -> None:
@@ -98,7 +98,7 @@ class ControlLoop:
     def hold_between_sources(self, stamp_ns: int) -> Commanded | None:
         """Hold the command: it is not known which of two sources measures the plant."""
         with self.lock:
-            commanded = self._command(self.timing.silence, Code.TWO_SOURCES, stamp_ns)
+            commanded = self._command(self.timing.silence, StatusCode.TWO_SOURCES, stamp_ns)
             if commanded is None and self.state.command is not None:
                 self._send(self.state.command, stamp_ns)
             return commanded
@@ -133,10 +133,10 @@ class ControlLoop:
         """Put another controller in force, and publish a record of that."""
         with self.lock:
             predecessor, self.controller = self.controller, controller
-            self.state = controller.hand_over(predecessor, self.state)
+            self.state = controller.switch_to(predecessor, self.state)
             record()
 
-    def _command(self, silence: float, cause: Code | None, stamp_ns: int | None = None
+    def _command(self, silence: float, cause: StatusCode | None, stamp_ns: int | None = None
                  ) -> Commanded | None:
         """
         Command without a measurement, if it is time to; the caller holds the lock.

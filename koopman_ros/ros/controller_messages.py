@@ -23,9 +23,9 @@ from koopman_ros.control.laws.base import Plan
 from koopman_ros.core.arrays import along_last, Array
 from koopman_ros.core.units import display_unit, NANOSECONDS, shown
 from koopman_ros.event_log.records import EventRecord, fields_of, SNAPSHOT, START
-from koopman_ros.parameters.signal_topics import Signals, Wiring
+from koopman_ros.parameters.signal_topics import Signals, SignalTopics
 from koopman_ros.ros import topics
-from koopman_ros.ros.signals import Outlet
+from koopman_ros.ros.signals import SignalPublisher
 
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _AGAIN = 1.0  # s, within which two nodes know each other
@@ -138,12 +138,12 @@ def active_constraints(signals: Signals, plan: Plan, stamp: Time, frame_id: str)
 class ReportPublisher:
     """Publish the report of a step: tracked set-points, prediction, internals and plan."""
 
-    def __init__(self, matching: topics.Matching, wiring: Wiring) -> None:
+    def __init__(self, matching: topics.EndpointMonitor, wiring: SignalTopics) -> None:
         states = wiring.signals.states
-        self._setpoints = Outlet(
+        self._setpoints = SignalPublisher(
             wiring.active_setpoints, states,
             lambda topic, kind: matching.publish(topic, kind, topics.LATCHED_QOS))
-        self._predicted = Outlet(wiring.predicted, states, matching.publish)
+        self._predicted = SignalPublisher(wiring.predicted, states, matching.publish)
         self._internals = matching.publish(topics.CONTROLLER_INTERNALS)
         self._plan = matching.publish(topics.PREDICTED_TRAJECTORY)
         self._active_limits = matching.publish(topics.ACTIVE_CONSTRAINTS)
@@ -158,11 +158,11 @@ class ReportPublisher:
             self._setpoints.send(target.setpoint, stamp, frame_id)
         if predicted is not None and self._predicted.heard():
             self._predicted.send(predicted, stamp, frame_id)
-        if topics.heard(self._internals):
+        if topics.has_subscribers(self._internals):
             self._internals.publish(internals(signals, report, stamp, frame_id))
-        if plan is not None and topics.heard(self._plan):
+        if plan is not None and topics.has_subscribers(self._plan):
             self._plan.publish(planned(signals, plan, stamp, frame_id))
-        if plan is not None and topics.heard(self._active_limits):
+        if plan is not None and topics.has_subscribers(self._active_limits):
             self._active_limits.publish(active_constraints(signals, plan, stamp, frame_id))
 
 
@@ -175,7 +175,7 @@ class RecordPublisher:
     may know this publisher later than this one knows it, and miss what was published meanwhile.
     """
 
-    def __init__(self, matching: topics.Matching, snapshot: Callable[[], Mapping[str, Any]],
+    def __init__(self, matching: topics.EndpointMonitor, snapshot: Callable[[], Mapping[str, Any]],
                  lock: threading.Lock) -> None:
         self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
@@ -195,7 +195,7 @@ class RecordPublisher:
 
     def watch(self) -> None:
         """Publish the state to whoever listens, where that is due."""
-        if time.monotonic() > self._due and topics.heard(self._publisher):
+        if time.monotonic() > self._due and topics.has_subscribers(self._publisher):
             self.publish_snapshot()
 
     def publish_snapshot(self, event: str = SNAPSHOT) -> None:
@@ -205,7 +205,7 @@ class RecordPublisher:
 
     def publish_event(self, event: events.Event, outcome: events.EventOutcome) -> None:
         """Publish an event and what it led to."""
-        if topics.heard(self._publisher):
+        if topics.has_subscribers(self._publisher):
             self.publish(*fields_of(event, outcome))
         elif self._started:
             self._number += 1
@@ -220,6 +220,6 @@ class RecordPublisher:
             return
         number, self._number = self._number, self._number + 1
         # who comes later begins at a snapshot
-        if topics.heard(self._publisher):
+        if topics.has_subscribers(self._publisher):
             self._publisher.publish(String(data=EventRecord(self._run, number, event,
                                                             fields).text()))

@@ -12,8 +12,8 @@ import numpy as np
 from koopman_ros.control import Arrival, Controller, HOLD, Mode, SAFE, State, StepReport
 from koopman_ros.control.state import TargetReport
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import stem
-from koopman_ros.core.status import Code, level_words
+from koopman_ros.core.message_fields import base_name
+from koopman_ros.core.status import level_words, StatusCode
 from koopman_ros.core.synchronizer import Assembler
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import display_unit, shown
@@ -54,8 +54,9 @@ class Counts:
         self.missed += report.measurement.missed
         self.refused += report.measurement.arrival is Arrival.REJECTED
         if report.reason is not None and (cause := report.reason.cause) is not None:
-            self.late_plans += cause.code is Code.TOO_LATE
-            self.unsolved_plans += cause.code in (Code.PLAN_NOT_SOLVED, Code.PLAN_MOVES)
+            self.late_plans += cause.code is StatusCode.TOO_LATE
+            self.unsolved_plans += cause.code in (StatusCode.PLAN_NOT_SOLVED,
+                                                  StatusCode.PLAN_MOVES)
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class StatusContext:
     @property
     def input(self) -> str:
         """What an operator calls the inputs."""
-        return ' and '.join(stem(name, unit) for name, unit in self.signals.inputs.items())
+        return ' and '.join(base_name(name, unit) for name, unit in self.signals.inputs.items())
 
     @property
     def awaited(self) -> str:
@@ -97,7 +98,7 @@ class StatusContext:
     def commanded(self, command: Array) -> str:
         """Write a command (n_u,) with names and units."""
         return ', '.join(
-            f'{stem(name, unit)} at {shown(value, unit):.2f} {display_unit(unit)}'
+            f'{base_name(name, unit)} at {shown(value, unit):.2f} {display_unit(unit)}'
             for (name, unit), value in zip(self.signals.inputs.items(), command.tolist(),
                                            strict=True))
 
@@ -266,7 +267,7 @@ def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
             limits.upper.tolist(), strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
-            return (f'the set-point would need the {stem(name, unit)} at '
+            return (f'the set-point would need the {base_name(name, unit)} at '
                     f'{shown(wanted, unit):.6g} {display_unit(unit)}, its range is '
                     f'{shown(low, unit):.6g} to {shown(high, unit):.6g}: it is not reached')
     return ''
@@ -282,7 +283,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
     target, law, estimate = report.target, report.command.law, report.estimate
     transfer = np.zeros(len(signals.inputs)) if report.command.transfer is None else (
         report.command.transfer)
-    inputs = {stem(name, unit): unit for name, unit in signals.inputs.items()}
+    inputs = {base_name(name, unit): unit for name, unit in signals.inputs.items()}
     # a bias of what is not measured is no sensor's
     bias = None if estimate is None or signals.estimated else (
         now.controller.equivalent_bias(state))

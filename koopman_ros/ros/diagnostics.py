@@ -16,8 +16,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from koopman_ros.core.plugins import contained
 from koopman_ros.parameters.signal_topics import DIAGNOSTICS
-from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.hosted import HostedNode, wall_timer
+from koopman_ros.ros.time_conversion import stamp_message
 
 
 class Severity(Enum):

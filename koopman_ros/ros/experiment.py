@@ -11,15 +11,15 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import SetBool
 
 from koopman_ros.control.experiment import ExperimentPhase, level
-from koopman_ros.core.status import Code, Reason, reason
-from koopman_ros.parameters.signal_topics import Wiring, words_of
+from koopman_ros.core.status import Reason, reason, StatusCode
+from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.experiment_run import ExperimentRun, other_publishers, stepped
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Owned
-from koopman_ros.ros.signals import Heard, Inlet
+from koopman_ros.ros.node import NodeEntities
+from koopman_ros.ros.signals import SignalSample, SignalSubscriber
 
 
 class PlantExperiment:
@@ -33,7 +33,7 @@ class PlantExperiment:
     :param commanded: last command of each input by name, of any node; kept up to date.
     """
 
-    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: SignalTopics,
                  commanded: dict[str, float] | None = None) -> None:
         self.settings = settings  # of the next experiment
         self._node, self._wiring = node, wiring
@@ -42,10 +42,11 @@ class PlantExperiment:
         self._outcome = TaskReport(Severity.OK, 'no experiment')
         self._diagnostics = node.diagnostics.add('experiment', self._status)
         # a group of its own: the service waits for the first measurement
-        self._owned = Owned(node)
+        self._owned = NodeEntities(node)
         self._commanded = {} if commanded is None else commanded
         # best effort fits every publisher
-        Inlet(node, lambda topic, callback, kind: self._owned.keep(node.create_subscription(
+        SignalSubscriber(node, lambda topic, callback,
+                         kind: self._owned.keep(node.create_subscription(
             kind, topic, callback, topics.profile(1, reliable=False))),
             wiring.commands, wiring.signals.inputs, self._on_command)
         self._owned.keep(node.create_service(
@@ -60,7 +61,7 @@ class PlantExperiment:
             run.farewell()
             self._let_go(self._verdict(run))
 
-    def _on_command(self, heard: Heard) -> None:
+    def _on_command(self, heard: SignalSample) -> None:
         self._commanded |= {name: value for name, value in heard.values.items()
                             if math.isfinite(value)}
 
@@ -141,7 +142,7 @@ class PlantExperiment:
         if run is not None:
             run.destroy()
             if not run.started.done():
-                run.started.set_result(reason(Code.ENDED_EARLY))
+                run.started.set_result(reason(StatusCode.ENDED_EARLY))
 
     def _say(self, sentence: str) -> None:
         # two lines, because rclpy allows one severity a line

@@ -30,18 +30,18 @@ from koopman_ros.control.experiment import (
     TrackingMonitor,
 )
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import Place, stem
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.message_fields import base_name, MessageField
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.synchronizer import Assembler
 from koopman_ros.core.units import display_unit, NANOSECONDS, shown
 from koopman_ros.event_log import records
-from koopman_ros.parameters.signal_topics import Wiring
+from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Owned
-from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs, Outlet
+from koopman_ros.ros.node import NodeEntities
+from koopman_ros.ros.signals import MeasuredInputs, SignalPublisher, SignalSample, SignalSubscriber
+from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _TICK = 0.1  # s
 _DEVIATIONS = 10  # commands of a controller, and
@@ -51,7 +51,7 @@ _FAREWELL = 2.0  # s for the way back at the end of the process
 _ACKNOWLEDGED = 0.2  # s for the last command to arrive
 
 
-def stepped(settings: TrainerParameters, wiring: Wiring) -> dict[str, Place]:
+def stepped(settings: TrainerParameters, wiring: SignalTopics) -> dict[str, MessageField]:
     """Return where an experiment publishes, by name of the signal that it steps."""
     if settings.experiment_signal == SETPOINT:
         return wiring.setpoints
@@ -67,7 +67,7 @@ class ExperimentRun:
     :raises ValueError: for bounds that are no plan.
     """
 
-    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: SignalTopics,
                  commanded: Mapping[str, float], on_end: Callable[[Reason | None], None]) -> None:
         places = stepped(settings, wiring)
         signals = wiring.signals
@@ -96,22 +96,22 @@ class ExperimentRun:
         self._sent: Array | None = None
         self._monitors = [TrackingMonitor(span)
                           for span in (self.plan.upper - self.plan.lower).tolist()]
-        self._owned = owned = Owned(node)
+        self._owned = owned = NodeEntities(node)
         self.destroy = owned.destroy  #: commands no more
         self._assembler = Assembler(
             tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
-        self._measured = Inlet(
+        self._measured = SignalSubscriber(
             node, self._subscribe, wiring.measured, signals.states, self._on_measurement)
-        self._answers = Inlet(
+        self._answers = SignalSubscriber(
             node, self._subscribe, wiring.commands, signals.inputs, self._on_command) if (
                 settings.experiment_signal != COMMAND) else None
-        self._inputs = None if self._on_setpoints else Inlet(
+        self._inputs = None if self._on_setpoints else SignalSubscriber(
             node, self._subscribe, wiring.applied, signals.inputs, self._on_applied)
         if self._on_setpoints:
-            Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
+            SignalSubscriber(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
                   signals.states, lambda heard: self._tracked.update(heard.values))
             self._subscribe(topics.EVENT_LOG, self._on_record, String)
-        self._outlet = Outlet(places, self._units, lambda topic, kind: owned.keep(
+        self._outlet = SignalPublisher(places, self._units, lambda topic, kind: owned.keep(
             node.create_publisher(kind, topic, topics.LOOP_QOS)))
         owned.timer(_TICK, self._on_tick)
 
@@ -183,7 +183,7 @@ class ExperimentRun:
                     f'{display_unit(unit)}')
         return start
 
-    def _on_applied(self, heard: Heard) -> None:
+    def _on_applied(self, heard: SignalSample) -> None:
         self._applied.take(heard)
         self._answer_first()
 
@@ -194,7 +194,7 @@ class ExperimentRun:
             self._answer(*first)
 
     def _called(self, name: str) -> str:
-        return name if self._on_setpoints else stem(name, self._units[name])
+        return name if self._on_setpoints else base_name(name, self._units[name])
 
     def figures(self, what: str, values: Array) -> dict[str, float]:
         """Return values (m,) by name with unit."""
@@ -239,7 +239,7 @@ class ExperimentRun:
                         header is None) else stamp_nanoseconds(header.stamp))
         return found
 
-    def _on_measurement(self, heard: Heard) -> None:
+    def _on_measurement(self, heard: SignalSample) -> None:
         if (whole := self._assembler.take(heard.stamp_ns, heard.values)) is not None:
             self._answer(*whole, heard.frame_id)
 
@@ -249,7 +249,7 @@ class ExperimentRun:
         assert self.progress is not None
         newest_ns, was_running = self.progress.time_ns, self.running
         self._frame_id = frame_id
-        if self._on_setpoints and not self._followed(self._tracked, Code.NOT_TRACKED):
+        if self._on_setpoints and not self._followed(self._tracked, StatusCode.NOT_TRACKED):
             return
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         if self.progress.time_ns != newest_ns:
@@ -285,11 +285,11 @@ class ExperimentRun:
         self._sent = values
         self._outlet.send(values, stamp_message(stamp_ns), self._frame_id)
 
-    def _on_command(self, heard: Heard) -> None:
+    def _on_command(self, heard: SignalSample) -> None:
         """Watch a controller that should be in manual mode."""
         self._answer_first()
         if self.progress is not None and not self._on_setpoints:
-            self._followed(heard.values, Code.NOT_FOLLOWED)
+            self._followed(heard.values, StatusCode.NOT_FOLLOWED)
 
     def _on_record(self, message: String) -> None:
         """Watch a controller that should be in automatic mode."""
@@ -297,13 +297,13 @@ class ExperimentRun:
             mode = records.parse(message.data).fields.get('mode')
             self._automatic = self._automatic or mode == 'automatic'
             if mode == 'manual':
-                why = reason(Code.IN_MANUAL_MODE)
+                why = reason(StatusCode.IN_MANUAL_MODE)
                 if self.progress is not None:
                     self._on_end(why)
                 elif not self.started.done():
                     self.started.set_result(why)
 
-    def _followed(self, values: Mapping[str, float], code: Code) -> bool:
+    def _followed(self, values: Mapping[str, float], code: StatusCode) -> bool:
         """Tell whether a controller does as it is asked; where it does not, all is over."""
         assert self.progress is not None
         now = time.monotonic()
@@ -323,16 +323,16 @@ class ExperimentRun:
         why = None
         for topic in dict.fromkeys(self._topics):
             if others := other_publishers(self._node, topic, own=1):
-                why = reason(Code.OTHER_PUBLISHER, nodes=others, topic=topic)
+                why = reason(StatusCode.OTHER_PUBLISHER, nodes=others, topic=topic)
         if why is None and self._answers is not None and not self._answers.published():
-            why = reason(Code.CONTROLLER_GONE)
+            why = reason(StatusCode.CONTROLLER_GONE)
         elif why is None and time.monotonic() - self._heard_at > self._patience:
-            why = reason(Code.NOTHING_TRACKED if self._setpoints_missing else Code.SILENCE,
-                         timeout=self._patience)
+            why = reason(StatusCode.NOTHING_TRACKED if self._setpoints_missing
+                         else StatusCode.SILENCE, timeout=self._patience)
         if self.progress is None:
             if why is not None and not self.started.done():
                 self.started.set_result(why)
-        elif why is not None and why.code is Code.SILENCE:
+        elif why is not None and why.code is StatusCode.SILENCE:
             was_running = self.running
             # the way back goes by the wall clock
             self.progress = advance(

@@ -12,7 +12,7 @@ from typing import Any
 import rclpy
 
 from koopman_ros.execution.training import JobState, TrainingJob
-from koopman_ros.parameters.signal_topics import SIGNALS, Wiring
+from koopman_ros.parameters.signal_topics import SIGNALS, SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.ros.managed import one_line, START_ERRORS
@@ -72,7 +72,7 @@ def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
         if not bags:
             raise ConfigurationError('there is no bag to train from: name it in bags')
         signals = trainer_signals(present, {name: getattr(settings, name) for name in SIGNALS})
-        wiring = Wiring(signals, settings.states, settings.inputs)
+        wiring = SignalTopics(signals, settings.states, settings.inputs)
         return task_fields(node, settings, wiring, bags), settings.executor
     finally:
         node.destroy_node()

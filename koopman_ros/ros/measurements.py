@@ -12,10 +12,10 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.synchronizer import Assembler
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, Wiring
+from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, SignalTopics
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode, wall_timer
-from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
+from koopman_ros.ros.signals import MeasuredInputs, SignalSample, SignalSubscriber
 from koopman_ros.ros.timing import Timing
 
 _PATIENCE = 0.5  # s that the first measurement waits for the measured inputs
@@ -38,7 +38,7 @@ class Measurements:
     :param answer: called with each measurement.
     """
 
-    def __init__(self, node: HostedNode, matching: topics.Matching, wiring: Wiring,
+    def __init__(self, node: HostedNode, matching: topics.EndpointMonitor, wiring: SignalTopics,
                  exclusive: Mapping[str, str], tolerance: float,
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals
@@ -51,9 +51,9 @@ class Measurements:
                          if place.topic in exclusive}
         self._waiting: list[Sample] = []  # that came before the measured inputs
         self._patience: Timer | None = None
-        self._inputs = Inlet(
+        self._inputs = SignalSubscriber(
             node, matching.subscribe, wiring.applied, signals.inputs, self._on_applied)
-        measured = Inlet(
+        measured = SignalSubscriber(
             node, matching.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:
             node.get_logger().warning(
@@ -85,7 +85,7 @@ class Measurements:
             f'the frame_id of the measurement has {self._frame_length} characters, of which '
             f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
 
-    def _on_measurement(self, heard: Heard) -> None:
+    def _on_measurement(self, heard: SignalSample) -> None:
         self.frame_id = heard.frame_id[:LONGEST_FRAME_ID]
         self._frame_length = len(heard.frame_id)
         late = self.assembler.late.total()
@@ -111,7 +111,7 @@ class Measurements:
             return
         self._answer(sample)
 
-    def _on_applied(self, heard: Heard) -> None:
+    def _on_applied(self, heard: SignalSample) -> None:
         self.applied.take(heard)
         if self._waiting and self.applied.complete:
             self._answer_waiting()

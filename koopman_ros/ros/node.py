@@ -38,7 +38,7 @@ _DESTROY: dict[type, Callable[[Node, Any], object]] = {
     Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
     Service: Node.destroy_service, Timer: Node.destroy_timer}
 
-class Owned:
+class NodeEntities:
     """Publishers, subscriptions, services and timers of one part of a node."""
 
     def __init__(self, node: HostedNode) -> None:

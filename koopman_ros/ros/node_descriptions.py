@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.model import load
 from koopman_ros.parameters import controller, panel, plant, trainer
-from koopman_ros.parameters.signal_topics import DEFAULT_SYSTEM, preset
+from koopman_ros.parameters.signal_topics import DEFAULT_SYSTEM, plant_defaults
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.ros import topics
 
@@ -46,7 +46,7 @@ _TRANSITIONS = '~/transition_event'
 def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
     """Return the tables of all programs for a plant that is shipped."""
     given = {'system': system}
-    name = preset(system, 'controller').get('model', '')
+    name = plant_defaults(system, 'controller').get('model', '')
     if not name:
         raise ConfigurationError(
             f'the system {system!r} has no model: name one in config/plants/{system}.yaml')

@@ -13,12 +13,12 @@ from std_srvs.srv import SetBool
 
 from koopman_ros.control import events, Mode
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import stem
+from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import display_unit, NANOSECONDS, shown
-from koopman_ros.parameters.signal_topics import Wiring, words_of
+from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.ros import topics
 from koopman_ros.ros.control_loop import ControlLoop
-from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
+from koopman_ros.ros.signals import MeasuredInputs, SignalSample, SignalSubscriber
 
 _SHOWN = 60.0  # s for which a request that was refused or limited is a warning
 
@@ -32,8 +32,8 @@ class OperatorRequests:
     :ivar setpoint_received: whether a set-point was accepted.
     """
 
-    def __init__(self, node: Node, matching: topics.Matching, wiring: Wiring, loop: ControlLoop,
-                 applied: MeasuredInputs, changed: Callable[[], None]) -> None:
+    def __init__(self, node: Node, matching: topics.EndpointMonitor, wiring: SignalTopics,
+                 loop: ControlLoop, applied: MeasuredInputs, changed: Callable[[], None]) -> None:
         self._log, self._loop, self._applied = node.get_logger(), loop, applied
         self._signals, self._changed = wiring.signals, changed
         self._words = words_of(wiring.signals)
@@ -41,10 +41,10 @@ class OperatorRequests:
         self.setpoint_received = False
         # volatile, so that `ros2 topic pub` matches
         for name, place in wiring.setpoints.items():
-            Inlet(node, matching.subscribe, {name: place}, wiring.signals.states,
+            SignalSubscriber(node, matching.subscribe, {name: place}, wiring.signals.states,
                   self._on_setpoint)
         for name, place in wiring.manual.items():
-            Inlet(node, matching.subscribe, {name: place}, wiring.signals.inputs,
+            SignalSubscriber(node, matching.subscribe, {name: place}, wiring.signals.inputs,
                   self._on_manual)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
 
@@ -53,7 +53,7 @@ class OperatorRequests:
         """Why the last request was refused or limited, for a minute; or an empty string."""
         return self._note if time.monotonic() - self._noted < _SHOWN else ''
 
-    def _on_setpoint(self, heard: Heard) -> None:
+    def _on_setpoint(self, heard: SignalSample) -> None:
         (name, value), = heard.values.items()
         several = len(self._signals.controlled) > 1
         if self._change(events.SetpointRequest(
@@ -68,7 +68,7 @@ class OperatorRequests:
                 f'{when}', throttle_duration_sec=1.0)
         self._changed()
 
-    def _on_manual(self, heard: Heard) -> None:
+    def _on_manual(self, heard: SignalSample) -> None:
         state = self._loop.state
         held = state.command if state.manual_input is None else state.manual_input
         # the others stay
@@ -106,7 +106,7 @@ class OperatorRequests:
         """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
         within = self._loop.controller.tuning.limits.within(requested)
         return ', '.join(
-            f'manual {stem(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
+            f'manual {base_name(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
             f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
             for (name, unit), wanted, limit in zip(
                 self._signals.inputs.items(), requested.tolist(), within.tolist(), strict=True)

@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from koopman_ros.core.paths import LOOPBACK_PROFILE
-from koopman_ros.process_entry import end_by_force, handle_signals
+from koopman_ros.process_entry import force_exit_after, handle_signals
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
@@ -25,13 +25,13 @@ from koopman_ros.ros.watchdog import end_in_time
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LOOPS = '--loops'
 # (arguments, file of loops, signals as they come) to the exit code
-Loops = Callable[[list[str] | None, str, list[int]], int]
+LoopRunner = Callable[[list[str] | None, str, list[int]], int]
 LONGEST_WAIT = 0.1  # s from a signal to the end
 TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
 def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None,
-        loops: Loops | None = None, executor: Callable[[], Executor] = SingleThreadedExecutor
+        loops: LoopRunner | None = None, executor: Callable[[], Executor] = SingleThreadedExecutor
         ) -> int:
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks, or by force.
@@ -118,7 +118,7 @@ def take_down(name: str, node: LoopNode | None, executor: Executor | None,
               patience: float = TAKE_DOWN_PATIENCE) -> None:
     """Take a node down, and the middleware, by force where that takes longer than so many s."""
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see docs/middleware.md
-    disarm = end_by_force(patience, 0, (
+    disarm = force_exit_after(patience, 0, (
         f'{name}: the middleware does not shut down: left to the operating system'))
     if executor is not None:
         # its threads would call into the interpreter while that ends

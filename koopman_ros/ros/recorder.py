@@ -27,7 +27,7 @@ from rosgraph_msgs.msg import Clock
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records import BagWriter, message_definition
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 
 # An unlimited duration [ns]: RMW_DURATION_INFINITE.
 _INFINITE_NS = 2**63 - 1

@@ -13,13 +13,13 @@ import shutil
 
 from std_srvs.srv import SetBool
 
-from koopman_ros.parameters.signal_topics import Wiring
+from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.records import BagWriter
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Owned
+from koopman_ros.ros.node import NodeEntities
 from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages
@@ -31,13 +31,14 @@ _MEGABYTE = 1_000_000
 class Recording:
     """Record the loop to one bag after another, on ``~/record``; reports by diagnostics."""
 
-    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring) -> None:
+    def __init__(self, node: ManagedNode, settings: TrainerParameters,
+                 wiring: SignalTopics) -> None:
         self.settings = settings  # of the next recording
-        self._node, self._known = node, topics.known(wiring)
+        self._node, self._known = node, topics.expected_topics(wiring)
         self._recorder: Recorder | None = None
         self._problem = self._path = ''
         self._diagnostics = node.diagnostics.add('recording', self._status)
-        self._owned = Owned(node)
+        self._owned = NodeEntities(node)
         self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
         self._timers = [
             self._owned.timer(period, partial(self._attempt, work), autostart=False)

@@ -17,15 +17,15 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import Conversion, conversion, in_steps
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class SignalSample:
     """What a message says of some signals."""
 
     stamp: Time  #: of the message, or of its arrival where it has none
@@ -42,7 +42,7 @@ class Heard:
         return stamp_nanoseconds(self.stamp)
 
 
-def by_topic(places: Mapping[str, Place]) -> Iterator[tuple[str, Any, list[str]]]:
+def by_topic(places: Mapping[str, MessageField]) -> Iterator[tuple[str, Any, list[str]]]:
     """
     Yield each topic, the class of its messages and the names of the signals in them.
 
@@ -83,7 +83,7 @@ def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., 
     return hear
 
 
-class Inlet:
+class SignalSubscriber:
     """
     Subscribe to some signals.
 
@@ -98,8 +98,8 @@ class Inlet:
     """
 
     def __init__(self, node: Node, subscribe: Callable[..., Subscription],
-                 places: Mapping[str, Place], units: Mapping[str, str],
-                 hear: Callable[[Heard], None]) -> None:
+                 places: Mapping[str, MessageField], units: Mapping[str, str],
+                 hear: Callable[[SignalSample], None]) -> None:
         self._node, self._hear = node, hear
         self.subscriptions: list[Subscription] = []
         self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
@@ -123,7 +123,7 @@ class Inlet:
             values[name] = converted(number) if lowest <= number <= highest else math.nan
         if values:
             header = getattr(message, 'header', None)
-            self._hear(Heard(self._node.get_clock().now().to_msg() if header is None
+            self._hear(SignalSample(self._node.get_clock().now().to_msg() if header is None
                              else header.stamp, header.frame_id if header else '', values,
                              header is not None, topic, info['publication_sequence_number']))
 
@@ -139,7 +139,7 @@ class MeasuredInputs:
         self._names = tuple(names)
         self._last: dict[str, tuple[int, float]] = {}  # stamp in ns and value
 
-    def take(self, heard: Heard) -> None:
+    def take(self, heard: SignalSample) -> None:
         """Take what a message says."""
         self._last |= {name: (heard.stamp_ns, value) for name, value in heard.values.items()}
 
@@ -163,7 +163,7 @@ class MeasuredInputs:
         return self.latest if near else None
 
 
-class Outlet:
+class SignalPublisher:
     """
     Publish some signals, those of one topic in one message, which is made once.
 
@@ -173,7 +173,7 @@ class Outlet:
     :param units: of the signals, in which the numbers are given.
     """
 
-    def __init__(self, places: Mapping[str, Place], units: Mapping[str, str],
+    def __init__(self, places: Mapping[str, MessageField], units: Mapping[str, str],
                  make: Callable[[str, Any], Publisher]) -> None:
         self._parts = []
         for topic, kind, names in by_topic(places):
@@ -194,7 +194,7 @@ class Outlet:
 
     def heard(self) -> bool:
         """Tell whether anybody subscribes to one of the topics."""
-        return any(map(topics.heard, self.publishers))
+        return any(map(topics.has_subscribers, self.publishers))
 
     def send(self, values: Array, stamp: Time, frame_id: str, variances: Array | None = None,
              resolutions: Array | None = None) -> None:

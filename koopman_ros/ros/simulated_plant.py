@@ -9,7 +9,7 @@ import numpy as np
 
 from koopman_ros import plants
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import stem
+from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import display_unit, shown
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
 
@@ -100,7 +100,7 @@ class SimulatedPlant:
 
     def figures(self) -> dict[str, float]:
         """Return states and inputs with their names and units."""
-        inputs = {stem(name, unit): unit for name, unit in self.signals.inputs.items()}
+        inputs = {base_name(name, unit): unit for name, unit in self.signals.inputs.items()}
         signals = [*self.signals.states.items(), *inputs.items()]
         values = [*self._process.x.tolist(), *self._process.u.tolist()]
         return {f'{name} [{display_unit(unit)}]': shown(value, unit)

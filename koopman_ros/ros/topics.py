@@ -28,7 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from koopman_ros.core.plugins import plug
+from koopman_ros.core.plugins import load_plugin
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
     AUDIT_LOG,
@@ -37,11 +37,11 @@ from koopman_ros.parameters.signal_topics import (
     DIAGNOSTICS,
     EVENT_LOG,
     PREDICTED_TRAJECTORY,
-    Wiring,
+    SignalTopics,
 )
 from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.managed import one_line
-from koopman_ros.ros.node import Owned
+from koopman_ros.ros.node import NodeEntities
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
 # JointTrajectory the one with their course in time.
@@ -69,7 +69,7 @@ def overridable() -> QoSOverridingOptions:
     return QoSOverridingOptions.with_default_policies()
 
 
-def known(wiring: Wiring) -> dict[str, tuple[Any, QoSProfile]]:
+def expected_topics(wiring: SignalTopics) -> dict[str, tuple[Any, QoSProfile]]:
     """Return type and quality of service of all topics that are known beforehand."""
     found = {place.topic: (message_class(place.type), LATCHED_QOS if (
         kind in ('active_setpoints', 'applied')) else LOOP_QOS)
@@ -104,13 +104,13 @@ def message_class(type_name: str) -> Any:
     """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
         package, kind, name = type_name.split('/')
-        return plug(f'{package}.{kind}:{name}', 'message type', {})
+        return load_plugin(f'{package}.{kind}:{name}', 'message type', {})
     except ValueError as error:
         raise LookupError(
             f'message type {type_name!r} is not installed here: source its workspace') from error
 
 
-class Matching:
+class EndpointMonitor:
     """
     Make a node's publishers and subscriptions, and say which others conflict or do not match.
 
@@ -125,7 +125,7 @@ class Matching:
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
                  single: Mapping[str, str] | None = None) -> None:
         self._node, self._on_change, self._single = node, on_change, single or {}
-        self._owned = Owned(node)
+        self._owned = NodeEntities(node)
         self._own: list[Publisher | Subscription] = []
         self._said: tuple[str, ...] = ('', '')
         self._shared: dict[str, bool] = {}
@@ -254,7 +254,7 @@ def _explicit(profile: QoSProfile) -> QoSProfile:
     return filled
 
 
-def heard(publisher: Publisher) -> bool:
+def has_subscribers(publisher: Publisher) -> bool:
     """Tell whether anybody subscribes: writing for nobody takes as long as for somebody."""
     return publisher.get_subscription_count() > 0
 

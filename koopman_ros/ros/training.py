@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.paths import model_path
 from koopman_ros.execution.training import (
     class_lines,
@@ -23,11 +23,11 @@ from koopman_ros.execution.training import (
     TrainingJob,
 )
 from koopman_ros.model import LiftedModel, load
-from koopman_ros.parameters.signal_topics import preset, system_of, Wiring
+from koopman_ros.parameters.signal_topics import plant_defaults, SignalTopics, system_of
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import LoopNode, Owned
+from koopman_ros.ros.node import LoopNode, NodeEntities
 
 POLL_PERIOD = 0.1  # s between two looks at a training
 _LINE_PERIOD = 5.0  # s between plain lines of progress
@@ -36,15 +36,15 @@ _BAR_WIDTH = 30
 
 def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
     """Return the lift in use by parameters that were given, None where there is none yet."""
-    own = preset(system_of(given), 'trainer')
+    own = plant_defaults(system_of(given), 'trainer')
     name = str(given.get('model', own.get('model', '')))
     return load(model_path(name)) if name else None
 
 
-def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
+def task_fields(node: LoopNode, settings: TrainerParameters, wiring: SignalTopics,
                 bags: Iterable[str]) -> dict[str, Any]:
     """Return the fields of a `koopman_ros.learning.TrainingTask` of a trainer's parameters."""
-    def found(place: Place) -> dict[str, str]:
+    def found(place: MessageField) -> dict[str, str]:
         return {**asdict(place), 'topic': node.resolve_topic_name(place.topic)}
 
     def file(model: str) -> str:
@@ -99,7 +99,7 @@ class TrainingProgress:
 class Training:
     """Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it."""
 
-    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: SignalTopics,
                  recorded: Callable[[], str],
                  on_end: Callable[[JobState], None] = lambda _: None) -> None:
         self.settings = settings  # of the next training
@@ -109,7 +109,7 @@ class Training:
         self._state: JobState | None = None
         self._progress = TrainingProgress(node.get_logger().info)
         self._diagnostics = node.diagnostics.add('training', self._status)
-        self._owned = owned = Owned(node)
+        self._owned = owned = NodeEntities(node)
         owned.keep(node.create_service(Trigger, '~/train', self._on_train))
         owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
         self._timer = owned.timer(POLL_PERIOD, self._on_poll, autostart=False)

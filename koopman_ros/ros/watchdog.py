@@ -9,7 +9,7 @@ import signal
 import threading
 
 from koopman_ros.core.plugins import contained
-from koopman_ros.process_entry import end_by_force, SIGNALS
+from koopman_ros.process_entry import force_exit_after, SIGNALS
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
 # Looks in a row at which the executor has not come by: on a loaded machine it may be late by some.
@@ -79,7 +79,7 @@ def end_in_time(name: str) -> Callable[[], None]:
                 pass
             # the pipe stays open, for the byte of a second signal
             if number:
-                disarm = end_by_force(_PATIENCE, 1, (
+                disarm = force_exit_after(_PATIENCE, 1, (
                     f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force'))
                 over.wait()
                 disarm()

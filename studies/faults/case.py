@@ -13,7 +13,7 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from studies.faults.plants import FaultPlant, LOCKSTEP, REACTOR
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ class FaultCase:
     #: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have matched from
     #: the beginning of the fault on
     says: tuple[str, ...] = ()
-    code: Code | None = None  #: reason that the controller's records must have given since then
+    #: reason that the controller's records must have given since then
+    code: StatusCode | None = None
     allowed_errors: tuple[str, ...] = ()  #: statuses (``<node>: <task>``) that may end in ERROR
 
 

@@ -11,7 +11,7 @@ import math
 import signal
 from typing import Any
 
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
 from studies.faults import interceptor, operators, processes, silence
@@ -87,7 +87,7 @@ def _twice() -> interceptor.Alteration:
 
 # The reactor: one temperature, one coolant.
 
-def _sensor(name: str, does: str, make: Maker, seconds: float, code: Code | None = None,
+def _sensor(name: str, does: str, make: Maker, seconds: float, code: StatusCode | None = None,
             **details: Any) -> FaultCase:
     return FaultCase('sensor', name, f'{does}, {seconds:g} s',
                 partial(altered, make=make, seconds=seconds), True, code=code, **details)
@@ -102,35 +102,37 @@ def _in_a_step(group: str, name: str, does: str, make: Maker, seconds: float, *,
 
 _clock = partial(_in_a_step, 'clocks')
 _MESSAGES = (
-    _sensor('nan-short', 'NaN', _shows(math.nan), 5.0, Code.NOT_FINITE),
-    _sensor('nan-long', 'NaN', _shows(math.nan), 180.0, Code.NOT_FINITE),
-    _sensor('infinity', '+inf', _shows(math.inf), 10.0, Code.NOT_FINITE),
-    _sensor('minus-infinity', '-inf', _shows(-math.inf), 10.0, Code.NOT_FINITE),
-    _sensor('huge', '1e300 degC', _shows(1e300), 10.0, Code.NOT_FINITE),
-    _sensor('minus-zero', '-0.0 degC', _shows(-0.0), 10.0, Code.JUMPED),
-    _sensor('below-absolute-zero', '-300 degC', _shows(-300.0), 10.0, Code.NOT_FINITE),
-    _sensor('out-of-range', '200 degC', _shows(200.0), 20.0, Code.OUTSIDE_SENSOR),
-    _sensor('railed', 'at the upper end of its range, 150 degC', _shows(150.0), 60.0, Code.JUMPED),
-    _sensor('spike-short', '+30 K in one sample', _shifted(lambda _: 30.0), 1.0, Code.JUMPED),
-    _sensor('spike-long', '+15 K', _shifted(lambda _: 15.0), 20.0, Code.JUMPED),
+    _sensor('nan-short', 'NaN', _shows(math.nan), 5.0, StatusCode.NOT_FINITE),
+    _sensor('nan-long', 'NaN', _shows(math.nan), 180.0, StatusCode.NOT_FINITE),
+    _sensor('infinity', '+inf', _shows(math.inf), 10.0, StatusCode.NOT_FINITE),
+    _sensor('minus-infinity', '-inf', _shows(-math.inf), 10.0, StatusCode.NOT_FINITE),
+    _sensor('huge', '1e300 degC', _shows(1e300), 10.0, StatusCode.NOT_FINITE),
+    _sensor('minus-zero', '-0.0 degC', _shows(-0.0), 10.0, StatusCode.JUMPED),
+    _sensor('below-absolute-zero', '-300 degC', _shows(-300.0), 10.0, StatusCode.NOT_FINITE),
+    _sensor('out-of-range', '200 degC', _shows(200.0), 20.0, StatusCode.OUTSIDE_SENSOR),
+    _sensor('railed', 'at the upper end of its range, 150 degC', _shows(150.0), 60.0,
+            StatusCode.JUMPED),
+    _sensor('spike-short', '+30 K in one sample', _shifted(lambda _: 30.0), 1.0,
+            StatusCode.JUMPED),
+    _sensor('spike-long', '+15 K', _shifted(lambda _: 15.0), 20.0, StatusCode.JUMPED),
     _sensor('spikes', 'a spike of +20 K in every seventh sample',
-            _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, Code.JUMPED),
+            _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, StatusCode.JUMPED),
     _sensor('frozen-at-rest', 'bit-identical values', frozen, 120.0),
     FaultCase('sensor', 'frozen-in-a-step',
               'bit-identical values, 10 s after a step of the set-point, '
          '90 s', partial(altered, make=frozen, seconds=90.0, setpoint=(42.0,), wait=10.0), True,
-         code=Code.FROZEN),
+         code=StatusCode.FROZEN),
     _sensor('drift', 'drifts by 1 K/min', _shifted(lambda seconds: seconds / 60.0), 180.0),
     FaultCase('sensor', 'bias', 'wrong by +2 K, 300 s and more', operators.biased, True,
          recovery=360.0, afterwards=420.0),
     _sensor('noise-burst', 'noise of 1 K', lambda: noise(1.0), 60.0),
-    _sensor('noise-wild', 'noise of 10 K', lambda: noise(10.0), 60.0, Code.JUMPED),
+    _sensor('noise-wild', 'noise of 10 K', lambda: noise(10.0), 60.0, StatusCode.JUMPED),
     _sensor('quantised', 'in steps of 0.5 K, the set-point between two of them',
             lambda: value(lambda _, measured: round(2.0 * measured) / 2.0), 300.0,
             setpoint=(45.8,)),
     _sensor('dropout-short', 'no measurement', lost, 5.0),
-    _sensor('dropout-long', 'no measurement', lost, 150.0, Code.NO_MEASUREMENT, plant=_SILENT,
-            controller=_BY_CLOCK, largest_step=_LOOK,
+    _sensor('dropout-long', 'no measurement', lost, 150.0, StatusCode.NO_MEASUREMENT,
+            plant=_SILENT, controller=_BY_CLOCK, largest_step=_LOOK,
             says=('^controller: control: no measurement',)),
     *(_in_a_step('messages', f'{what}-{name}', f'{what}: {does}', make, 120.0, what=what,
                  largest_step=largest_step)
@@ -218,7 +220,7 @@ def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, A
                 partial(operators.storm_of_parameters, make=make, refused=refused))
 
 
-def _setpoints(name: str, does: str, *values: float, code: Code | None = None) -> FaultCase:
+def _setpoints(name: str, does: str, *values: float, code: StatusCode | None = None) -> FaultCase:
     return FaultCase('operators', name, f'set-points at 1 kHz{does}',
                 partial(operators.storm_of_setpoints, asked=tuple(
                     {reactor.TEMPERATURE: value} for value in values)), code=code)
@@ -240,9 +242,9 @@ _OPERATORS = (
         operators.drawn, 2, {'temperature.setpoint_ramp': (-5.0, 1.0)}, True)),
     _parameters('bad-values-storm', 'parameters that cannot be', partial(_cycled, _BAD), True),
     _setpoints('setpoint-storm', ', all the same', *REACTOR.setpoint),
-    _setpoints('setpoint-storm-nan', ': NaN', math.nan, code=Code.SETPOINT_NOT_FINITE),
+    _setpoints('setpoint-storm-nan', ': NaN', math.nan, code=StatusCode.SETPOINT_NOT_FINITE),
     _setpoints('setpoint-storm-outside', ': 500 and -1e308 degC', 500.0, -1e308,
-               code=Code.SETPOINT_OUTSIDE),
+               code=StatusCode.SETPOINT_OUTSIDE),
     _setpoints('setpoint-storm-alternating', ': 41 and 51 degC in turn', 41.0, 51.0),
     FaultCase('operators', 'mode-once', 'manual mode for a minute, and back, without a bump',
          operators.mode_once, bump=_BUMP),
@@ -285,8 +287,8 @@ def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
     long, short = 60.0 * on.period, 10.0 * on.period
     step = {'largest_step': 2.0 * on.rate * on.period}
 
-    def one(name: str, does: str, make: Maker, seconds: float = short, code: Code | None = None,
-            group: str = 'sensor', **details: Any) -> FaultCase:
+    def one(name: str, does: str, make: Maker, seconds: float = short,
+            code: StatusCode | None = None, group: str = 'sensor', **details: Any) -> FaultCase:
         return _on(on, group, name, f'{last}: {does}, {seconds:g} s', partial(
             altered, make=lambda: interceptor.part(make(), last), seconds=seconds,
             setpoint=on.other), between=True, code=code, **{**step, **details})
@@ -297,20 +299,20 @@ def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
             altered, make=make, seconds=seconds, setpoint=on.other, what=what), between=True,
             **{**step, **details})
 
-    yield one('nan-one', 'NaN', _shows(math.nan), code=Code.NOT_FINITE)
-    yield one('huge-one', '1e300', _shows(1e300), code=Code.OUTSIDE_SENSOR)
+    yield one('nan-one', 'NaN', _shows(math.nan), code=StatusCode.NOT_FINITE)
+    yield one('huge-one', '1e300', _shows(1e300), code=StatusCode.OUTSIDE_SENSOR)
     yield one('spike-one', f'+{_SPIKE:g} m in one sample', _shifted(lambda _: _SPIKE), on.period,
-              Code.JUMPED)
-    yield one('frozen-one', 'bit-identical values', frozen, 60.0, Code.FROZEN)
-    yield one('silent-one', 'no measurement', lost, 150.0, Code.NO_MEASUREMENT, plant=_SILENT,
-              controller=_BY_CLOCK, largest_step=_LOOK * on.rate,
+              StatusCode.JUMPED)
+    yield one('frozen-one', 'bit-identical values', frozen, 60.0, StatusCode.FROZEN)
+    yield one('silent-one', 'no measurement', lost, 150.0, StatusCode.NO_MEASUREMENT,
+              plant=_SILENT, controller=_BY_CLOCK, largest_step=_LOOK * on.rate,
               says=('^controller: control: no measurement',))
     yield one('lost-one', '30 % lost', lambda: lost(0.3), long, group='messages')
     yield one('doubled-one', 'each comes twice', _twice, long, group='messages')
     yield one('swapped-one', 'each two in the wrong order', interceptor.swapped, long,
               group='messages')
     yield one('contradicted-one', f'comes twice, first {_SPIKE:g} m too high',
-              _twins(_SPIKE, first=True), code=Code.JUMPED)
+              _twins(_SPIKE, first=True), code=StatusCode.JUMPED)
     yield one('late-one', 'each 3 samples late', lambda: delayed(3), long, group='messages')
     yield every('lost', '30 % lost', lambda: lost(0.3), long, 'messages')
     yield every('commands-lost', '30 % of the commands lost', lambda: lost(0.3), long,
@@ -340,16 +342,16 @@ def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
 
     for name, does, asked, code in (
             ('nan', 'NaN, of each state in turn', each((math.nan,) * len(on.controlled)),
-             Code.SETPOINT_NOT_FINITE),
+             StatusCode.SETPOINT_NOT_FINITE),
             ('outside', '500 and -1e308, of each state in turn', each((500.0, -1e308)),
-             Code.SETPOINT_OUTSIDE),
+             StatusCode.SETPOINT_OUTSIDE),
             ('alternating', 'two pairs in turn, a state at a time',
              each(on.setpoint) + each(on.other), None)):
         yield case(f'setpoints-{name}', f'set-points at 1 kHz: {does}',
                    partial(operators.storm_of_setpoints, asked=tuple(asked)), code=code)
     # the outflow below cannot be less than the inflow from above
     yield case('not-held', 'a set-point that no flow can hold beside the other',
-               operators.not_held, code=Code.SETPOINT_NOT_HELD)
+               operators.not_held, code=StatusCode.SETPOINT_NOT_HELD)
     yield case('mode-once', 'manual mode for 20 samples, and back, without a bump', partial(
         operators.mode_once, seconds=20.0 * on.period), bump=_TANK_BUMP)
     yield case('mode-storm', f'{REQUESTS} changes between automatic and manual mode',
@@ -409,10 +411,11 @@ def _saddle(group: str, name: str, does: str, make: Maker, seconds: float, *, st
 _FEED = 76.85  # degC
 _SADDLE = (
     _saddle('sensor', 'lost', 'no measurement', lost, 5.0),
-    _saddle('sensor', 'nan', 'NaN', _shows(math.nan), 5.0, code=Code.NOT_FINITE),
+    _saddle('sensor', 'nan', 'NaN', _shows(math.nan), 5.0, code=StatusCode.NOT_FINITE),
     _saddle('sensor', 'noise-burst', 'noise of 0.5 K', lambda: noise(0.5), 60.0),
     _saddle('sensor', 'outliers', '+20 K in every seventh sample',
-            _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, code=Code.JUMPED),
+            _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0,
+            code=StatusCode.JUMPED),
     _saddle('messages', 'measurements-lost', '30 % of the measurements lost', lambda: lost(0.3),
             120.0, step=True),
     _saddle('messages', 'late', 'each measurement 3 samples late', lambda: delayed(3), 60.0,
@@ -427,14 +430,14 @@ _SADDLE = (
           ('feed-warm', 'T_f +5 K', {'constants.feed_temperature': _FEED + 5.0}),
           ('feed-cold', 'T_f -5 K', {'constants.feed_temperature': _FEED - 5.0}))),
     _on(SADDLE, 'operators', 'setpoint-out-of-reach', 'a set-point of 120 degC',
-        operators.out_of_reach, code=Code.SETPOINT_OUTSIDE),
+        operators.out_of_reach, code=StatusCode.SETPOINT_OUTSIDE),
     _on(SADDLE, 'operators', 'temperature-limited', 'the temperature may not exceed '
         f'{operators.LIMIT:g} degC, 1 K below the set-point, 240 s', operators.limited),
     _on(SADDLE, 'processes', 'controller-killed', 'the controller is killed and started again',
         processes.controller_again, plant=PATIENT),
     _on(SADDLE, 'processes', 'solver-missing', 'the controller has no solver of quadratic '
         'programs, and the set-point steps', operators.stepped, missing=('daqp',),
-        code=Code.PACKAGE_MISSING))
+        code=StatusCode.PACKAGE_MISSING))
 
 
 # Faults that could leave a plant without control while every status is OK, or end a process.

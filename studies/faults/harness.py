@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from rclpy.publisher import Publisher
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
@@ -170,7 +170,7 @@ class FaultHarness:
 
     # The operator.
 
-    def _publishers(self, places: Mapping[str, Place]
+    def _publishers(self, places: Mapping[str, MessageField]
                     ) -> dict[str, Callable[[float], None]]:
         """Return what publishes a value of each signal."""
         made: dict[str, Callable[[float], None]] = {}
@@ -182,7 +182,7 @@ class FaultHarness:
         return made
 
     @staticmethod
-    def _speak(publisher: Publisher, kind: Any, name: str, places: Mapping[str, Place],
+    def _speak(publisher: Publisher, kind: Any, name: str, places: Mapping[str, MessageField],
                value: float) -> None:
         publisher.publish(message_of(kind, places, {name: value}))
 

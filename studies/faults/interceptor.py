@@ -19,12 +19,12 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.synchronizer import Assembler
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.signals import by_topic
+from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from studies.faults.case import Command, LoopTrace, SeenStatus
 from studies.faults.plants import FaultPlant
 
@@ -197,7 +197,7 @@ class Interceptor:
         self._listen(on.wiring.measured, _whole(on.states, self._on_states),
                      before=_BEHIND if self._between else '')
 
-    def _publishers(self, places: Mapping[str, Place], before: str = ''
+    def _publishers(self, places: Mapping[str, MessageField], before: str = ''
                     ) -> Callable[[Packet], None]:
         """Return what publishes a packet, what it says of one topic in one message."""
         parts = [(self._node.create_publisher(kind, f'{before}{topic}', topics.LOOP_QOS), kind,
@@ -211,7 +211,7 @@ class Interceptor:
 
         return publish
 
-    def _listen(self, places: Mapping[str, Place], hear: Callable[[Packet], None],
+    def _listen(self, places: Mapping[str, MessageField], hear: Callable[[Packet], None],
                 qos: QoSProfile = topics.LOOP_QOS, before: str = '') -> list[Subscription]:
         def read(names: list[str], message: Any) -> None:
             hear(Packet(stamp_nanoseconds(message.header.stamp),
@@ -300,7 +300,7 @@ def _whole(names: tuple[str, ...], hear: Callable[[Packet], None]) -> Callable[[
     return take
 
 
-def message_of(kind: Any, places: Mapping[str, Place], values: Mapping[str, float],
+def message_of(kind: Any, places: Mapping[str, MessageField], values: Mapping[str, float],
                stamp_ns: int = 0) -> Any:
     """Build a message from values in its units."""
     message = kind()

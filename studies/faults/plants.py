@@ -17,7 +17,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.signal_topics import preset, Wiring
+from koopman_ros.parameters.signal_topics import plant_defaults, SignalTopics
 from koopman_ros.parameters.table import ParameterTable
 
 LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
@@ -68,14 +68,14 @@ class FaultPlant:
 
     @property
     def _model(self) -> str:
-        return str({**preset(self.system, 'controller'), **self.tuned}['model'])
+        return str({**plant_defaults(self.system, 'controller'), **self.tuned}['model'])
 
     @cached_property
-    def wiring(self) -> Wiring:
+    def wiring(self) -> SignalTopics:
         """Where its signals are."""
         signals = signals_of(load(model_path(self._model)), self.parameters.tuning.controlled,
                              self.parameters.states)
-        return Wiring(signals, self.parameters.states, self.parameters.inputs)
+        return SignalTopics(signals, self.parameters.states, self.parameters.inputs)
 
     @property
     def states(self) -> tuple[str, ...]:

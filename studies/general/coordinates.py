@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from koopman_ros.control import averaged, recentred
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import DriftSamples, split_by_episode
-from koopman_ros.learning import NoUsefulLift, rollout_rmse, train
+from koopman_ros.learning import rollout_rmse, train, TrainingFailed
 from koopman_ros.learning.lift.metrics import drift_error
 from koopman_ros.model import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plants import describe
@@ -156,7 +156,7 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
                 model = LEARNERS[label](plant, given, seed).model if label in _POLYNOMIALS else (
                     train(plant, given, RECIPES[label](case.system.n_x), seed=seed, starts=1,
                           refuse=False).model)
-            except NoUsefulLift:
+            except TrainingFailed:
                 figures[figure] = None
                 continue
             figures[figure] = drift_error(model, held_out)

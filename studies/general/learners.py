@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
-from koopman_ros.learning import Edmd, Growth, NeuralDrift, NoUsefulLift, train
+from koopman_ros.learning import Edmd, IncrementalTraining, NeuralDrift, train, TrainingFailed
 from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.model import Box, LiftedModel, PolynomialObservables
 
@@ -76,7 +76,7 @@ def _trained(recipe: Callable[[int], Recipe]) -> Learner:
         begin = time.process_time()
         try:
             refused, model = '', train(plant, samples, made, seed=seed, starts=1).model
-        except NoUsefulLift as error:
+        except TrainingFailed as error:
             refused = str(error)
         seconds = time.process_time() - begin
         if refused:
@@ -90,8 +90,9 @@ def _trained(recipe: Callable[[int], Recipe]) -> Learner:
 _STEPS = 300  # of Levenberg-Marquardt, for each size
 # What is trained, made for a number of states.
 RECIPES: dict[str, Callable[[int], Recipe]] = {
-    'identity lift': lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS),
-    'free lift': lambda n_x: Growth(
+    'identity lift': lambda n_x: IncrementalTraining(n_x + 3, hidden_first=16,
+                                                     max_iterations=_STEPS),
+    'free lift': lambda n_x: IncrementalTraining(
         n_x, identity=False, hidden_first=16, max_iterations=_STEPS),
     'neural drift': lambda n_x: NeuralDrift(16, max_iterations=_STEPS),
 }

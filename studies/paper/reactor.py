@@ -42,7 +42,7 @@ IN_RANGE = RandomStepDesign(
 OUT_OF_RANGE = RandomStepDesign(
     input_lower=270.0, input_upper=301.1, state_lower=293.0, state_upper=329.3,
     hold_time=(2.0, 10.0), sample_period=0.25)
-RECIPE = learning.Growth(max(LIFTED_SIZES), max_iterations=600)
+RECIPE = learning.IncrementalTraining(max(LIFTED_SIZES), max_iterations=600)
 EDMD_DEGREE = 5
 
 
@@ -134,7 +134,7 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
             models[f'nz={n_z}'] = learning.train(
                 describe(SYSTEM), samples, learning.Algorithm1(n_z, max_iterations=100), seed=seed,
                 starts=1, refuse=False).model
-        except learning.NoUsefulLift:
+        except learning.TrainingFailed:
             continue
     return _all_judged(models, seed), {f'paper_{name}': model for name, model in models.items()}
 

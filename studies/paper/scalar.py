@@ -6,7 +6,7 @@
 import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples
-from koopman_ros.learning import fit, Growth, train
+from koopman_ros.learning import fit, IncrementalTraining, train
 from koopman_ros.plants import describe, scalar_example
 from studies.campaign import Metrics, Models
 
@@ -31,7 +31,7 @@ def run(seed: int) -> tuple[Metrics, Models]:
     """
     x = np.random.default_rng(seed).uniform(*RANGE, (SAMPLES, 1))
     samples = DriftSamples(x, x * x, np.zeros((SAMPLES, 0)), np.arange(SAMPLES) % 10)
-    recipe = Growth(1, identity=False, hidden_first=10)
+    recipe = IncrementalTraining(1, identity=False, hidden_first=10)
     model = train(describe(scalar_example()), samples, recipe, seed=seed, starts=STARTS).model
     metrics: Metrics = {'eigenvalue': float(model.A[0, 0])}
     for name, bounds in PARTS.items():

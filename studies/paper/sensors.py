@@ -14,13 +14,13 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.learning import (
-    decide,
-    Decision,
+    AcceptanceResult,
+    evaluate_model,
     learn_lift,
-    NoUsefulLift,
     roll_out,
     Thresholds,
     Trained,
+    TrainingFailed,
 )
 from koopman_ros.learning.identification import DriftModel, Identified, identify
 from koopman_ros.model import Box, LiftedModel, linearised_model, Provenance
@@ -96,7 +96,7 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
         measured_upper=np.array([328.0]), seed=seed)
     driven = _experiment(fouled, plan, loop[-1], seed + 2)
     found, learned = _learn([record, driven], present.model, seed)
-    decision = decide(found, learned, present.model, Thresholds())
+    decision = evaluate_model(found, learned, present.model, Thresholds())
     after, _ = _controlled(fouled, learned.model, before[-1], 15.0, seed)
     offsets = [abs(float(np.mean(x[-300:, 0])) - SETPOINT) for x in (before, after)]
     return {
@@ -121,9 +121,9 @@ def run_two_state(seed: int) -> tuple[Metrics, Models]:
     found = identify(like.plant, _measured(path, NOISE, seed, state=1), seed=seed)
     try:
         trained = learn_lift(found, like.plant, N_Z, seed=seed, starts=STARTS)
-    except NoUsefulLift:
+    except TrainingFailed:
         return {'accepted': False, 'noise_kelvin': float(found.noise[0])}, {}
-    decision: Decision = decide(found, trained, like, Thresholds())
+    decision: AcceptanceResult = evaluate_model(found, trained, like, Thresholds())
     return {
         'heldout_kelvin': float(decision.rmse[0]), 'noise_kelvin': float(decision.noise[0]),
         'linear_kelvin': float(decision.linear_rmse[0]),

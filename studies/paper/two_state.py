@@ -48,8 +48,8 @@ NARROW = {
     '[3,6]x[3,8]': StateRange((3.0, 3.0), (6.0, 8.0), (0.0, 40.0)),
     '[4,5.5]x[4,5.5]': StateRange((4.0, 4.0), (5.5, 5.5), (5.0, 35.0)),
 }
-WIDE_RECIPE = learning.Growth(3, hidden_first=16, max_iterations=600)
-NARROW_RECIPE = learning.Growth(3)
+WIDE_RECIPE = learning.IncrementalTraining(3, hidden_first=16, max_iterations=600)
+NARROW_RECIPE = learning.IncrementalTraining(3)
 PAPER_RECIPE = learning.Algorithm1(3, identity=True, hidden=16, max_iterations=100)
 STARTS = 2
 SYSTEM = two_state_example()
@@ -141,15 +141,15 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
     """Run Algorithm 1 once on the wide box; all figures are None when the lift is degenerate."""
     try:
         model = _learned(samples(WIDE, seed), PAPER_RECIPE, seed)
-    except learning.NoUsefulLift:
+    except learning.TrainingFailed:
         return {'rw': None, 'rx': None, 'cond': None, 'eigenvalue_error': None,
                 'cost_ratio_to_exact': {f'R={R:g}': None for R in INPUT_WEIGHTS},
                 'left_box': None}, {}
     return judged(model, seed), {'paper_two_state': model}
 
 
-def _learned(data: DriftSamples, recipe: learning.Growth | learning.Algorithm1, seed: int,
-             starts: int = 1) -> LiftedModel:
+def _learned(data: DriftSamples, recipe: learning.IncrementalTraining | learning.Algorithm1,
+             seed: int, starts: int = 1) -> LiftedModel:
     return learning.train(describe(SYSTEM), data, recipe, seed=seed, starts=starts,
                           refuse=False).model
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.evaluation.optimal_cost import cost_along, Course
+from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory
 from koopman_ros.plants import Process
 from studies.equations import EQUATIONS
 from studies.least import least_course
@@ -71,7 +71,7 @@ class ComparedFigures:
     lost: bool  #: whether one of them was further than what counts as reached
 
 
-def least(case: PartialCase, x0: Array) -> Course:
+def least(case: PartialCase, x0: Array) -> OptimalTrajectory:
     """Return the course of least cost of the step of the set-point from a state (n_x,)."""
     return least_course(case.task(x0), EQUATIONS[case.plant], case.lower, case.upper,
                         state_upper=case.state_upper)

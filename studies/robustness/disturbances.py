@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.evaluation import at, perfect, Sensor, Simulation, Timed
+from koopman_ros.evaluation import at, perfect, ScheduledChange, Sensor, Simulation
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
 from studies.campaign import Metrics
 from studies.robustness import loop
@@ -38,7 +38,7 @@ class Disturbed:
     """A loop that is disturbed or whose set-point steps."""
 
     name: str  #: for the tables
-    changes: Sequence[Timed]  #: what happens when, in s
+    changes: Sequence[ScheduledChange]  #: what happens when, in s
     reference: float = START  #: where the true temperature ought to go, in K
     system: ControlAffineSystem = REACTOR  #: the plant
     x0: Sequence[float] = (START,)  #: its state at the start
@@ -58,7 +58,7 @@ class Disturbed:
             sensor=self.sensor)
 
 
-def _step(words: str, *changes: Timed, **details: Any) -> Disturbed:
+def _step(words: str, *changes: ScheduledChange, **details: Any) -> Disturbed:
     return Disturbed(f'set-point −10 K{words}', [at(LEAD, at_setpoint(SETPOINT)), *changes],
                      SETPOINT, overshoot=True, **details)
 

@@ -106,7 +106,7 @@ def worst(run: Simulation) -> str:
 
 
 def run_loop(controller: Controller, system: plants.ControlAffineSystem, x0: Array,
-             coolant: float, seconds: float, events: Iterable[evaluation.Timed] = (), *,
+             coolant: float, seconds: float, events: Iterable[evaluation.ScheduledChange] = (), *,
              actuator: plants.Actuator | None = None, tells: bool = False, noise: float = 0.0,
              **others: Any) -> Simulation:
     """

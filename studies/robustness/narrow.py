@@ -11,7 +11,7 @@ import numpy as np
 from koopman_ros import control, evaluation
 from koopman_ros.control import Controller
 from koopman_ros.evaluation import at, Simulation
-from koopman_ros.learning import Growth, Linearisation, train
+from koopman_ros.learning import IncrementalTraining, Linearisation, train
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign
 from studies.campaign import Metrics
@@ -42,7 +42,7 @@ class Trial:
     name: str  #: for the tables
     temperature: float  #: of the reactor at the start, in K
     bandwidth: float = loop.BANDWIDTH  #: of the observer, in 1/min
-    changes: Sequence[evaluation.Timed] = ()  #: what happens when, in s
+    changes: Sequence[evaluation.ScheduledChange] = ()  #: what happens when, in s
 
     def run(self, controller: Controller) -> Simulation:
         """Drive the true reactor to its steady state."""
@@ -63,7 +63,8 @@ def reactor_courses() -> dict[tuple[str, str], Simulation]:
     """Run all trials: by their name and ``narrow``, ``guarded`` (with fallback) or ``wide``."""
     # an hour of steps within 1.5 K of the steady state
     samples = box_episodes(REACTOR, DESIGN, 60, 1.0, 0)
-    lift = train(describe(REACTOR), samples, Growth(3), seed=0, starts=1, refuse=False).model
+    lift = train(describe(REACTOR), samples, IncrementalTraining(3), seed=0, starts=1,
+                 refuse=False).model
     return {(trial.name, kind): trial.run(loop.reactor_controller(
         bandwidth=trial.bandwidth, fallback=fallback, model=model)) for trial in TRIALS
         for kind, model, fallback in (('narrow', lift, False), ('guarded', lift, True),

@@ -16,7 +16,7 @@ from scipy.linalg import expm
 
 from koopman_ros.control import Arrival, Controller, InputLimits, Mode, SensorLimits, State, Tuning
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.event_log.records import decoded
 from koopman_ros.model import LiftedModel, linearised_model, Provenance
 from support.closed_loops import content, controller, EPOCH, SECOND
@@ -140,8 +140,9 @@ def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
                 else:
                     assert asked is state
                     assert not inside or refused.code in (
-                        Code.SETPOINT_NOT_HELD, Code.NO_SETPOINT_HELD, Code.SETPOINT_UNMEASURED)
-                if refused is not None and refused.code is Code.SETPOINT_NOT_HELD:
+                        StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_SETPOINT_HELD,
+                        StatusCode.SETPOINT_UNMEASURED)
+                if refused is not None and refused.code is StatusCode.SETPOINT_NOT_HELD:
                     # what is named as the nearest one can be asked for
                     held = dict(refused.values['held'])
                     assert loop.controlled.only(tuple(held)).violation(
@@ -161,7 +162,7 @@ def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
                 state = loop.initialise(State(), u)
             case 'successor':
                 other = controllers[(values[0] > 0.0) + (values[1] > 0.0)]
-                state, loop = other.hand_over(loop, state), other
+                state, loop = other.switch_to(loop, state), other
         if command is None:
             continue
         assert command.shape == (model.n_u,)

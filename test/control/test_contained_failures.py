@@ -23,7 +23,7 @@ from koopman_ros.control.events import (
 from koopman_ros.control.laws import LawResult, Linear
 from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import (
     DisturbanceObserver,
     Estimate,
@@ -32,7 +32,7 @@ from koopman_ros.estimation import (
 )
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.parameters.signal_topics import preset
+from koopman_ros.parameters.signal_topics import plant_defaults
 from support.closed_loops import SECOND
 
 SYSTEMS = ('reactor', 'two_state', 'quadruple_tank', 'pendulum')
@@ -93,7 +93,7 @@ def plugin(monkeypatch):
 
 
 def tuned(system, measured=None, **parameters):
-    model = load(model_path(preset(system, 'controller')['model']))
+    model = load(model_path(plant_defaults(system, 'controller')['model']))
     given = {'system': system}
     if measured is not None:
         given['states_measured'] = tuple(
@@ -217,9 +217,9 @@ def test_random_events_on_every_law_and_estimator_end_in_a_command(system):
             run.do(event)
             if rng.random() < 0.05:
                 before, run.controller = run.controller, others[rng.integers(len(others))]
-                run.state = run.controller.hand_over(before, run.state)
+                run.state = run.controller.switch_to(before, run.state)
         # what is contained should be rare: a numerical cause is mended where it arises
-        assert Code.CALCULATION_FAILED not in run.codes, (measured, levels, estimator)
+        assert StatusCode.CALCULATION_FAILED not in run.codes, (measured, levels, estimator)
 
 
 @pytest.mark.parametrize('failure', [*FAILURES, *RESULTS], ids=lambda _: '')
@@ -232,7 +232,7 @@ def test_a_law_that_fails_hands_over_to_the_next_level(plugin, failure):
     run.do(SetpointRequest(0, center + 1e-3))
     last = run.do(Measurement(20 * SECOND, center - 1e-4)).report
     assert last.level == 'linear'
-    assert run.codes & {Code.LAW_RAISED, Code.COMMAND_NOT_FINITE}
+    assert run.codes & {StatusCode.LAW_RAISED, StatusCode.COMMAND_NOT_FINITE}
 
 
 @pytest.mark.parametrize('failure', [*FAILURES, *ESTIMATES], ids=lambda _: '')
@@ -247,7 +247,7 @@ def test_an_estimator_that_fails_leads_to_a_hold_and_the_safe_input(plugin, meth
     # None, LinAlgError and numbers that are not finite mean that it cannot predict, and the
     # disturbance is only reported
     if method in ('correct', 'restart'):
-        assert Code.CALCULATION_FAILED in run.codes
+        assert StatusCode.CALCULATION_FAILED in run.codes
     if method == 'correct':
         levels = {report.level for report in run.reports}
         assert levels <= {'hold', 'safe', 'sdre'}
@@ -261,7 +261,7 @@ def test_the_loop_goes_on_when_an_estimator_works_again(monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr(DisturbanceObserver, 'correct', Failing(ZeroDivisionError('once')))
         report = run.do(Measurement(15 * SECOND, center - 1e-4)).report
-        assert (report.level, report.reason.code) == ('hold', Code.CALCULATION_FAILED)
+        assert (report.level, report.reason.code) == ('hold', StatusCode.CALCULATION_FAILED)
         assert 'ZeroDivisionError' in report.reason.values['error']
     assert run.do(Measurement(16 * SECOND, center + 2e-4)).report.level == 'sdre'
 
@@ -279,8 +279,9 @@ def test_requests_and_a_hand_over_contain_a_failing_estimator(plugin):
     center = good.model.states.center
     for k in range(3):
         run.do(Measurement((10 + k) * SECOND, center + 1e-4 * k))
-    bad = tuned('two_tanks', estimator=plugin(DisturbanceObserver, 'rebased', TypeError('bad')))
-    state = bad.hand_over(good, run.state)
+    failing_one = plugin(DisturbanceObserver, 'transferred', TypeError('bad'))
+    bad = tuned('two_tanks', estimator=failing_one)
+    state = bad.switch_to(good, run.state)
     assert state.command is run.state.command
     run.controller, run.state = bad, state
     run.do(ModeChange(Mode.MANUAL))

@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, State, Tuning
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 
@@ -196,13 +196,13 @@ def test_a_setpoint_is_acted_on_from_the_estimate_while_nothing_is_measured():
 def test_a_hold_for_want_of_measurements_refuses_what_it_cannot_track():
     loop = controller()
     state = measured(loop, started(loop), START, 1)[0]
-    for cause in (Code.NO_MEASUREMENT, Code.STAMPS_STAND, Code.TWO_SOURCES):
+    for cause in (StatusCode.NO_MEASUREMENT, StatusCode.STAMPS_STAND, StatusCode.TWO_SOURCES):
         held, command, report = loop.hold(state, NOW + 20 * SECOND, cause)
         assert (report.level, report.reason.code) == ('hold', cause)
         np.testing.assert_array_equal(command, state.command)
         same, refused = loop.request_setpoint(held, np.array([316.0]))
         assert same is held
-        assert (refused.code, refused.cause.code) == (Code.SETPOINT_UNMEASURED, cause)
+        assert (refused.code, refused.cause.code) == (StatusCode.SETPOINT_UNMEASURED, cause)
         # what lies ahead may be tracked then, and what is measured again is
         assert loop.request_setpoint(held, np.array([316.0]), NOW + 60 * SECOND)[1] is None
         again = measured(loop, held, START, 21)[0]

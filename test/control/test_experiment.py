@@ -20,7 +20,7 @@ from koopman_ros.control.experiment import (
     level,
     TrackingMonitor,
 )
-from koopman_ros.core.status import Words
+from koopman_ros.core.status import StatusFormatter
 from koopman_ros.core.units import Displays
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from support.closed_loops import say
@@ -145,7 +145,7 @@ def test_each_level_is_reached_along_its_rate_and_home_at_the_end(
 def test_a_bad_measurement_aborts_and_refuses_a_start(
         measured: tuple[float, float], words: str | None) -> None:
     y = np.array(measured)
-    write = Words(Displays({'temperature': 'K', 'pressure': 'Pa'}))
+    write = StatusFormatter(Displays({'temperature': 'K', 'pressure': 'Pa'}))
     # a stamp heard before moves nothing, but what it carries counts
     for time_ns in (START + SECOND, START):
         after = advance(PAIR, begin(PAIR, START), y, time_ns)

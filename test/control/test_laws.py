@@ -13,7 +13,7 @@ from koopman_ros.control import Tuning
 from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
@@ -370,5 +370,5 @@ def test_a_law_that_is_predicted_unstable_is_not_used():
         patched.setattr(riccati, 'feedback', lambda *arguments, interval, **bounds: feedback(
             *arguments, **bounds))
         refused = law.compute(estimate, setpoint_target(model), None, 1.0, None)
-    assert refused.failure.code is Code.PREDICTED_UNSTABLE
+    assert refused.failure.code is StatusCode.PREDICTED_UNSTABLE
     assert refused.failure.values['interval'] == 1.0

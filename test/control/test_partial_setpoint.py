@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
 from koopman_ros.control.events import EventOutcome
 from koopman_ros.control.steady_state import reachable_target
-from koopman_ros.core.status import Code, Words
+from koopman_ros.core.status import StatusCode, StatusFormatter
 from koopman_ros.core.units import Displays
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
@@ -28,7 +28,7 @@ from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from support.closed_loops import EPOCH
 
 LEVELS, FLOWS = ('h1', 'h2', 'h3'), ('q1', 'q2')
-say = Words(Displays({**dict.fromkeys(LEVELS, 'm'), **dict.fromkeys(FLOWS, 'L/s')}))
+say = StatusFormatter(Displays({**dict.fromkeys(LEVELS, 'm'), **dict.fromkeys(FLOWS, 'L/s')}))
 
 
 def tanks(slope, gain, *, level=1.0, flow=3.0):
@@ -162,14 +162,14 @@ def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
         state, np.array([1.0, 1.0]), EPOCH + SECOND // 1000)
     assert report.level == 'linear'
     assert (report.reason.code, report.reason.cause.code) == (
-        Code.LAW_FAILED, Code.NO_STEADY_STATE)
+        StatusCode.LAW_FAILED, StatusCode.NO_STEADY_STATE)
     assert np.all(np.isfinite(command))
     # the linearised model has one: 2 xi - eta + w2 = 0
     np.testing.assert_allclose(report.target.setpoint, [0.5])
     assert report.target.state[0] == pytest.approx(1.0 + 0.5 * (-0.5 - 0.7), abs=0.01)
     refused = asked(controller, -0.5)[1]
     assert (refused.code, refused.values['cause'].code) == (
-        Code.SETPOINT_NOT_HELD, Code.NO_STEADY_STATE)
+        StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_STEADY_STATE)
     assert refused.values['nearest'] == pytest.approx(0.0, abs=1e-3)
 
 
@@ -190,11 +190,11 @@ def test_a_refusal_names_the_nearest_level_and_what_the_pump_would_need(
     state = disturbed(controller, [1.0, 1.0], [w, 0.0])
     same, refused = asked(controller, value, state)
     assert same is state
-    assert refused.code is Code.SETPOINT_NOT_HELD
+    assert refused.code is StatusCode.SETPOINT_NOT_HELD
     assert (refused.values['signal'], refused.values['value']) == ('h2', value)
     assert refused.values['nearest'] == pytest.approx(nearest, abs=1e-5)
     why = refused.cause
-    assert (why.code, why.values['signal']) == (Code.INPUT_NEEDED, 'q1')
+    assert (why.code, why.values['signal']) == (StatusCode.INPUT_NEEDED, 'q1')
     assert (why.values['lower'], why.values['upper']) == (2.5, upper)
     assert why.values['value'] == pytest.approx(needed, abs=1e-9)
     assert asked(controller, refused.values['nearest'], state)[1] is None
@@ -205,8 +205,8 @@ def test_another_level_that_would_overflow_refuses_too():
     controller = loop(SERIES, 'h2', lower=-9.0, upper=9.0)
     state = disturbed(controller, [1.0, 1.0], [0.0, -0.2])
     refused = asked(controller, 1.6, state)[1]
-    assert refused.code is Code.SETPOINT_NOT_HELD
-    assert (refused.cause.code, refused.cause.values['signal']) == (Code.STATE_LEAVES, 'h1')
+    assert refused.code is StatusCode.SETPOINT_NOT_HELD
+    assert (refused.cause.code, refused.cause.values['signal']) == (StatusCode.STATE_LEAVES, 'h1')
     assert refused.cause.values['value'] == pytest.approx(2.3, abs=1e-9)
     assert refused.values['nearest'] == pytest.approx(1.2, abs=1e-5)
 
@@ -216,7 +216,7 @@ def test_a_limit_tightened_afterwards_withdraws_nothing():
     state, refused = asked(wide, 1.9)
     assert refused is None
     state = stepped(wide, state, [1.0, 1.0], 0)[0]
-    state = narrow.hand_over(wide, state)
+    state = narrow.switch_to(wide, state)
     state, command, report = stepped(narrow, state, [1.0, 1.0], 1)
     np.testing.assert_array_equal(report.target.setpoint, [1.9])
     assert command[0] <= 3.5
@@ -228,7 +228,7 @@ def test_every_level_with_one_pump_has_to_be_a_steady_state():
     assert asked(controller, [1.2, 1.4])[1] is None
     refused = asked(controller, [1.4, 1.4])[1]
     assert (refused.code, refused.cause.code) == (
-        Code.SETPOINT_NOT_HELD, Code.NO_STEADY_STATE)
+        StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_STEADY_STATE)
     held = dict(refused.values['held'])
     # the foot of the perpendicular: (0.4, 0.4) . (1, 2) / 5 = 0.24
     assert held == pytest.approx({'h1': 1.24, 'h2': 1.48}, abs=1e-4)
@@ -329,10 +329,10 @@ def test_a_successor_keeps_the_setpoints_of_the_same_signals():
     state = stepped(before, State(), [1.0, 1.0, 1.0], 0)[0]
     state = asked(before, [1.2, 1.3], state)[0]
     state = stepped(before, state, [1.0, 1.0, 1.0], 1)[0]
-    again = loop(THREE, 'h2', 'h3', bumpless_transfer_time=5.0).hand_over(before, state)
+    again = loop(THREE, 'h2', 'h3', bumpless_transfer_time=5.0).switch_to(before, state)
     np.testing.assert_array_equal(again.setpoint.active, [1.2, 1.3])
     other = loop(THREE, 'h1', 'h3')
-    moved = other.hand_over(before, state)
+    moved = other.switch_to(before, state)
     report = stepped(other, moved, [1.1, 1.0, 0.9], 2)[2]
     np.testing.assert_array_equal(report.target.setpoint, [1.1, 0.9])
 

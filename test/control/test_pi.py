@@ -16,7 +16,7 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.laws.pi import PIParameters
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
@@ -99,7 +99,7 @@ def test_it_begins_where_another_law_ended():
 def test_without_a_gain_the_next_level_acts_and_says_why():
     loop = run(controller(gain=0.0, laws=('pi',)), seconds=5.0)
     assert set(loop.levels) == {'hold'}
-    assert loop.reports[-1].reason.cause.code is Code.NO_PI_GAIN
+    assert loop.reports[-1].reason.cause.code is StatusCode.NO_PI_GAIN
 
 
 def test_two_signals_move_two_inputs_each_its_own():

@@ -27,7 +27,7 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.event_log import records
 from koopman_ros.event_log.loop import replay
 from koopman_ros.model import LiftedModel, load_with_digest
@@ -146,7 +146,7 @@ def test_commands_keep_their_limits_and_follow_from_the_records(name, slow, sequ
                 measured[i] = x[i]
                 answered(Measurement(run.plant.time_ns, measured))
             case 'silence':
-                answered(Silence(now, Code.NO_MEASUREMENT if values[0] > 0.0 else None))
+                answered(Silence(now, StatusCode.NO_MEASUREMENT if values[0] > 0.0 else None))
             case 'setpoint':
                 run.do(SetpointRequest(0, r))
             case 'one setpoint':

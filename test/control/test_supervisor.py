@@ -11,8 +11,8 @@ from scipy.optimize import brentq
 
 from koopman_ros.control import Controller, InputLimits, State, Supervisor, Tuning
 from koopman_ros.control.recovery import rest_under, SafeStateRecovery
-from koopman_ros.control.supervisor import FallbackOrder, Requested
-from koopman_ros.core.status import Code, reason
+from koopman_ros.control.supervisor import FallbackOrder, LevelRequest
+from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.evaluation import exchange
 from koopman_ros.model import Coordinates, linearised_model, Provenance
 from koopman_ros.parameters.model_checks import rests_outside
@@ -35,13 +35,13 @@ from support.closed_loops import (
 ORDER = FallbackOrder(('sdre', 'linear'), (0.2, 1.0), hold_timeout=60.0, recovery_time=10.0)
 
 
-FAR = reason(Code.OUTSIDE_TRAINING, ranges=(('T', 1.0, 2.0),), margin=0.2, level='sdre')
-NO_LAW = reason(Code.LAW_FAILED, level='linear', cause=reason(Code.COMMAND_NOT_FINITE))
-BEST = Requested('sdre')
-LINEAR = Requested('linear', FAR)
-LATE = Requested('linear', NO_LAW, passing=True)
-HOLD = Requested('hold', NO_LAW)
-BLIND = Requested('hold', reason(Code.NO_MEASUREMENT), passing=True)
+FAR = reason(StatusCode.OUTSIDE_TRAINING, ranges=(('T', 1.0, 2.0),), margin=0.2, level='sdre')
+NO_LAW = reason(StatusCode.LAW_FAILED, level='linear', cause=reason(StatusCode.COMMAND_NOT_FINITE))
+BEST = LevelRequest('sdre')
+LINEAR = LevelRequest('linear', FAR)
+LATE = LevelRequest('linear', NO_LAW, passing=True)
+HOLD = LevelRequest('hold', NO_LAW)
+BLIND = LevelRequest('hold', reason(StatusCode.NO_MEASUREMENT), passing=True)
 
 
 def walk(requests):
@@ -58,9 +58,9 @@ def walk(requests):
     ([*[HOLD] * 70, BEST, HOLD, *[BEST] * 11], [*['hold'] * 61, *['safe'] * 21, 'sdre']),
     ([BEST, BLIND, BEST], ['sdre', 'hold', 'sdre']),
     ([LINEAR, BLIND, LINEAR], ['linear', 'hold', 'linear']),
-    ([Requested('safe', FAR), BLIND, BLIND, *[BEST] * 11], [*['safe'] * 13, 'sdre']),
+    ([LevelRequest('safe', FAR), BLIND, BLIND, *[BEST] * 11], [*['safe'] * 13, 'sdre']),
     ([LINEAR, BLIND, *[BEST] * 12], ['linear', 'hold', *['linear'] * 10, 'sdre', 'sdre']),
-    ([Requested('safe', FAR), *[LATE] * 11], [*['safe'] * 11, 'linear']),
+    ([LevelRequest('safe', FAR), *[LATE] * 11], [*['safe'] * 11, 'linear']),
     ([BEST, HOLD, *[LATE] * 11], ['sdre', *['hold'] * 11, 'linear'])],
     ids=['down at once and up after a while', 'a relapse starts the wait anew',
          'a hold becomes the safe input and stays it', 'a passing hold resumes the best',
@@ -78,7 +78,7 @@ def test_reasons_tell_what_is_waited_for():
     assert recovering[-1].reason is None
     assert say(walk([HOLD] * 62)[-1].reason) == f'{say(NO_LAW)}; held for longer than 60 s'
     # under the safe input for another reason, a hold is not said to last longer than it does
-    blind = walk([Requested('safe', FAR), *[BLIND] * 62])
+    blind = walk([LevelRequest('safe', FAR), *[BLIND] * 62])
     assert all(supervisor.reason is BLIND.reason for supervisor in blind[1:-1])
     assert say(blind[-1].reason) == f'{say(BLIND.reason)}; held for longer than 60 s'
 

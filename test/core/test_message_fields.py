@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from koopman_ros.core.message_fields import Place, place, stem
+from koopman_ros.core.message_fields import base_name, MessageField, place
 from koopman_ros.parameters.signal_topics import named_units, Signals
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
@@ -21,12 +21,13 @@ def joints() -> SimpleNamespace:
 @pytest.mark.parametrize(('field', 'value'), [
     ('position[arm]', 1.0), ('velocity[1]', 4.0), ('position[level [m]]', 2.0)])
 def test_number_is_found_by_path(field, value):
-    assert Place('joints', 'sensor_msgs/msg/JointState', field, 'rad').get(joints()) == value
+    assert MessageField('joints', 'sensor_msgs/msg/JointState', field,
+                        'rad').get(joints()) == value
 
 
 def test_path_goes_down_into_a_message():
     message = SimpleNamespace(twist=SimpleNamespace(linear=SimpleNamespace(x=0.5)))
-    found = Place('speed', 'geometry_msgs/msg/TwistStamped', 'twist.linear.x', 'm/s')
+    found = MessageField('speed', 'geometry_msgs/msg/TwistStamped', 'twist.linear.x', 'm/s')
     assert found.get(message) == 0.5
     found.put(message, 0.25)
     assert message.twist.linear.x == 0.25
@@ -35,22 +36,23 @@ def test_path_goes_down_into_a_message():
 @pytest.mark.parametrize('field', ['position[leg]', 'effort[arm]', 'position[7]', 'name[0]'])
 def test_what_is_not_there_is_named(field):
     with pytest.raises(LookupError, match=field.replace('[', r'\[')):
-        Place('joints', 'sensor_msgs/msg/JointState', field, 'rad').get(joints())
+        MessageField('joints', 'sensor_msgs/msg/JointState', field, 'rad').get(joints())
 
 
 @pytest.mark.parametrize('field', ['', '.x', 'x.', 'a b', 'data[', 'data[]', 'x..y', '3'])
 def test_field_that_is_no_path_is_refused(field):
     with pytest.raises(ValueError, match='no path'):
-        Place('t', 'std_msgs/msg/Float64', field, '1')
+        MessageField('t', 'std_msgs/msg/Float64', field, '1')
 
 
 def test_arrays_and_names_grow_with_what_is_written():
     message = SimpleNamespace(name=[], effort=[])
     for name, value in (('left', 1.0), ('right', 2.0), ('left', 3.0)):
-        Place('motors', 'sensor_msgs/msg/JointState', f'effort[{name}]', 'N m').put(message, value)
+        MessageField('motors', 'sensor_msgs/msg/JointState', f'effort[{name}]', 'N m').put(message,
+                                                                                           value)
     assert (message.name, message.effort) == (['left', 'right'], [3.0, 2.0])
     array = SimpleNamespace(data=[])
-    Place('out', 'std_msgs/msg/Float64MultiArray', 'data[1]', '1').put(array, 5.0)
+    MessageField('out', 'std_msgs/msg/Float64MultiArray', 'data[1]', '1').put(array, 5.0)
     assert array.data[1] == 5.0
     assert len(array.data) == 2
 
@@ -69,8 +71,8 @@ def test_rest_of_a_place_follows_from_what_is_said(unit, given, expected):
 
 
 def test_commands_are_named_after_what_is_commanded():
-    assert stem('coolant_temperature', 'K') == 'coolant'
-    assert stem('flow', 'm^3/s') == 'flow'
+    assert base_name('coolant_temperature', 'K') == 'coolant'
+    assert base_name('flow', 'm^3/s') == 'flow'
 
 
 def test_signals_have_names_of_topics_and_units_that_there_are():

@@ -11,7 +11,7 @@ import pytest
 from koopman_ros import plants
 from koopman_ros.control.laws import Law
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.plugins import own_code, plug, plug_in
+from koopman_ros.core.plugins import load_plugin, own_code, plug_in
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
@@ -91,7 +91,7 @@ def test_an_interrupt_is_none_of_its_failures(
     monkeypatch.syspath_prepend(tmp_path)
 
     with pytest.raises(KeyboardInterrupt):
-        plug('plug_interrupted:x', 'law', {})
+        load_plugin('plug_interrupted:x', 'law', {})
     class Interrupted(Law):
         def compute(self, *_: Any) -> Any: ...
 

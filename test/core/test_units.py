@@ -9,7 +9,7 @@ import string
 import numpy as np
 import pytest
 
-from koopman_ros.core.status import Code, reason, Words
+from koopman_ros.core.status import reason, StatusCode, StatusFormatter
 from koopman_ros.core.units import check_unit, Conversion, conversion, Display, Displays
 
 
@@ -54,20 +54,21 @@ def test_a_signal_is_written_in_the_unit_of_its_reader() -> None:
 
 
 def test_every_code_has_its_words() -> None:
-    say = Words(Displays({'T': 'K'}, {'K': Display('K', 'degC', '.2f')}))
+    say = StatusFormatter(Displays({'T': 'K'}, {'K': Display('K', 'degC', '.2f')}))
     assert say(None) == ''
-    for code in Code:
+    for code in StatusCode:
         values = {'signal': 'T'}
         for _, name, form, _ in string.Formatter().parse(code.template):
             if name and name != 'signal':
                 values[name] = {
                     'ranges': (('T', 300.0, 310.0),), 'values': (('T', 300.0),),
-                    'level': 'sdre', 'cause': reason(Code.NO_MEASUREMENT)}.get(form or name, 300.0)
+                    'level': 'sdre', 'cause': reason(StatusCode.NO_MEASUREMENT)}.get(form or name,
+                                                                                     300.0)
         words = say(reason(code, **values))
         assert words
         assert '{' not in words
-    assert say(reason(Code.HELD_TOO_LONG, timeout=60.0, cause=reason(
-        Code.OUTSIDE_SENSOR, signal='T', value=473.15, lower=273.15, upper=373.15))) == (
+    assert say(reason(StatusCode.HELD_TOO_LONG, timeout=60.0, cause=reason(
+        StatusCode.OUTSIDE_SENSOR, signal='T', value=473.15, lower=273.15, upper=373.15))) == (
             'the measured T 200.00 degC is outside the range of the sensor, 0.00 degC to '
             '100.00 degC: check it; held for longer than 60 s')
 

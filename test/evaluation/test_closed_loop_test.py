@@ -15,11 +15,11 @@ from scipy.integrate import quad
 from koopman_ros.control import Controller, InputLimits, State, Tuning
 from koopman_ros.control.laws import Law, LawResult, Linear
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation.closed_loop_plots import draw_loops, plot_law_check
-from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck
+from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops
 from koopman_ros.model import (
     Coordinates,
     LiftedModel,
@@ -27,7 +27,7 @@ from koopman_ros.model import (
     PolynomialObservables,
     Provenance,
     TrainingStates,
-    TriedLoops,
+    VerifiedLoops,
 )
 
 STATE = Coordinates(('level',), ('m',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
@@ -60,7 +60,7 @@ def two_state_rate(x, u):
 
 
 def test_on_a_linear_plant_the_law_is_the_linear_one():
-    found = check_law(two_states(), two_state_rate, loops=32)
+    found = evaluate_closed_loops(two_states(), two_state_rate, loops=32)
     assert (found.loops, found.arrived, found.hopeless) == (32, 32, 0)
     assert found.ratios == pytest.approx(np.ones(32), abs=1e-8)
     assert found.accepted
@@ -75,7 +75,7 @@ def test_on_a_linear_plant_the_law_is_the_linear_one():
 
 
 def test_an_input_of_the_wrong_sign_is_refused():
-    found = check_law(two_states(-B), two_state_rate, loops=16)
+    found = evaluate_closed_loops(two_states(-B), two_state_rate, loops=16)
     assert not found.accepted
     assert (found.loops, found.arrived, found.share_failed) == (16, 0, 1.0)
     assert not found.no_gain.any()
@@ -86,7 +86,7 @@ def test_an_input_of_the_wrong_sign_is_refused():
 
 def test_a_model_without_a_gain_is_refused():
     """What drifts away in it is moved by no input."""
-    found = check_law(scalar(1.0, 0.0), linear_rate(1.0), loops=16)
+    found = evaluate_closed_loops(scalar(1.0, 0.0), linear_rate(1.0), loops=16)
     assert found.no_gain.all()
     assert '(16 without a gain), begun at level' in str(found)
 
@@ -102,7 +102,7 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
     observables = PolynomialObservables.total_degree(1, 4)
     model = LiftedModel(observables, A, np.ones((1, 1)), STATE, INPUT, 's', Provenance('wrong'),
                         readout=A[:1])
-    found = check_law(model, linear_rate(0.5))
+    found = evaluate_closed_loops(model, linear_rate(0.5))
     x0, r = found.starts[:, 0], found.setpoints[:, 0]
     secant = 0.5 - 1.5 * (x0 ** 3 - r ** 3 + x0 ** 4 - r ** 4) / (x0 - r)
     lost = (x0 > r) & (x0 > 0.0) & (secant < -0.8)
@@ -122,7 +122,7 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
     # the right one passes
     A = np.diag([0.5, 0.0, 0.0, 0.0])
     right = replace(model, A=A, readout=A[:1])
-    assert check_law(right, linear_rate(0.5), loops=32).accepted
+    assert evaluate_closed_loops(right, linear_rate(0.5), loops=32).accepted
 
 
 class Constant(Law):
@@ -142,7 +142,8 @@ def held_cost(a, gain, h):
 def test_a_costly_law_is_refused_by_what_it_costs():
     endless = InputLimits(np.full(1, -np.inf), np.full(1, np.inf), np.full(1, np.inf))
     model, h = scalar(), 0.4  # longer than half of 1 / sqrt(2)
-    found = check_law(model, linear_rate(1.0), law=Constant, limits=endless, interval=h, loops=16)
+    found = evaluate_closed_loops(model, linear_rate(1.0), law=Constant, limits=endless,
+                                  interval=h, loops=16)
     u = Linear(model, Tuning.for_model(model), None).compute(
         Estimate(np.ones(1), np.zeros(1)), steady_state_target(model, np.zeros(1)), None, h,
         None).u
@@ -157,19 +158,20 @@ def test_a_costly_law_is_refused_by_what_it_costs():
 def test_what_no_law_can_do_within_the_limits_is_judged_without_them():
     """With |u| <= 0.5 nothing brings dx/dt = x + u back from |x| > 0.5."""
     tight = InputLimits(np.full(1, -0.5), np.full(1, 0.5), np.full(1, np.inf))
-    found = check_law(scalar(), linear_rate(1.0), limits=tight, loops=64)
+    found = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=64)
     assert found.accepted
     assert 20 < found.hopeless < 44
     assert found.loops == 64
     assert np.all(np.isfinite(found.excess))
     # they do not hide what another law costs out there
-    costly = check_law(scalar(), linear_rate(1.0), limits=tight, loops=64, law=Constant)
+    costly = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=64,
+                                   law=Constant)
     far = np.abs(costly.starts[:, 0]) > 0.55
     assert np.sum(far) > 20
     assert np.all(costly.excess[far] > 1.05)
     assert np.max(np.abs(found.setpoints)) <= 0.5 + 1e-9
     # nor is it a recommendation where there is nothing else
-    lost = check_law(scalar(1.0, -1.0), lambda x, u: x, limits=tight, loops=16)
+    lost = evaluate_closed_loops(scalar(1.0, -1.0), lambda x, u: x, limits=tight, loops=16)
     assert lost.loops == 0
     assert not lost.accepted
     assert 'no law arrives in any of ' in str(lost)
@@ -194,11 +196,11 @@ def too_steady():
 
 @cache
 def too_steady_on_its_plant():
-    return check_law(too_steady(), linear_rate(1.0))
+    return evaluate_closed_loops(too_steady(), linear_rate(1.0))
 
 
 def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
-    found = check_law(*cubic(0.0, 6.0, 0.0, 8.0), loops=64)
+    found = evaluate_closed_loops(*cubic(0.0, 6.0, 0.0, 8.0), loops=64)
     assert np.mean(found.poor) > 0.01
     assert np.all(found.excess[found.poor] <= 1.001)
     assert found.accepted
@@ -214,8 +216,8 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
 def test_what_a_better_model_would_save_is_held_against_a_model():
     """A linear model passes beside linear laws, but another would save much."""
     model, rate = cubic(0.5, 0.5, 0.0, 8.0)
-    assert check_law(model, rate, loops=64).failed.sum() == 0
-    found = check_law(model.linearised, rate, loops=64)
+    assert evaluate_closed_loops(model, rate, loops=64).failed.sum() == 0
+    found = evaluate_closed_loops(model.linearised, rate, loops=64)
     assert found.poor.sum() == 0
     assert found.ratios.max() == pytest.approx(1.0)
     assert not found.accepted
@@ -229,22 +231,22 @@ def test_what_a_better_model_would_save_is_held_against_a_model():
 
 def test_what_is_slow_and_cheap_has_not_failed():
     """Between two stable rests the law takes longer than a linear one, and costs less."""
-    found = check_law(*cubic(2.0, 0.0, -2.0, 3.0), loops=64)
+    found = evaluate_closed_loops(*cubic(2.0, 0.0, -2.0, 3.0), loops=64)
     assert (found.arrived, found.poor.sum()) == (found.loops, 0)
     assert found.worst_ratio < 1.0
 
 
 def test_a_model_keeps_the_loops_in_which_its_law_is_lost():
     model = too_steady()
-    found = check_law(model, linear_rate(1.0))
+    found = evaluate_closed_loops(model, linear_rate(1.0))
     tried = found.tried
     assert tried is not None
     model = replace(model, tried_loops=tried)
     for start, setpoint, lost in zip(found.starts, found.setpoints, found.lost, strict=True):
-        assert model.lost_at(start, setpoint) == lost
+        assert model.failed_near(start, setpoint) == lost
     assert model.linearised.tried_loops is None
     # and nothing of a law that is lost nowhere
-    assert check_law(two_states(), two_state_rate, loops=16).tried is None
+    assert evaluate_closed_loops(two_states(), two_state_rate, loops=16).tried is None
 
 
 @pytest.mark.parametrize(('starts', 'setpoints', 'lost'), [
@@ -254,11 +256,11 @@ def test_a_model_keeps_the_loops_in_which_its_law_is_lost():
     (np.zeros((1025, 2)), np.zeros((1025, 2)), np.zeros(1025))])
 def test_tried_loops_that_do_not_fit_are_refused(starts, setpoints, lost):
     with pytest.raises(ValueError, match='incompatible'):
-        TriedLoops(starts, setpoints, lost)
+        VerifiedLoops(starts, setpoints, lost)
 
 
 def test_tried_loops_of_another_plant_are_refused():
-    tried = TriedLoops(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
+    tried = VerifiedLoops(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
     with pytest.raises(ValueError, match='incompatible tried_loops: expected 1 states, got 2'):
         replace(scalar(), tried_loops=tried)
 
@@ -286,7 +288,7 @@ def test_where_its_law_was_lost_the_controller_takes_the_next_one():
     found = too_steady_on_its_plant()
     assert 0 < found.lost.sum() < found.poor.sum() < found.loops
     model = replace(too_steady(), tried_loops=found.tried)
-    for lost, expected in ((True, ('linear', Code.LOST_HERE)), (False, ('sdre', None))):
+    for lost, expected in ((True, ('linear', StatusCode.LOST_HERE)), (False, ('sdre', None))):
         for k in np.flatnonzero(found.lost == lost)[:3]:
             first, *_ = levels_on_the_way(
                 model, ('sdre', 'linear'), found.starts[k, 0], found.setpoints[k, 0])
@@ -313,7 +315,7 @@ def test_the_map_shows_each_loop_once(tmp_path):
 
 
 def test_ranges_are_told_to_what_tells():
-    found = LawCheck(TWO, np.array([[2.0004, 300.0]]), np.array([[-1e-17, 310.012]]),
+    found = ClosedLoopTest(TWO, np.array([[2.0004, 300.0]]), np.array([[-1e-17, 310.012]]),
                      np.array([np.inf]), np.array([False]), np.array([np.inf]), 0)
     assert found.region == 'begun at a 2 m, b 300 K and bound for a 0 m, b 310 K'
 
@@ -324,7 +326,7 @@ def test_setpoints_are_where_an_input_holds_the_plant():
                                   np.array([1.0, 4.0]))
     slope, b = np.array([[-1.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
     model = linearised_model(slope, b, states, INPUT, 's', Provenance('cascade'))
-    found = check_law(model, lambda x, u: x @ slope.T + u @ b.T, loops=32)
+    found = evaluate_closed_loops(model, lambda x, u: x @ slope.T + u @ b.T, loops=32)
     assert found.setpoints[:, 0] == pytest.approx(found.setpoints[:, 1], abs=1e-6)
     assert np.ptp(found.setpoints[:, 0]) > 1.0
     assert found.accepted
@@ -334,7 +336,7 @@ def test_loops_begin_anywhere_in_the_box_and_end_where_the_data_are():
     line = np.linspace(-1.0, 1.0, 41)
     data = TrainingStates.of(np.stack([line, line], 1), np.ones(2))
     model = replace(two_states(), training_states=data)
-    found = check_law(model, two_state_rate, loops=32)
+    found = evaluate_closed_loops(model, two_state_rate, loops=32)
     assert found.loops > 8
     assert all(model.distance(x) <= 1e-9 for x in found.setpoints)
     assert max(model.distance(x) for x in found.starts) > 0.5
@@ -343,17 +345,19 @@ def test_loops_begin_anywhere_in_the_box_and_end_where_the_data_are():
 
 
 def test_a_lift_is_not_charged_for_an_offset_that_an_observer_removes():
-    found = check_law(scalar(-1.0), lambda x, u: 0.3 - x + u, loops=16)
+    found = evaluate_closed_loops(scalar(-1.0), lambda x, u: 0.3 - x + u, loops=16)
     assert found.ratios == pytest.approx(np.ones(16), abs=1e-6)
 
 
 def test_the_watch_sees_it_and_can_end_it():
     seen = []
-    assert check_law(scalar(), linear_rate(1.0), loops=2, watch=seen.append) is not None
+    assert evaluate_closed_loops(scalar(), linear_rate(1.0), loops=2,
+                                 watch=seen.append) is not None
     assert seen[0] == 0.0
     assert 0.9 < seen[-1] < 1.0
     assert seen == sorted(seen)
-    assert check_law(scalar(), linear_rate(1.0), watch=lambda share: share > 0.3) is None
+    assert evaluate_closed_loops(scalar(), linear_rate(1.0),
+                                 watch=lambda share: share > 0.3) is None
 
 
 def test_a_plant_without_inputs_has_no_closed_loop():
@@ -361,4 +365,4 @@ def test_a_plant_without_inputs_has_no_closed_loop():
     model = LiftedModel(PolynomialObservables.total_degree(1, 1), -np.eye(1), np.zeros((1, 0)),
                         STATE, none, 's', Provenance('free'))
     with pytest.raises(ValueError, match='a plant without inputs has no closed loop'):
-        check_law(model, lambda x, u: -x)
+        evaluate_closed_loops(model, lambda x, u: -x)

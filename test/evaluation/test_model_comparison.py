@@ -14,7 +14,11 @@ from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
 from koopman_ros.core.signals import Outputs
 from koopman_ros.evaluation import model_comparison
-from koopman_ros.evaluation.model_comparison import ModelComparison, Recent, Windows
+from koopman_ros.evaluation.model_comparison import (
+    MeasurementBuffer,
+    ModelComparison,
+    PredictionWindows,
+)
 from koopman_ros.evaluation.simulate import at, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
@@ -40,14 +44,14 @@ def one(model: LiftedModel, outputs: Outputs | None = None) -> Controller:
         outputs)
 
 
-def compare(present: LiftedModel, candidate: LiftedModel, windows: Windows,
+def compare(present: LiftedModel, candidate: LiftedModel, windows: PredictionWindows,
             outputs: Outputs | None = None) -> ModelComparison | None:
     return model_comparison.compare(one(present, outputs), one(candidate, outputs), windows)
 
 
-def recent(x: np.ndarray, u: np.ndarray, length: float, seconds: float = 1.0) -> Recent:
+def recent(x: np.ndarray, u: np.ndarray, length: float, seconds: float = 1.0) -> MeasurementBuffer:
     """Remember samples (N, n_x), before each of which inputs (N, n_u) acted."""
-    found = Recent()
+    found = MeasurementBuffer()
     for k, (value, held) in enumerate(zip(x, u, strict=True)):
         found.add(Measurement(round((1 + k * seconds) * SECOND), value), ACCEPTED, held, length)
     return found
@@ -174,47 +178,48 @@ def test_memory_is_bounded_and_averages_the_inputs():
     assert windows.places.shape == (8, 20)
 
 
-def samples(found: Recent, times: range, report: MeasurementReport = ACCEPTED,
-            u: np.ndarray | None = None, applied: np.ndarray | None = None) -> Recent:
+def samples(found: MeasurementBuffer, times: range, report: MeasurementReport = ACCEPTED,
+            u: np.ndarray | None = None, applied: np.ndarray | None = None) -> MeasurementBuffer:
     for time in times:
         found.add(Measurement(time * SECOND, np.array([float(time)]), applied), report,
                   np.zeros(1) if u is None else u, 100.0)
     return found
 
 
-def cut(found: Recent, seconds: float = 40.0) -> Windows:
+def cut(found: MeasurementBuffer, seconds: float = 40.0) -> PredictionWindows:
     windows = found.windows(seconds)
     assert windows is not None
     return windows
 
 
 def test_too_little_is_no_window():
-    assert Recent().windows(40.0) is None
-    assert samples(Recent(), range(1, 9)).windows(40.0) is None
-    assert cut(samples(Recent(), range(1, 10))).places.tolist() == [list(range(8))]
+    assert MeasurementBuffer().windows(40.0) is None
+    assert samples(MeasurementBuffer(), range(1, 9)).windows(40.0) is None
+    assert cut(samples(MeasurementBuffer(), range(1, 10))).places.tolist() == [list(range(8))]
     # a fifth of what is to be remembered
-    assert samples(Recent(), range(1, 20)).windows(100.0) is None
+    assert samples(MeasurementBuffer(), range(1, 20)).windows(100.0) is None
     # rare measurements are all there is
-    assert cut(samples(Recent(), range(100, 1000, 100))).places.shape == (1, 8)
+    assert cut(samples(MeasurementBuffer(), range(100, 1000, 100))).places.shape == (1, 8)
 
 
 def test_clock_that_goes_back_or_an_unknown_input_begins_anew():
-    assert cut(samples(samples(Recent(), range(50, 90)), range(1, 10))).x.ravel().tolist() == list(
+    assert cut(samples(samples(MeasurementBuffer(), range(50, 90)),
+                       range(1, 10))).x.ravel().tolist() == list(
         range(1, 10))
-    found = samples(Recent(), range(1, 30))
+    found = samples(MeasurementBuffer(), range(1, 30))
     found.add(Measurement(30 * SECOND, np.array([30.0])), ACCEPTED, None, 100.0)
     assert found.windows(40.0) is None
 
 
 def test_no_window_spans_a_gap():
-    windows = cut(samples(samples(Recent(), range(1, 12)), range(20, 40)))
+    windows = cut(samples(samples(MeasurementBuffer(), range(1, 12)), range(20, 40)))
     assert np.max(windows.steps) == 9.0
     assert np.all(windows.steps[windows.places] == 1.0)
     assert len(windows.places) == 4
 
 
 def test_rejected_measurement_leaves_its_input_and_late_ones_nothing():
-    found = samples(Recent(), range(1, 10))
+    found = samples(MeasurementBuffer(), range(1, 10))
     samples(found, range(10, 11), REJECTED, np.ones(1))
     samples(found, range(9, 10), MeasurementReport(Arrival.LATE), np.full(1, 9.0))
     windows = cut(samples(found, range(11, 12)))
@@ -223,6 +228,6 @@ def test_rejected_measurement_leaves_its_input_and_late_ones_nothing():
 
 
 def test_measured_input_counts_where_it_is_a_number():
-    found = samples(Recent(), range(1, 6), u=np.ones(1), applied=np.full(1, 2.0))
+    found = samples(MeasurementBuffer(), range(1, 6), u=np.ones(1), applied=np.full(1, 2.0))
     samples(found, range(6, 11), u=np.ones(1), applied=np.full(1, np.nan))
     assert cut(found).u.ravel().tolist() == [2.0] * 4 + [1.0] * 5

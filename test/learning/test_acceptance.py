@@ -14,8 +14,8 @@ from scipy.optimize import brentq
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
-from koopman_ros.evaluation.closed_loop_test import LawCheck
-from koopman_ros.learning import decide, learn_lift, Thresholds
+from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
+from koopman_ros.learning import evaluate_model, learn_lift, Thresholds
 from koopman_ros.learning.acceptance import uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.identification import (
@@ -57,9 +57,10 @@ def trained(found, shipped):
 @pytest.fixture
 def no_loops(monkeypatch, shipped):
     """Leave the closed loops out where another figure decides."""
-    passed = LawCheck(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool),
+    passed = ClosedLoopTest(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool),
                       np.ones(9), 0)
-    monkeypatch.setattr(sys.modules[decide.__module__], 'check_law', lambda *_, **__: passed)
+    monkeypatch.setattr(sys.modules[evaluate_model.__module__], 'check_law', lambda *_,
+                        **__: passed)
 
 
 def linear_lift(model, slope, input_matrix):
@@ -108,7 +109,7 @@ def test_nominal_input_that_is_not_known_is_the_one_that_holds_the_nominal_state
 
 
 def test_a_better_lift_is_accepted(found, trained, shipped):
-    decision = decide(found, trained, shipped, Thresholds())
+    decision = evaluate_model(found, trained, shipped, Thresholds())
     assert decision.accepted
     assert (decision.reasons, decision.warnings) == ((), ())
     assert decision.law_check.arrived == decision.law_check.loops == 128
@@ -123,12 +124,12 @@ def test_a_better_lift_is_accepted(found, trained, shipped):
 
 @pytest.mark.usefixtures('no_loops')
 def test_the_present_lift_does_not_beat_itself(found, trained):
-    decision = decide(found, trained, trained.model, Thresholds())
+    decision = evaluate_model(found, trained, trained.model, Thresholds())
     own = f'{decision.rmse[0]:.4g} K'
     assert decision.reasons == (
         f'its error on held-out records, {own}, is not 10 % below that of the present model, '
         f'{own}',)
-    assert decide(found, trained, trained.model, Thresholds(margin=0.0)).accepted
+    assert evaluate_model(found, trained, trained.model, Thresholds(margin=0.0)).accepted
 
 
 @pytest.mark.usefixtures('no_loops')
@@ -139,7 +140,7 @@ def test_what_is_accepted_can_be_loaded_and_what_cannot_is_refused(
     inputs, path = trained.model.inputs, tmp_path / 'lift.safetensors'
     center = 0.5 * (inputs.lower + inputs.upper) + share * 0.5 * (inputs.upper - inputs.lower)
     model = replace(trained.model, inputs=replace(inputs, center=center))
-    decision = decide(found, replace(trained, model=model), None, Thresholds())
+    decision = evaluate_model(found, replace(trained, model=model), None, Thresholds())
     reasons = [reason for reason in decision.reasons if 'nominal coolant_temperature' in reason]
     save(model, path)
     if abs(share) < 1.0:
@@ -156,29 +157,30 @@ def test_what_is_accepted_can_be_loaded_and_what_cannot_is_refused(
 @pytest.mark.usefixtures('no_loops')
 def test_what_the_estimate_warns_of_is_passed_on(found, trained, shipped):
     warned = replace(found, warnings=('the pumps moved together',))
-    assert decide(warned, trained, shipped, Thresholds()).warnings == warned.warnings
+    assert evaluate_model(warned, trained, shipped, Thresholds()).warnings == warned.warnings
 
 
 @pytest.mark.usefixtures('no_loops')
 def test_margin_is_a_share(found, trained, shipped):
-    decision = decide(found, trained, shipped, Thresholds())
+    decision = evaluate_model(found, trained, shipped, Thresholds())
     ratio = float(decision.rmse[0] / decision.linear_rmse[0])
-    assert decide(found, trained, shipped, Thresholds(margin=1.0 - 1.01 * ratio)).accepted
-    (reason,) = decide(found, trained, shipped, Thresholds(margin=1.0 - 0.99 * ratio)).reasons
+    assert evaluate_model(found, trained, shipped, Thresholds(margin=1.0 - 1.01 * ratio)).accepted
+    (reason,) = evaluate_model(found, trained, shipped,
+                               Thresholds(margin=1.0 - 0.99 * ratio)).reasons
     assert 'the best linear model' in reason
 
 
 @pytest.mark.usefixtures('no_loops')
 def test_coordinates_that_have_collapsed(found, trained, shipped):
     cond = trained.figures.fit.cond
-    (reason,) = decide(found, trained, shipped, Thresholds(condition=0.99 * cond)).reasons
+    (reason,) = evaluate_model(found, trained, shipped, Thresholds(condition=0.99 * cond)).reasons
     assert reason == (f'the condition number of its coordinates, {cond:.3g}, is above '
                       f'{0.99 * cond:.3g}: use fewer coordinates')
 
 
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
-    decision = decide(found, wrong, shipped, Thresholds(), loops=16)
+    decision = evaluate_model(found, wrong, shipped, Thresholds(), loops=16)
     assert decision.law_check.share_failed == 1.0
     (reason,) = (reason for reason in decision.reasons if 'controller' in reason)
     assert reason.startswith('it is no controller of the estimated drift: the law fails in 16 of '
@@ -189,16 +191,16 @@ def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
 
 def test_loops_that_are_ended_leave_no_decision(found, trained, shipped):
     with pytest.raises(Stopped):
-        decide(found, trained, shipped, Thresholds(), watch=lambda share: share > 0.5)
+        evaluate_model(found, trained, shipped, Thresholds(), watch=lambda share: share > 0.5)
 
 
 @pytest.mark.usefixtures('no_loops')
 def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, trained):
     diverging = linear_lift(trained.model, 1e4, 1.0)
-    decision = decide(found, trained, diverging, Thresholds())
+    decision = evaluate_model(found, trained, diverging, Thresholds())
     assert decision.current_rmse == [np.inf]
     assert decision.accepted
-    decision = decide(found, replace(trained, model=diverging), diverging, Thresholds())
+    decision = evaluate_model(found, replace(trained, model=diverging), diverging, Thresholds())
     assert 'its error on held-out records, inf K, is not 10 % below that of the present model' in (
         ' '.join(decision.reasons))
 
@@ -220,7 +222,7 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     """The reactor's concentration moves, too; its temperature alone does not tell where it is."""
     run = driven(two_state_reactor(), 20.0, coolant=(294.0, 302.0), seed=2, noise=0.03)
     found = identify(shipped.plant, [run.episode()], degrees=(1, 2), methods=methods(20))
-    decision = decide(found, trained, shipped, Thresholds())
+    decision = evaluate_model(found, trained, shipped, Thresholds())
     coloured, warning = decision.warnings
     # what is not measured moves slowly
     assert coloured.startswith('the noise of temperature is coloured (autocorrelation 0.')
@@ -248,7 +250,8 @@ def test_noise_that_is_coloured_is_named(found, trained, shipped):
             segments = Segments.of([clean], longest_step([clean]))
             path = segments.path(found.drift.rate, clean.x[:1])[segments.measured[:, 0], 0]
             episodes.append(replace(clean, x=path + NOISE * n[:, None]))
-        return decide(replace(found, held_out=tuple(episodes)), trained, shipped, Thresholds())
+        return evaluate_model(replace(found, held_out=tuple(episodes)), trained, shipped,
+                              Thresholds())
 
     assert noisy(0.0).warnings == ()
     (said, *_) = noisy(0.8).warnings

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from koopman_ros.core.datasets import split_by_episode
-from koopman_ros.learning import fit, Growth, NoUsefulLift, train
+from koopman_ros.learning import fit, IncrementalTraining, train, TrainingFailed
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.metrics import ROUNDING
 from support import small_plants
@@ -84,15 +84,15 @@ def test_a_start_without_a_result_is_no_candidate(change, words):
         train(UNFORCED, unforced_samples(), recorded, starts=1)
         given = replace(recorded.found[2][0][2], **change)
     # a ValueError to whoever does not know it
-    assert issubclass(NoUsefulLift, ValueError)
-    with pytest.raises(NoUsefulLift, match=f'no start gave a usable lift with n_z = 2: {words}'):
+    assert issubclass(TrainingFailed, ValueError)
+    with pytest.raises(TrainingFailed, match=f'no start gave a usable lift with n_z = 2: {words}'):
         train(UNFORCED, unforced_samples(), Given(given), starts=2)
 
 
 def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    with pytest.raises(NoUsefulLift, match=r'the lift with n_z = 2 does not predict the motion '
+    with pytest.raises(TrainingFailed, match=r'the lift with n_z = 2 does not predict the motion '
                                            r'better than a linear model \(relative error rx = '
                                            r'[0-9.e-]+ against [0-9.e-]+ on validation .*wider '
                                            r'range$'):
@@ -114,8 +114,9 @@ def test_a_held_out_episode_at_rest():
 def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     """Two free coordinates can be x1 and x1^2, whose rw is 0 and which do not hold x2."""
     plant, samples = small_plants.TWO_STATE, small_plants.two_state_samples(400)
-    exact = Growth(3, identity=False, decoder=0, max_iterations=150)
-    with pytest.raises(NoUsefulLift, match=r'does not predict the motion better than a linear .*, '
+    exact = IncrementalTraining(3, identity=False, decoder=0, max_iterations=150)
+    with pytest.raises(TrainingFailed,
+                       match=r'does not predict the motion better than a linear .*, '
                                            r'or use identity coordinates$'):
         train(plant, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
@@ -132,7 +133,7 @@ def test_a_lift_whose_law_goes_nowhere_is_no_controller():
     for recipe, more in ((SMALL, 'more starts'), (RECIPE, 'a smaller n_z, more starts'), (
             replace(SMALL, identity=False), 'identity coordinates, a smaller n_z, more starts')):
         # what is so already is not advised
-        with pytest.raises(NoUsefulLift, match=(
+        with pytest.raises(TrainingFailed, match=(
                 rf'the lift with n_z = {recipe.n_z} is no controller: no law arrives in any of '
                 rf'\d+ closed loops over the box.*: use {more}, or a narrower range$')):
             train(plant, runaway, recipe, starts=1, loops=16)
@@ -245,5 +246,5 @@ def test_an_interrupt_before_there_is_anything_of_use():
     with pytest.raises(KeyboardInterrupt):
         train(UNFORCED, unforced_samples(), Given(KeyboardInterrupt()), starts=3)
     assert torch.get_num_threads() == threads
-    with pytest.raises(NoUsefulLift):
+    with pytest.raises(TrainingFailed):
         watched(lambda now: True, replace(SMALL, hidden_first=1, ridge=1e6))

@@ -12,9 +12,9 @@ import pytest
 from koopman_ros.execution.training import class_lines, scalars
 from koopman_ros.learning import (
     compare_classes,
-    decide,
     drift_sampling,
-    Growth,
+    evaluate_model,
+    IncrementalTraining,
     NeuralDrift,
     retrain,
     Thresholds,
@@ -38,8 +38,10 @@ def small_networks():
     """Learn small networks; that of the identity lift is the task's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drift_sampling, 'usual_recipes', lambda _: {
-            'neural drift': NeuralDrift(3, max_iterations=60), 'identity lift': Growth(2),
-            'free lift': Growth(1, identity=False, hidden_first=3, max_iterations=60)})
+            'neural drift': NeuralDrift(3, max_iterations=60),
+            'identity lift': IncrementalTraining(2),
+            'free lift': IncrementalTraining(1, identity=False, hidden_first=3,
+                                             max_iterations=60)})
         yield
 
 
@@ -100,7 +102,7 @@ def test_noise_neither_hides_an_error_nor_makes_one(bend, chosen):
     assert 1.05 < linear / polynomial < np.sqrt(2.0)
     assert comparison.chosen.name == chosen
     # which no linear model has to be better than
-    assert decide(found, comparison, None, GATE).accepted
+    assert evaluate_model(found, comparison, None, GATE).accepted
 
 
 def test_a_class_that_the_gate_would_refuse_is_not_chosen(found, best):
@@ -121,7 +123,7 @@ def test_a_class_that_is_named_is_learned_alone(found, name):
     alone = compared(found, name)
     assert [one.name for one in alone.contenders] == [name]
     assert alone.chosen.name == name
-    decision = decide(found, alone, None, GATE, loops=16)
+    decision = evaluate_model(found, alone, None, GATE, loops=16)
     # its loops are not run again
     assert decision.law_check is alone.chosen.law_check
     assert decision.rmse == alone.figures.rollout_rmse

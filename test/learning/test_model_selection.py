@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import split_by_episode
-from koopman_ros.evaluation.closed_loop_test import check_law
+from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import (
     compare,
     Edmd,
     evaluate,
     fit,
-    Growth,
+    IncrementalTraining,
     model_selection,
     ModelCandidate,
     NeuralDrift,
-    NoUsefulLift,
+    TrainingFailed,
 )
 from koopman_ros.learning.lift.neural_drift import with_units_of
 from koopman_ros.learning.model_selection import plainest
@@ -118,12 +118,13 @@ def test_a_class_may_be_learned_alone():
 
 
 def test_a_class_that_cannot_be_learned_has_its_reason():
-    found = compare(BENT, bent_samples(), {'lift': Growth(1)}, degrees=(40,), starts=1, loops=0)
+    found = compare(BENT, bent_samples(), {'lift': IncrementalTraining(1)}, degrees=(40,),
+                    starts=1, loops=0)
     assert found.chosen.name == 'linear'
     assert [one.model is None for one in found.contenders] == [False, True, True]
     assert found.contenders[2].refusal.startswith('n_z = 1 is too small for 1 states')
     none = [contender(name, math.inf, 'is none') for name in ('a', 'b')]
-    with pytest.raises(NoUsefulLift, match='no class has a model: a: is none; b: is none'):
+    with pytest.raises(TrainingFailed, match='no class has a model: a: is none; b: is none'):
         plainest(none)
 
 
@@ -138,12 +139,12 @@ def test_a_class_may_be_asked_for():
 def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    recipes = {'lift': Growth(2, hidden_first=3, max_iterations=5)}
+    recipes = {'lift': IncrementalTraining(2, hidden_first=3, max_iterations=5)}
     found = compare(BENT, linear, recipes, starts=1, loops=16)
     assert found.chosen.name == 'linear'
     assert 'does not predict the motion better' in found.contenders[2].refusal
     assert found.contenders[2].model is None
-    with pytest.raises(NoUsefulLift, match='does not predict the motion better'):
+    with pytest.raises(TrainingFailed, match='does not predict the motion better'):
         compare(BENT, linear, recipes, starts=1, choose='lift', loops=0)
 
 
@@ -154,7 +155,7 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     def fails(model, rate, loops, **_):
         excess = np.ones(16)
         excess[:failing.get(model.n_z, 0)] = np.inf
-        return replace(check_law(model, rate, loops=loops), excess=excess)
+        return replace(evaluate_closed_loops(model, rate, loops=loops), excess=excess)
 
     monkeypatch.setattr(model_selection, 'check_law', fails)
     found = compare(BENT, bent_samples(), {}, loops=16)

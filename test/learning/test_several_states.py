@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.execution.training import constant_lines, scalars
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.identification import identify, identify_unmeasured
-from koopman_ros.learning.task import known
+from koopman_ros.learning.task import resolve_signals
 from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
 from koopman_ros.plants.library.two_tanks import TwoTanks
@@ -33,9 +33,9 @@ LEVEL_NOISE = 2e-4  # m
 TANKS = TwoTanks().system()
 RANGE = 0.5 * TANKS.nominal_state, 1.6 * TANKS.nominal_state
 # not in the order of the model
-STATES = tuple(RecordedState(name, 'm', Place('/tanks', JOINTS, f'position[{name}]', 'cm'))
+STATES = tuple(RecordedState(name, 'm', MessageField('/tanks', JOINTS, f'position[{name}]', 'cm'))
                for name in ('level_2', 'level_1'))
-INPUTS = tuple(RecordedInput(name, 'V', Place('/pumps', ARRAY, f'data[{k}]', 'mV'))
+INPUTS = tuple(RecordedInput(name, 'V', MessageField('/pumps', ARRAY, f'data[{k}]', 'mV'))
                for k, name in ((1, 'pump_2'), (0, 'pump_1')))
 
 
@@ -236,7 +236,7 @@ def test_constants_are_in_summary_report_and_diagnostics(by_equations):
      'constants name orifice_1, but there is no physical_model')])
 def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        known(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)
+        resolve_signals(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)
 
 
 def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
@@ -246,8 +246,8 @@ def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
     present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), TANKS.B, *boxes, 's',
                                Provenance('two tanks'))
     task = TrainingTask((), '', 'present', STATES[:1], INPUTS)
-    plant, states, inputs = known(replace(task, physical_model='two_tanks'), present)
+    plant, states, inputs = resolve_signals(replace(task, physical_model='two_tanks'), present)
     assert plant.state_names == tuple(state.name for state in states) == ('level_2',)
     assert plant.input_names == tuple(one.name for one in inputs) == TANKS.input_names
     with pytest.raises(ValueError, match=r'has the states level_1 \[m\], level_2 \[m\]'):
-        known(task, present)
+        resolve_signals(task, present)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import PlantDescription
-from koopman_ros.learning import Growth, train
+from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.model import (
     Box,
@@ -447,7 +447,7 @@ def test_what_does_not_fit_is_refused(states, fill, words):
 
 
 def test_training_on_several_states_notes_them_and_on_one_does_not():
-    recipe = Growth(3, hidden_first=3, max_iterations=2)
+    recipe = IncrementalTraining(3, hidden_first=3, max_iterations=2)
     samples = two_state_samples()
     model = train(TWO_STATE, samples, recipe, starts=1, refuse=False).model
     known = model.training_states
@@ -456,8 +456,8 @@ def test_training_on_several_states_notes_them_and_on_one_does_not():
     # but for rounding on the way to scaled deviations and back
     assert all(model.distance(x) < 1e-12 for x in samples.x)
     assert model.distance(np.array([-6.0, 12.0])) > 0.5
-    assert train(BENT, bent_samples(), Growth(2, hidden_first=3, max_iterations=2), starts=1,
-                 refuse=False).model.training_states is None
+    assert train(BENT, bent_samples(), IncrementalTraining(2, hidden_first=3, max_iterations=2),
+                 starts=1, refuse=False).model.training_states is None
 
 
 def test_lists_do_as_arrays_do_and_another_size_is_refused():

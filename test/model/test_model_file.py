@@ -27,7 +27,7 @@ from koopman_ros.model import (
     PolynomialObservables,
     save,
     TrainingStates,
-    TriedLoops,
+    VerifiedLoops,
 )
 from support.closed_loops import content
 from support.random_lifts import random_lift
@@ -51,7 +51,7 @@ MODELS = {
     'read-out': replace(PLAIN, readout=RNG.normal(size=(2, 7))),
     'pre-feedback': replace(random_lift(n_u=2), pre_feedback=RNG.normal(size=(2, 2))),
     'input terms': replace(PLAIN, input_terms=InputTerms(RNG.normal(size=(5, 2, 1)))),
-    'tried loops': replace(PLAIN, tried_loops=TriedLoops(
+    'tried loops': replace(PLAIN, tried_loops=VerifiedLoops(
         *RNG.normal(size=(2, 7, 2)), np.arange(7) % 3 == 0)),
     'refused': with_origin(model_class='neural drift', accepted=False,
                            reasons=('too large', 'too few')),

@@ -24,7 +24,7 @@ from koopman_ros.parameters.signal_topics import Signals
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.records import read_messages
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from support.nodes import seconds, temperature, value
 

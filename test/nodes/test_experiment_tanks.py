@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
 from support.nodes import seconds
 from support.tanks import LEVELS, linear, PUMPS, TANKS

@@ -31,7 +31,7 @@ INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'level', 'd
 LIMITS = {'at_range_coolant_temperature', 'at_rate_coolant_temperature', 'at_limit_temperature'}
 WIRING = preset_wiring('reactor')
 assert WIRING is not None
-TYPES = {topic: kind for topic, (kind, _) in topics.known(WIRING).items()}
+TYPES = {topic: kind for topic, (kind, _) in topics.expected_topics(WIRING).items()}
 ONE, NONE = np.ones(1), np.zeros(1)
 # by a Kalman filter, which says more than the observer, and a law that plans
 ESTIMATE = EstimateReport(ONE, NONE, False, np.eye(1), Innovation(NONE, 1.0, 1))

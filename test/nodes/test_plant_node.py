@@ -22,7 +22,7 @@ from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.plants import sensor_noise
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from support.nodes import seconds, temperature, value
 

@@ -31,7 +31,7 @@ from koopman_ros.nodes import player
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.trainer import player_table, preset_wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from support.bag_samples import DEFAULT_QOS
 from support.nodes import complaint, run_here, temperature, TIMEOUT
@@ -95,7 +95,7 @@ def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) ->
     assert set(stored) == TOPICS
     wiring = preset_wiring('two_state')
     assert wiring is not None
-    known = topics.known(wiring)
+    known = topics.expected_topics(wiring)
     for topic, metadata in stored.items():
         kind, _ = known.get(topic) or known[topic.removeprefix('/')]
         ros.node.create_publisher(kind, topic, 1)

@@ -30,8 +30,8 @@ from koopman_ros.nodes import trainer
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.records import BagMessage, read_messages, summary
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.recording import free_name
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 

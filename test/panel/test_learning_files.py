@@ -26,7 +26,7 @@ from koopman_ros.panel.training_report import (
     TrainingReport,
 )
 from koopman_ros.parameters.panel import panel_signals, panel_table
-from koopman_ros.parameters.signal_topics import Wiring
+from koopman_ros.parameters.signal_topics import SignalTopics
 
 MARKUP = '<script>alert(1)</script>'
 FIGURES = {
@@ -126,7 +126,7 @@ def test_a_report_is_followed(base: Path) -> None:
     given = {'system': 'reactor'}
     values = {name: row.default for name, row in panel_table(None, given).rows.items()}
     settings = panel_table(None, given).snapshot(values)
-    watch = LearningWatch('reactor', Wiring(
+    watch = LearningWatch('reactor', SignalTopics(
         panel_signals(None, given), settings.states, settings.inputs), '/', str)
     try:
         assert 'train one' in watch.compare('reactor_nz4').text

@@ -26,7 +26,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from koopman_ros.panel import trend_page
-from koopman_ros.panel.connections import Listener, Seldom
+from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
 from koopman_ros.panel.trend_page import zoomed
 from support.browser import opened_browser, Pages
@@ -335,7 +335,7 @@ def test_a_process_that_may_open_few_files_has_fewer_connections(
 
 def test_a_log_has_so_many_lines_in_a_period(caplog: pytest.LogCaptureFixture) -> None:
     log = logging.getLogger('test.seldom')
-    log.addFilter(Seldom(most=3, period=3600.0))
+    log.addFilter(RateLimiter(most=3, period=3600.0))
     for number in range(100):
         log.error('line %d', number)
     messages = [record.getMessage() for record in caplog.records]

@@ -14,16 +14,18 @@ import pytest
 
 from koopman_ros import records
 from koopman_ros.core.datasets import Episode
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
-from koopman_ros.records.series import spikes_and_jumps
+from koopman_ros.records.series import outliers_and_steps
 from support.bag_samples import Sample
 
 MEASURED, COMMAND = '/level', '/valve'
 PRESSURE = 'sensor_msgs/msg/FluidPressure'
-STATE = records.RecordedState('level', 'Pa', Place(MEASURED, PRESSURE, 'fluid_pressure', 'Pa'))
-INPUT = records.RecordedInput('valve', 'Pa', Place(COMMAND, PRESSURE, 'fluid_pressure', 'Pa'))
+STATE = records.RecordedState('level', 'Pa',
+                              MessageField(MEASURED, PRESSURE, 'fluid_pressure', 'Pa'))
+INPUT = records.RecordedInput('valve', 'Pa',
+                              MessageField(COMMAND, PRESSURE, 'fluid_pressure', 'Pa'))
 # what the wall clock says where stamps are simulated
 WALL = 1_700_000_000 * SECOND
 
@@ -79,7 +81,7 @@ def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def read(*paths: Path) -> tuple[list[Episode], records.Account]:
+def read(*paths: Path) -> tuple[list[Episode], records.ImportReport]:
     episodes, account = records.loop_episodes(paths, [STATE], [INPUT])
     assert account.used == sum(map(len, episodes))
     return episodes, account
@@ -360,7 +362,7 @@ def test_type_that_only_bears_the_name(
     with records.BagWriter(tmp_path / 'run.mcap') as writer:
         writer.add_topic('/t', replace(known, text=text))
         writer.write('/t', sample.data, 1)
-    place = Place('/t', 'sensor_msgs/msg/Temperature', 'temperature', 'degC')
+    place = MessageField('/t', 'sensor_msgs/msg/Temperature', 'temperature', 'degC')
     for read in (lambda: records.read_series(writer.path, '/t'),
                  lambda: records.read_series(writer.path, place),
                  lambda: records.loop_episodes(
@@ -383,7 +385,7 @@ def motion() -> np.ndarray:
 
 def found(values: np.ndarray) -> list[list[int]]:
     """Return where there are spikes, and where jumps."""
-    return [np.flatnonzero(kind).tolist() for kind in spikes_and_jumps(values, 1.0)]
+    return [np.flatnonzero(kind).tolist() for kind in outliers_and_steps(values, 1.0)]
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.1, 1.0])

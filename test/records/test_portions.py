@@ -13,11 +13,12 @@ import pytest
 
 from koopman_ros import records
 from koopman_ros.core.datasets import Episode
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.records import segments
 from support.long_records import FIELD, TYPE, write
 
-PLACES = {name: Place(f'/{name}', TYPE, FIELD, '1') for name in ('warm', 'cold', 'valve', 'flow')}
+PLACES = {name: MessageField(f'/{name}', TYPE, FIELD, '1') for name in ('warm', 'cold', 'valve',
+                                                                        'flow')}
 STATES = [records.RecordedState(name, '1', PLACES[name]) for name in ('warm', 'cold')]
 COMMANDED = records.RecordedInput('valve', '1', PLACES['valve'], None)
 MEASURED = replace(COMMANDED, measured=PLACES['flow'])
@@ -102,7 +103,7 @@ def test_state_that_falls_silent_does_not_hold_up_the_others(tmp_path: Path) -> 
 def test_memory_does_not_grow_with_the_record(tmp_path: Path) -> None:
     def peak(count: int) -> int:
         path = record(tmp_path / f'{count}.mcap', count)
-        account = records.Account()
+        account = records.ImportReport()
         stream: Iterator[Episode] = records.stream_episodes([path], STATES, [MEASURED], account)
         tracemalloc.start()
         try:

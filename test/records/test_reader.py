@@ -17,7 +17,7 @@ import zstandard
 
 from koopman_ros import records
 from koopman_ros.core import message_fields
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records.metadata import dump_offered_qos, parse_offered_qos
 from support.bag_samples import (
@@ -381,7 +381,7 @@ def test_numbered_file_that_is_not_listed_is_no_secret(tmp_path: Path, name: str
 @pytest.mark.parametrize('named', ['std_msgs/Float64', 'std_msgs/msg/Float64'])
 def test_short_and_full_names_are_one_type(tmp_path: Path, schema: str, named: str) -> None:
     path = foreign(tmp_path / 'run.mcap', name=schema)
-    for place in (Place('/x', named, 'data', '1'),
+    for place in (MessageField('/x', named, 'data', '1'),
                   message_fields.place('/x', 'x', '1', {'type': named})):
         assert records.read_series(path, place).values.tolist() == [1.0]
     assert records.summary(path).types == {'/x': 'std_msgs/msg/Float64'}
@@ -423,7 +423,7 @@ def test_small_integers_are_the_same_live_and_from_a_bag(
     values = range(-128, 128) if kind.startswith('Int') else range(256)
     own = getattr(importlib.import_module('std_msgs.msg'), kind)
     serialize = importlib.import_module('rclpy.serialization').serialize_message
-    place = Place('/x', f'std_msgs/msg/{kind}', field, '1')
+    place = MessageField('/x', f'std_msgs/msg/{kind}', field, '1')
     place.expect(own())
     live, path = [], tmp_path / 'run.mcap'
     with records.BagWriter(path) as writer:

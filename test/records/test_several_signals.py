@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 
 from koopman_ros import records
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import RecordedInput, RecordedState
 from support.bag_samples import Sample
 
 TEMPERATURE, JOINTS, NUMBER = (
     'sensor_msgs/msg/Temperature', 'sensor_msgs/msg/JointState', 'std_msgs/msg/Float64')
-WARM = RecordedState('warm', 'K', Place('/warm', TEMPERATURE, 'temperature', 'degC'))
-COLD = RecordedState('cold', 'K', Place('/cold', TEMPERATURE, 'temperature', 'degC'))
-TANKS = [RecordedState(name, 'm', Place('/tanks', JOINTS, f'position[{name}]', 'mm'))
+WARM = RecordedState('warm', 'K', MessageField('/warm', TEMPERATURE, 'temperature', 'degC'))
+COLD = RecordedState('cold', 'K', MessageField('/cold', TEMPERATURE, 'temperature', 'degC'))
+TANKS = [RecordedState(name, 'm', MessageField('/tanks', JOINTS, f'position[{name}]', 'mm'))
          for name in ('low', 'high')]
-PUMP = RecordedInput('pump', 'm^3/s', Place('/pump_setpoint', NUMBER, 'data', 'L/s'))
+PUMP = RecordedInput('pump', 'm^3/s', MessageField('/pump_setpoint', NUMBER, 'data', 'L/s'))
 JACKET = RecordedInput(
-    'jacket', 'K', Place('/jacket_setpoint', TEMPERATURE, 'temperature', 'degC'),
-    Place('/jacket', TEMPERATURE, 'temperature', 'degC'))
+    'jacket', 'K', MessageField('/jacket_setpoint', TEMPERATURE, 'temperature', 'degC'),
+    MessageField('/jacket', TEMPERATURE, 'temperature', 'degC'))
 COMMANDED = replace(JACKET, measured=None)
 
 
@@ -153,7 +153,7 @@ def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
 
 
 def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path]) -> None:
-    level = RecordedState('level', 'm', Place('/level', NUMBER, 'data', 'm'))
+    level = RecordedState('level', 'm', MessageField('/level', NUMBER, 'data', 'm'))
     # the stamps are simulated, ten times as fast as the recorder's clock
     path = write([Sent('/jacket_setpoint', 1, 1.0, 100.05), *(s for k in range(1, 21) for s in (
         Sent('/warm', k, 50.0 + k, 100.0 + 0.1 * k),

@@ -10,12 +10,12 @@ import struct
 import pytest
 
 from koopman_ros import records
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from support.bag_samples import HEAD, NUMBER, number
 
-STATE = records.RecordedState('x', '1', Place('/x', NUMBER.type_name, 'data', '1'))
-INPUT = records.RecordedInput('u', '1', Place('/u', NUMBER.type_name, 'data', '1'))
+STATE = records.RecordedState('x', '1', MessageField('/x', NUMBER.type_name, 'data', '1'))
+INPUT = records.RecordedInput('u', '1', MessageField('/u', NUMBER.type_name, 'data', '1'))
 CLOCK = records.MessageDefinition(
     'rosgraph_msgs/msg/Clock', 'builtin_interfaces/Time clock\n' + '=' * 80
     + '\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n', 'RIHS01_' + 'b' * 64)

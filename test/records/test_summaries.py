@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 import pytest
 
 from koopman_ros import records
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from support.bag_samples import NUMBER, number, TEXT, text
 
 MESSAGES = 120
@@ -107,6 +107,6 @@ def test_series_of_a_file_with_a_sparse_summary_is_whole(
 ) -> None:
     statistics(monkeypatch)
     path = write(tmp_path / 'run.mcap', repeat_channels=repeated, repeat_schemas=repeated)
-    series = records.read_series(path, Place('/x', NUMBER.type_name, 'data', '1'))
+    series = records.read_series(path, MessageField('/x', NUMBER.type_name, 'data', '1'))
     assert len(series.values) == records.summary(path).counts['/x']
 

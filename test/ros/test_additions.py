@@ -60,7 +60,7 @@ def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixtu
     (tmp_path / f'{name}.py').write_text(textwrap.dedent(request.param))
     monkeypatch.syspath_prepend(tmp_path)
     # what it adds is gone with it
-    with mock.patch.dict(message_fields.CARRIERS):
+    with mock.patch.dict(message_fields.KNOWN_TYPES):
         yield importlib.import_module(name)
 
 
@@ -100,5 +100,6 @@ def test_a_message_type_is_learned_from(tmp_path: Path) -> None:
     series = read_series(tmp_path / 'run', '/cell')
     assert (series.values.tolist(), series.unit) == ([3.5, -1.0, 3.75], 'V')
     where = message_fields.place('/cell', 'cell', 'mV', {'type': 'sensor_msgs/msg/BatteryState'})
-    assert where == message_fields.Place('/cell', 'sensor_msgs/msg/BatteryState', 'voltage', 'V')
+    assert where == message_fields.MessageField('/cell', 'sensor_msgs/msg/BatteryState', 'voltage',
+                                                'V')
     assert where.range == (0.0, 1e3)

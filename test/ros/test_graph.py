@@ -227,7 +227,7 @@ class Pair:
         self.own, self.other = (self._node(name) for name in ('own', 'other'))
         self.executor = SingleThreadedExecutor(context=self.own.context)
         self.executor.add_node(self.own)
-        self.matching = topics.Matching(self.own, lambda: None)
+        self.matching = topics.EndpointMonitor(self.own, lambda: None)
         self.speaker = self.matching.publish('command', Temperature)
         self.matching.subscribe('temperature', lambda _: None, Temperature)
 

@@ -27,7 +27,7 @@ from koopman_ros.model import LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters import model_checks
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.parameters.signal_topics import Signals, signals_of, Wiring
+from koopman_ros.parameters.signal_topics import Signals, signals_of, SignalTopics
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
@@ -57,16 +57,17 @@ def made(part: str, node: Part, folder: Path) -> Callable[[], object]:
     """Make a part of a node, and return what takes it down."""
     table = trainer_table(load(model_path(reactor.MODEL)))
     settings = table.snapshot({'output': str(folder / 'bag')})
-    wiring = Wiring(SIGNALS, settings.states, settings.inputs)
+    wiring = SignalTopics(SIGNALS, settings.states, settings.inputs)
     match part:
         case 'diagnostics':
             made = node.diagnostics.add('task', lambda: TaskReport(Severity.OK, 'well'))
         case 'matching':
-            made = topics.Matching(node, lambda: None)
+            made = topics.EndpointMonitor(node, lambda: None)
             made.publish('mine', Temperature)
             made.subscribe('other', lambda _: None, Temperature)
         case 'recorder':
-            return Recorder(node, BagWriter(folder / 'bag'), NAMES, topics.known(wiring)).close
+            return Recorder(node, BagWriter(folder / 'bag'), NAMES,
+                            topics.expected_topics(wiring)).close
         case 'recording':
             made = Recording(node, settings, wiring)
             made.start()

@@ -22,9 +22,9 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.nodes import controller, plant, player, trainer
 from koopman_ros.records import summary
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.node_descriptions import tables
 from koopman_ros.ros.process import answer, open_to_the_network
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness, NodeProcess
 from support.nodes import run_here, TIMEOUT
 

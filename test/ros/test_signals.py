@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState, Temperature
 
-from koopman_ros.core.message_fields import Place, place
+from koopman_ros.core.message_fields import MessageField, place
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.signals import Heard, Inlet, Outlet
+from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
+from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
 
 STAMP = stamp_message(7 * NANOSECONDS + 250)
@@ -29,9 +29,9 @@ class Ends:
     """Places of signals, who publishes them, and what was heard of them."""
 
     ros: Harness
-    places: dict[str, Place]
+    places: dict[str, MessageField]
     units: dict[str, str]  #: of the signals
-    heard: list[Heard] = field(default_factory=list)
+    heard: list[SignalSample] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         node = self.ros.node
@@ -39,14 +39,14 @@ class Ends:
         def subscribe(topic: str, callback: Any, kind: Any) -> Any:
             return node.create_subscription(kind, topic, callback, topics.LOOP_QOS)
 
-        self.inlet = Inlet(node, subscribe, self.places, self.units, self.heard.append)
-        self.outlet = Outlet(
+        self.inlet = SignalSubscriber(node, subscribe, self.places, self.units, self.heard.append)
+        self.outlet = SignalPublisher(
             self.places, self.units,
             lambda topic, kind: node.create_publisher(kind, topic, topics.LOOP_QOS))
         self.ros.wait_until(lambda: all(
             publisher.get_subscription_count() for publisher in self.outlet.publishers))
 
-    def wait_for(self, count: int) -> list[Heard]:
+    def wait_for(self, count: int) -> list[SignalSample]:
         self.ros.wait_until(lambda: len(self.heard) >= count)
         return self.heard
 
@@ -156,8 +156,8 @@ def refuse(*_: Any) -> Any:
 def test_place_that_cannot_be_is_refused(
         shared_ros: Harness, unit: str, given: dict[str, str], words: str) -> None:
     places, units = {'signal': place('nowhere', 'signal', unit, given)}, {'signal': unit}
-    for make in (lambda: Inlet(shared_ros.node, refuse, places, units, refuse),
-                 lambda: Outlet(places, units, refuse)):
+    for make in (lambda: SignalSubscriber(shared_ros.node, refuse, places, units, refuse),
+                 lambda: SignalPublisher(places, units, refuse)):
         with pytest.raises(ConfigurationError, match=f'^{words}$'):
             make()
 
@@ -169,11 +169,12 @@ def test_place_that_cannot_be_is_refused(
 def test_integers_are_heard_and_not_published(
         shared_ros: Harness, kind: str, field: str) -> None:
     """A command of 23.7 would be sent as whatever the middleware makes of it."""
-    places = {'pump': Place('pump', kind, field, '1')}
+    places = {'pump': MessageField('pump', kind, field, '1')}
     with pytest.raises(ConfigurationError, match=r'^pump: data.* holds integers'):
-        Outlet(places, {'pump': '1'}, refuse)
+        SignalPublisher(places, {'pump': '1'}, refuse)
     heard: list[str] = []
-    Inlet(shared_ros.node, lambda topic, *_: heard.append(topic), places, {'pump': '1'}, refuse)
+    SignalSubscriber(shared_ros.node, lambda topic, *_: heard.append(topic), places, {'pump': '1'},
+                     refuse)
     assert heard == ['pump']
 
 
@@ -182,4 +183,4 @@ def test_signals_of_one_topic_have_one_type() -> None:
     with pytest.raises(ConfigurationError, match=(
             'heat and angle share the topic both and differ in the type of its messages, '
             'sensor_msgs/msg/Temperature and sensor_msgs/msg/JointState: give them one type')):
-        Outlet(places, {'heat': 'K', 'angle': 'rad'}, refuse)
+        SignalPublisher(places, {'heat': 'K', 'angle': 'rad'}, refuse)

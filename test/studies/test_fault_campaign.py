@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.event_log.records import parse
 from studies.faults import interceptor
 from studies.faults.__main__ import main
@@ -99,8 +99,8 @@ def test_commands_must_follow_from_the_records_which_give_the_reason() -> None:
         controller.measure(STEADY + 0.1 * k)
     controller.measure(math.nan)
     found = trace(records=[(60.0, text) for text in controller.texts])
-    assert not reasons(found, code=Code.NOT_FINITE)
-    assert 'no record gives the reason' in reasons(found, code=Code.FROZEN)
+    assert not reasons(found, code=StatusCode.NOT_FINITE)
+    assert 'no record gives the reason' in reasons(found, code=StatusCode.FROZEN)
     altered = parse(controller.texts[3])
     altered.fields['command'][0] += 1e-12
     found.records[3] = 60.0, altered.text()

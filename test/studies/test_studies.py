@@ -22,7 +22,7 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.demo.loop import Row
 from koopman_ros.evaluation import at, simulate, Simulation
 from koopman_ros.evaluation.optimal_cost import optimum
-from koopman_ros.learning import Growth, Linearisation, NeuralDrift, rollout_rmse
+from koopman_ros.learning import IncrementalTraining, Linearisation, NeuralDrift, rollout_rmse
 from koopman_ros.model import Box, load
 from koopman_ros.plants import describe, Process
 from koopman_ros.testing import HarnessError
@@ -205,11 +205,12 @@ def van_der_pol(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, 'LEARNERS', {
             'EDMD-3': learners.LEARNERS['EDMD-3'], 'SINDy-5': learners.LEARNERS['SINDy-5'],
-            'hasty lift': learners._trained(lambda n_x: Growth(n_x + 1, max_iterations=5))})
+            'hasty lift': learners._trained(lambda n_x: IncrementalTraining(n_x + 1,
+                                                                            max_iterations=5))})
         patch.setitem(study.EXPERIMENTS, 'van_der_pol', partial(
             study.run, 'van_der_pol', starts=3))
         patch.setattr(coordinates, 'RECIPES', {
-            'identity lift': lambda n_x: Growth(n_x + 1, max_iterations=5)})
+            'identity lift': lambda n_x: IncrementalTraining(n_x + 1, max_iterations=5)})
         patch.setitem(coordinates.EXPERIMENTS, 'coordinates/van_der_pol', partial(
             coordinates.run, 'van_der_pol', starts=3))
         assert general(['van_der_pol', '--seeds', '1', '--scheduler', '',

@@ -15,7 +15,7 @@ from scipy.optimize import root
 from koopman_ros import control, evaluation, plants
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import Words
+from koopman_ros.core.status import StatusFormatter
 from koopman_ros.core.units import Displays
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import DisturbanceObserver
@@ -84,7 +84,7 @@ def controller(model: Any = 'reactor_nz4', *, sensor: Mapping[str, Any] | None =
         USUAL, sensor=replace(USUAL.sensor, **(sensor or {})), **changes))
 
 
-say = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}))
+say = StatusFormatter(Displays({'temperature': 'K', 'coolant_temperature': 'K'}))
 
 
 def content(value: Any) -> str:

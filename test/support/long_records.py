@@ -11,7 +11,7 @@ import struct
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_MINUTE
 from koopman_ros.learning import TrainingTask
@@ -68,7 +68,7 @@ def bags_of(count: int, folder: Path) -> list[Path]:
 
 def task(bags: Sequence[Path], output: Path) -> TrainingTask:
     """Return the task of a first lift from some bags."""
-    state, coolant = (Place(f'/{name}', TYPE, FIELD, 'K')
+    state, coolant = (MessageField(f'/{name}', TYPE, FIELD, 'K')
                       for name in ('temperature', 'coolant_temperature'))
     return TrainingTask(tuple(map(str, bags)), str(output), '',
                 (RecordedState('temperature', 'K', state),),

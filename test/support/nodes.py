@@ -19,7 +19,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, isolated_domain
 
 TIMEOUT = 120.0  # s; a test that waits this long has failed, on a busy machine, too

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from koopman_ros.learning import compare_classes, decide
+from koopman_ros.learning import compare_classes, evaluate_model
 from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning.report import _sections
 from support.known_plants import methods
@@ -24,7 +24,7 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
         patch.setattr(task_module, 'identify', lambda *given, **others: original(
             *given, **{**others, 'degrees': degrees, 'methods': methods(*windows)}))
         patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
-        patch.setattr(task_module, 'decide', partial(decide, loops=loops))
+        patch.setattr(task_module, 'decide', partial(evaluate_model, loops=loops))
         yield
 
 

@@ -169,7 +169,7 @@ class Recorded:
             fields['model'] = {'name': name, 'digest': MODELS[name][1]}
         predecessor = self.controller
         self.controller = self.built(model)
-        self.state = self.controller.hand_over(predecessor, self.state)
+        self.state = self.controller.switch_to(predecessor, self.state)
         event = records.PARAMETERS if len(parameters) > ('model' in parameters) else records.MODEL
         self.write(event, fields)
 

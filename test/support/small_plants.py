@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
-from koopman_ros.learning import Growth
+from koopman_ros.learning import IncrementalTraining
 from koopman_ros.plants import two_state_example
 
 # dx/dt = -x - 0.3 x^2 + 2 u, in deviations from 3 m and 0.5 m/s
@@ -18,7 +18,7 @@ BENT = PlantDescription('bent', ('level',), ('m',), ('flow',), ('m/s',), 's', np
 UNFORCED = PlantDescription('unforced', ('level',), ('m',), (), (), 's', np.array([3.0]),
                             np.zeros(0),
                  np.zeros((1, 0)))
-SMALL = Growth(2, hidden_first=3, max_iterations=40)
+SMALL = IncrementalTraining(2, hidden_first=3, max_iterations=40)
 
 _EXAMPLE = two_state_example()
 TWO_STATE = PlantDescription(

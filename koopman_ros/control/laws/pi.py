@@ -13,7 +13,7 @@ import numpy as np
 from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import column, UNBOUNDED
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -56,7 +56,7 @@ class ProportionalIntegral(Law):
 
     def unusable(self) -> Reason | None:
         """Return that there is no gain."""
-        return None if len(self._states) else reason(Code.NO_PI_GAIN)
+        return None if len(self._states) else reason(StatusCode.NO_PI_GAIN)
 
     def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
                 previous: Array | None) -> LawResult:

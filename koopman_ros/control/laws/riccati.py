@@ -22,7 +22,7 @@ from koopman_ros.control.laws.base import (
 )
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
-from koopman_ros.core.status import Code, reason
+from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -197,7 +197,7 @@ class StateDependentRiccati(Law):
                 max_gain=self.tuning.max_gain, max_residual=self.tuning.max_riccati_residual),
                 interval)
         except np.linalg.LinAlgError as error:
-            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
+            return LawResult(None, reason(StatusCode.SINGULAR, matrix=str(error)))
 
 
 class Linear(Law):
@@ -233,10 +233,10 @@ def _result(model: LiftedModel, found: Feedback, interval: float, u: Array | Non
     riccati = found.riccati
     info = SolutionInfo(found.form.value, riccati.residual, riccati.gain)
     if not found.solved:
-        return LawResult(None, reason(Code(riccati.status.value)), info)
+        return LawResult(None, reason(StatusCode(riccati.status.value)), info)
     if growth is None:
         growth = found.growth(interval / model.seconds_per_time_unit)
     info = SolutionInfo(found.form.value, riccati.residual, riccati.gain, growth)
     if not growth < 1.0:
-        return LawResult(None, reason(Code.PREDICTED_UNSTABLE, interval=interval), info)
+        return LawResult(None, reason(StatusCode.PREDICTED_UNSTABLE, interval=interval), info)
     return LawResult(model.inputs.to_physical(found.u if u is None else u), info=info)

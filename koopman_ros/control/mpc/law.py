@@ -17,7 +17,7 @@ from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
 from koopman_ros.core.plugins import contained
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -75,11 +75,11 @@ class RecedingHorizon(Law):
             # compiles, or loads the code compiled before
             from koopman_ros.control.mpc.planner import Planner
         except ImportError:
-            self._unusable = reason(Code.PACKAGE_MISSING, package=_PACKAGES)
+            self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGES)
             return
         except RuntimeError as error:
             # numba finds no folder for the compiled code
-            self._unusable = reason(Code.LAW_RAISED, error=contained(error))
+            self._unusable = reason(StatusCode.LAW_RAISED, error=contained(error))
             return
         self.planner = Planner(model, tuning, self.weights, *(
             np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
@@ -112,18 +112,19 @@ class RecedingHorizon(Law):
                 spent = time.perf_counter() - began
                 if iteration == 1 and spent > limit:
                     return LawResult(None, reason(
-                        Code.TOO_LATE, seconds=spent, deadline=limit), passing=True)
+                        StatusCode.TOO_LATE, seconds=spent, deadline=limit), passing=True)
                 if change <= _CONVERGED or spent * (iteration + 1) / iteration > limit:
                     break
         except np.linalg.LinAlgError as error:
-            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
+            return LawResult(None, reason(StatusCode.SINGULAR, matrix=str(error)))
         if not change <= _USABLE:
-            return LawResult(None, reason(Code.PLAN_MOVES, iterations=iteration), passing=True)
+            return LawResult(None, reason(StatusCode.PLAN_MOVES, iterations=iteration),
+                             passing=True)
         # a state outside the training data may return from there
         here, *ahead = self.model.distances(np.concatenate((x[:-1:_CHECKED], x[-1:]))).tolist()
         if max(ahead) > max(self.margin, here):
             return LawResult(None, reason(
-                Code.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
+                StatusCode.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
         plan = planner.plan(problem, u, x)
         return LawResult(
             plan.inputs[0], info=SolutionInfo('planned'), memory=(u, x, problem.grid.lengths),

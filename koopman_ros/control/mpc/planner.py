@@ -26,7 +26,7 @@ from koopman_ros.core.solvers import (
     runge_kutta_step,
     solve_riccati,
 )
-from koopman_ros.core.status import Code, Reason, reason
+from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -204,14 +204,14 @@ class Planner:
         ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
                       roll_out(self._arrays, *given))
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
-            return reason(Code.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
+            return reason(StatusCode.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
         nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
         A, lower, upper, sense = self._constraints(problem, u, nodes, by_inputs)
         v, _, flag, _ = daqp.solve(H, f, A, upper, lower, sense)
         v = np.asarray(v, dtype=np.float64)
         change = float(np.abs(v).max())
         if flag not in _SOLVED or not math.isfinite(change):
-            return reason(Code.PLAN_NOT_SOLVED, flag=f'daqp returns {flag}')
+            return reason(StatusCode.PLAN_NOT_SOLVED, flag=f'daqp returns {flag}')
         return change, u + v.reshape(u.shape), nodes + by_inputs @ v
 
     def _constraints(self, problem: PlanningProblem, u: Array, nodes: Array, by_inputs: Array

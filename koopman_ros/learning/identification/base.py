@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from koopman_ros.core.arrays import Array, brief
+from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.declaration import NoParameters
 from koopman_ros.learning.identification.drift import DriftModel
@@ -29,7 +29,7 @@ class DriftProblem:
     rough: Array | None = None
     input_degree: int = 0  #: of the B(x) that is to be estimated
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)

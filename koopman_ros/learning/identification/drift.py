@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import brief
+from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
@@ -103,7 +103,7 @@ class DriftModel(Drift):
     #: products with monomials, see :meth:`InputTerms.regressors`
     B: Array
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def monomials(self) -> PolynomialObservables:
@@ -204,7 +204,7 @@ class Segments:
     x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
     measured: np.ndarray  #: (K + 1, M) whether one was
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], longest_step: float) -> Segments:

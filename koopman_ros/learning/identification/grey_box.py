@@ -29,7 +29,7 @@ from koopman_ros.learning.identification.identify import (
 from koopman_ros.learning.identification.innovations_form import Predictor
 from koopman_ros.learning.identification.output_error import innovations_form, Refined
 from koopman_ros.model import Coordinates
-from koopman_ros.plants import Sought, sought_of
+from koopman_ros.plants import estimated_parameters_of, EstimatedParameter
 
 # How far disturbances, as filters assume them, move a state from sample to sample, over the noise
 # of the measurements, in deviations.
@@ -70,7 +70,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     :raises Stopped: when `watch` asked for it.
     """
     plant = replace(plant, B=None, input_matrix_degree=0)
-    sought = sought_of(equations, ranges or {})
+    sought = estimated_parameters_of(equations, ranges or {})
     progress = stage_by_stage(watch, 3)
     start = Equations.of(equations, sought, plant, np.concatenate([e.x for e in episodes]),
                          np.concatenate([e.u for e in episodes]))
@@ -166,7 +166,7 @@ def _within(record: SplitRecord, predictor: Predictor[Equations]) -> Predictor[E
     return Predictor(replace(drift, box=replace(drift.box, states=new)), gain)
 
 
-def _estimates(sought: Sequence[Sought], refined: Refined[Equations]
+def _estimates(sought: Sequence[EstimatedParameter], refined: Refined[Equations]
                ) -> tuple[EstimatedConstant, ...]:
     """Return values, standard errors and how they are to be taken."""
     shares, p = refined.model.shares, len(sought)

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.core.arrays import brief
+from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
-from koopman_ros.core.plugins import contained, plug_class, short_name
+from koopman_ros.core.plugins import contained, plugin_class, short_name
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
@@ -144,7 +144,7 @@ class Identified:
     constants: tuple[EstimatedConstant, ...] = ()
     warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
@@ -338,7 +338,7 @@ def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
     """
     found: dict[str, IdentificationMethod] = {}
     for name in names:
-        kind = plug_class(name, 'identification method', METHODS, IdentificationMethod)
+        kind = plugin_class(name, 'identification method', METHODS, IdentificationMethod)
         short = short_name(name)
         try:
             found[short] = kind(kind.Parameters(**parameters.get(short, {})))

@@ -13,7 +13,11 @@ import math
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.lift.levenberg_marquardt import minimise, Minimum, MinimumStatus
+from koopman_ros.learning.lift.levenberg_marquardt import (
+    LeastSquaresResult,
+    minimise,
+    MinimumStatus,
+)
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 
@@ -36,7 +40,7 @@ class TrainedLift:
 
 
 @dataclass(frozen=True)
-class Growth:
+class IncrementalTraining:
     """
     The default recipe: coordinates are added one at a time, each from several starts.
 
@@ -77,7 +81,7 @@ class Growth:
             raise ValueError('pre_feedback, the weight of the input, must be above 0 or None, got '
                              f'{self.pre_feedback}')
 
-    def of_start(self, number: int) -> Growth:
+    def of_start(self, number: int) -> IncrementalTraining:
         """Return the recipe of one of the starts of a round, by its number."""
         weights = (self.whitening, *self.other_whitenings)
         return replace(self, whitening=weights[number % len(weights)], other_whitenings=())
@@ -105,7 +109,7 @@ class Growth:
         iterations = 0
         for weight in weights:
             problem = LiftProblem(layout, data, ResidualWeights(self.whitening, weight))
-            minimum: Minimum = minimise(
+            minimum: LeastSquaresResult = minimise(
                 problem.add_residuals, theta, max_iterations=self.max_iterations,
                 tolerance=self.tolerance, monitor=monitor)
             theta, iterations = minimum.theta, iterations + minimum.iterations

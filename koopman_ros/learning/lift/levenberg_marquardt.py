@@ -31,7 +31,7 @@ class MinimumStatus(Enum):
 
 
 @dataclass(frozen=True)
-class Minimum:
+class LeastSquaresResult:
     """The outcome of a minimisation."""
 
     theta: Tensor  #: (p,) parameters with the lowest cost seen
@@ -96,7 +96,7 @@ def normal_equations(residuals: Residuals, theta: Tensor, *, derivatives: bool =
 @torch.inference_mode()
 def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
              tolerance: float = 1e-3, patience: int = PATIENCE,
-             monitor: Callable[[int, float], bool] | None = None) -> Minimum:
+             monitor: Callable[[int, float], bool] | None = None) -> LeastSquaresResult:
     """
     Minimise 0.5 ||r(theta)||^2 by Levenberg-Marquardt with Marquardt's diagonal scaling.
 
@@ -114,7 +114,7 @@ def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
     try:
         now = normal_equations(residuals, theta)
         if not math.isfinite(now.cost):
-            return Minimum(theta, math.inf, 0, MinimumStatus.STALLED)
+            return LeastSquaresResult(theta, math.inf, 0, MinimumStatus.STALLED)
         state = _State(theta, now, torch.clamp(now.matrix.diagonal().clone(), min=1e-12))
         costs = [now.cost]
         for iteration in range(1, max_iterations + 1):
@@ -148,8 +148,8 @@ class _State:
     factor: float = _FACTOR  # by which the damping rises when a step is refused; reset when taken
     iteration: int = 0
 
-    def minimum(self, status: MinimumStatus) -> Minimum:
-        return Minimum(self.theta, self.now.cost, self.iteration, status)
+    def minimum(self, status: MinimumStatus) -> LeastSquaresResult:
+        return LeastSquaresResult(self.theta, self.now.cost, self.iteration, status)
 
 
 def _converged(costs: list[float], tolerance: float, patience: int) -> bool:

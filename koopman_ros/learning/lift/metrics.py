@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
-from koopman_ros.core.arrays import brief
+from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import Array, DriftSamples
 from koopman_ros.evaluation.closed_loop_test import Rate
 from koopman_ros.model import LiftedModel
@@ -37,7 +37,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Figures:
+class LiftMetrics:
     """Figures of a model on held-out samples."""
 
     fit: Fit  #: its residuals
@@ -46,7 +46,7 @@ class Figures:
     #: infinite when it diverges, None when the samples have no times
     rollout_rmse: Array | None = field(compare=False)
 
-    __repr__ = brief
+    __repr__ = short_repr
 
     def metrics(self, names: tuple[str, ...]) -> dict[str, float]:
         """Return the finite figures by name, as they are stored with the model."""
@@ -58,9 +58,9 @@ class Figures:
         return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
-def evaluate(model: LiftedModel, samples: DriftSamples) -> Figures:
+def evaluate(model: LiftedModel, samples: DriftSamples) -> LiftMetrics:
     """Evaluate all open-loop figures on held-out episodes; raises as :func:`fit`."""
-    return Figures(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
+    return LiftMetrics(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
                   rollout_rmse(model, samples))
 
 

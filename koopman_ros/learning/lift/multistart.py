@@ -15,11 +15,11 @@ import torch
 
 from koopman_ros.execution import Backend, Tell
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
-from koopman_ros.learning.lift.incremental import Growth, TrainedLift
+from koopman_ros.learning.lift.incremental import IncrementalTraining, TrainedLift
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
 from koopman_ros.learning.lift.residuals import ScaledSamples
 
-Recipe = Growth | Algorithm1 | NeuralDrift
+Recipe = IncrementalTraining | Algorithm1 | NeuralDrift
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
     """Run one round; yield the result of each start in their order, or the reason of a failure."""
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     items = {f'start {i + 1} with n_z = {n_z}': (
-        recipe.of_start(i) if isinstance(recipe, Growth) else recipe, number)
+        recipe.of_start(i) if isinstance(recipe, IncrementalTraining) else recipe, number)
         for i, number in enumerate(seeds)}
     return backend.run(_start, items, shared=(data, n_z, parent, threads), watch=tracker.told)
 

@@ -21,7 +21,7 @@ _SINGULAR = 1e-14
 
 
 @dataclass(frozen=True)
-class Frame:
+class PrestabilizedFrame:
     """
     The plant under a pre-feedback, f(x) + B K x, in states x' = T x with E[x' x''] = I.
 
@@ -36,7 +36,7 @@ class Frame:
 
     @staticmethod
     def of(inputs: InputModel, x: Array, f: Array, regressors: Array | None, weight: float
-           ) -> Frame:
+           ) -> PrestabilizedFrame:
         """
         Find the gain of the linear-quadratic regulator of the linear fit, and whiten the states.
 
@@ -66,7 +66,8 @@ class Frame:
         if not variances[0] > _SINGULAR * variances[-1]:
             raise ValueError('the states of the samples do not move each on its own: excite the '
                              'plant, or leave out a state')
-        return Frame(inputs, B, -riccati.K, np.linalg.inv(np.linalg.cholesky(covariance)))
+        return PrestabilizedFrame(inputs, B, -riccati.K,
+                                  np.linalg.inv(np.linalg.cholesky(covariance)))
 
     def enter(self, x: Array, f: Array, regressors: Array | None
               ) -> tuple[Array, Array, Array | None]:

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from koopman_ros.core.datasets import Array, DriftSamples, PlantDescription
-from koopman_ros.learning.lift.incremental import Growth, TrainedLift
+from koopman_ros.learning.lift.incremental import IncrementalTraining, TrainedLift
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.learning.lift.prestabilization import Frame
+from koopman_ros.learning.lift.prestabilization import PrestabilizedFrame
 from koopman_ros.learning.lift.residuals import deviations, ScaledSamples
 from koopman_ros.model import Box, Coordinates, LiftedModel, NetworkObservables
 
@@ -25,7 +25,7 @@ class Scaling:
 
     box: Box  #: names and scaling of states and inputs
     inputs: InputModel  #: the known part of B
-    frame: Frame | None  #: in which the lift is learned; None for that of the samples
+    frame: PrestabilizedFrame | None  #: in which the lift is learned; None for that of the samples
     #: root mean square of the scaled rates, by which time is scaled, in 1/time unit
     pace: float
 
@@ -39,7 +39,8 @@ class Scaling:
         """
         inputs = InputModel.of(plant, box, samples.x)
         plain = _plain(box, inputs, samples)
-        frame = None if pre_feedback is None else Frame.of(inputs, *plain, pre_feedback)
+        frame = None if pre_feedback is None else PrestabilizedFrame.of(inputs, *plain,
+                                                                        pre_feedback)
         # rates of order one put the residuals of the dynamics beside the others
         rate = frame.enter(*plain)[1] if frame else deviations(box, samples)[1]
         return Scaling(box, inputs, frame, float(np.sqrt(np.mean(rate ** 2))) or 1.0)
@@ -56,7 +57,8 @@ class Scaling:
         place = checked_device(device)
         return ScaledSamples(*(torch.from_numpy(a).to(place) for a in arrays))
 
-    def planted(self, recipe: Growth, begin: LiftedModel, data: ScaledSamples) -> TrainedLift:
+    def planted(self, recipe: IncrementalTraining, begin: LiftedModel,
+                data: ScaledSamples) -> TrainedLift:
         """
         Return the lift of another plant of the same signals as one of these samples.
 

@@ -13,15 +13,27 @@ import math
 import numpy as np
 
 from koopman_ros import __version__
-from koopman_ros.core.arrays import brief
+from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
-from koopman_ros.evaluation.closed_loop_test import check_law, LawCheck, LOOPS, Rate
+from koopman_ros.evaluation.closed_loop_test import (
+    ClosedLoopTest,
+    evaluate_closed_loops,
+    LOOPS,
+    Rate,
+)
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.learning.lift.edmd import Edmd
-from koopman_ros.learning.lift.incremental import Growth, TrainedLift
+from koopman_ros.learning.lift.incremental import IncrementalTraining, TrainedLift
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, PATIENCE
-from koopman_ros.learning.lift.metrics import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
+from koopman_ros.learning.lift.metrics import (
+    evaluate,
+    Fit,
+    fit,
+    lifted_rate,
+    LiftMetrics,
+    ROUNDING,
+)
 from koopman_ros.learning.lift.multistart import Recipe, run_starts, Tracker, Watch
 from koopman_ros.learning.lift.neural_drift import SMALLEST, with_readout
 from koopman_ros.learning.lift.scaling import Scaling
@@ -38,24 +50,24 @@ class Trained:
 
     #: the winner, with its figures on the untouched test episodes in its provenance
     model: LiftedModel
-    figures: Figures  #: those figures
-    linear: Figures  #: the figures of the linear model that fits the training episodes best
+    figures: LiftMetrics  #: those figures
+    linear: LiftMetrics  #: the figures of the linear model that fits the training episodes best
     #: closed loops of the winner's law; None without inputs, when none were wanted, and when they
     #: were interrupted
-    law_check: LawCheck | None
+    law_check: ClosedLoopTest | None
     status: str  #: the sentence with which its training ended
     #: the winner of every round, smallest n_z first, each with its figures
     path: tuple[LiftedModel, ...]
     starts: int  #: number of starts that finished
     steps: int  #: of the minimisations of all these together
 
-    __repr__ = brief
+    __repr__ = short_repr
 
 
-class NoUsefulLift(ValueError):  # noqa: N818
+class TrainingFailed(ValueError):  # noqa: N818
     """Training ended without a lift that is better than a linear model; the message says why."""
 
-    law_check: LawCheck | None = None  #: the closed loops of a lift whose law failed
+    law_check: ClosedLoopTest | None = None  #: the closed loops of a lift whose law failed
 
 
 @dataclass(frozen=True)
@@ -118,11 +130,12 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     check_rates(plant, samples)
     check_nominal_point(plant, samples, box)
     scaling = Scaling.of(plant, box, parts[0],
-                         recipe.pre_feedback if isinstance(recipe, Growth) else None)
+                         recipe.pre_feedback if isinstance(recipe, IncrementalTraining) else None)
     data = scaling.data(parts[0], device)
     about = {'training_states': training_states(box, samples),
              'provenance': Provenance(plant.name, seed, samples.digest(), {}, __version__)}
-    first = None if begin is None or not isinstance(recipe, Growth) else scaling.planted(
+    first = None if begin is None or not isinstance(recipe,
+                                                    IncrementalTraining) else scaling.planted(
         recipe, begin, data)
 
     def run(n_z: int, parent: TrainedLift | None) -> Generator[tuple[str, TrainedLift | str]]:
@@ -140,7 +153,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
 
 def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple[int, ...]:
     """Return the rounds from those of a lift to begin from on."""
-    if not isinstance(recipe, Growth):
+    if not isinstance(recipe, IncrementalTraining):
         raise ValueError('only a lift by growth begins from another one: choose its class, or '
                          'begin from nothing')
     if begin.n_z not in rounds:
@@ -183,14 +196,14 @@ def _run_rounds(rounds: Sequence[int], tracker: Tracker,
                 raise
             interrupted = True
         if best is None and not interrupted:
-            raise NoUsefulLift(f'no start gave a usable lift with n_z = {n_z}: {reasons[-1]}')
+            raise TrainingFailed(f'no start gave a usable lift with n_z = {n_z}: {reasons[-1]}')
         # a start that was cut short may be worse than the round before
         if best is not None and not (interrupted and path and best.score >= path[-1].score):
             path.append(best)
         if interrupted:
             break
     if not path:
-        raise NoUsefulLift(reasons[-1] if reasons else 'stopped before a start finished')
+        raise TrainingFailed(reasons[-1] if reasons else 'stopped before a start finished')
     return path, interrupted
 
 
@@ -204,7 +217,7 @@ def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, 
     linear = Edmd(degree=1).learn(plant, parts[0], box)
     rx = fit(linear, parts[1].x, parts[1].dxdt, parts[1].u).rx
     if refuse and not winner.fit.rx + ROUNDING < rx:
-        raise NoUsefulLift(
+        raise TrainingFailed(
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
             f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '
             'validation episodes): keep the linear model, or excite the plant over a wider range'
@@ -214,11 +227,12 @@ def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, 
         # one that was ended before gets its loops all the same
         watch = (lambda _: False) if tracker.stop else tracker.check
         with contextlib.suppress(KeyboardInterrupt):
-            law_check = check_law(winner.model, reference_drift(plant, box, parts, winner.model),
+            law_check = evaluate_closed_loops(winner.model,
+                                              reference_drift(plant, box, parts, winner.model),
                                   loops=loops, watch=watch, backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
-            refusal = NoUsefulLift(
+            refusal = TrainingFailed(
                 f'the lift with n_z = {winner.model.n_z} is no controller: {law_check}: use '
                 f'{_remedies(winner.model)}')
             refusal.law_check = law_check

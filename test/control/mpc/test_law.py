@@ -23,7 +23,7 @@ from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.state import State
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.core.status import Code
+from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.evaluation.simulate import at, simulate, Simulation
@@ -349,7 +349,7 @@ def test_without_a_package_the_next_level_acts_with_the_advice(monkeypatch, pack
     loop = run(OSCILLATOR, [1.0, 0.0], [0.0, 0.0], 20, fallback_order=('mpc', 'sdre'))
     assert set(loop.levels) == {'sdre'}
     why = loop.reports[-1].reason
-    assert (why.code, why.cause.code) == (Code.LAW_FAILED, Code.PACKAGE_MISSING)
+    assert (why.code, why.cause.code) == (StatusCode.LAW_FAILED, StatusCode.PACKAGE_MISSING)
     assert why.cause.values['package'] == 'numba daqp'
 
 
@@ -360,7 +360,7 @@ def test_where_nothing_can_be_compiled_the_next_level_acts_with_the_reason(monke
 
     monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', Broken('planner'))
     found = law(OSCILLATOR[1])
-    assert found.unusable().code is Code.LAW_RAISED
+    assert found.unusable().code is StatusCode.LAW_RAISED
     assert 'locator' in found.unusable().values['error']
     assert compute(found, [1.0, 0.0]).failure == found.unusable()
 
@@ -383,7 +383,7 @@ def test_plan_that_takes_too_long_costs_one_sample(monkeypatch):
         late[0] = k == 6
         state, _, report = controller.step(state, np.array([0.5, 0.0]), int(1e8) * (k + 1))
         levels.append((report.level, report.reason and report.reason.cause.code))
-    assert levels == [*[('mpc', None)] * 6, ('sdre', Code.TOO_LATE), *[('mpc', None)] * 5]
+    assert levels == [*[('mpc', None)] * 6, ('sdre', StatusCode.TOO_LATE), *[('mpc', None)] * 5]
 
 
 def test_plan_outside_the_data_is_not_followed():
@@ -391,7 +391,7 @@ def test_plan_outside_the_data_is_not_followed():
     # fast, with little to brake it
     one = law(model, input_weight=100.0, learned_model_margin=0.1)
     found = compute(one, [0.9, 0.9])
-    assert (found.u, found.failure.code) == (None, Code.PLAN_OUTSIDE)
+    assert (found.u, found.failure.code) == (None, StatusCode.PLAN_OUTSIDE)
     assert found.failure.values['outside'] > 0.1
     assert compute(one, [0.5, 0.0]).failure is None
 
@@ -408,7 +408,7 @@ def test_infeasible_quadratic_program_costs_one_sample():
     one = law(OSCILLATOR[1], limits=limits(1.0))
     one.planner._lower = np.full(1, 2.0)
     found = compute(one, [0.0, 0.0])
-    assert (found.u, found.failure.code, found.passing) == (None, Code.PLAN_NOT_SOLVED, True)
+    assert (found.u, found.failure.code, found.passing) == (None, StatusCode.PLAN_NOT_SOLVED, True)
 
 
 def test_target_beyond_the_range_is_approached_to_the_limit():

@@ -19,9 +19,9 @@ from koopman_ros.plants import (
     Constants,
     constants_of,
     ControlAffineSystem,
+    estimated_parameters_of,
     random_steps,
     RandomStepDesign,
-    sought_of,
 )
 from koopman_ros.plants.library.reactor import FedReactor, TwoStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
@@ -197,7 +197,7 @@ def test_constants_that_act_alike_are_said():
 
 def test_derivatives_by_constants_and_states_against_those_by_hand():
     episode = vessel(0)
-    model = Equations.of(Vessel, sought_of(Vessel, {}), VESSEL, episode.x, episode.u)
+    model = Equations.of(Vessel, estimated_parameters_of(Vessel, {}), VESSEL, episode.x, episode.u)
     theta = np.array([0.3, -0.4])
     at = model.at(theta)
     box = at.box
@@ -227,7 +227,7 @@ def test_where_inputs_act_by_the_state_and_signals_have_another_order_and_time(t
     rng = np.random.default_rng(0)
     x, u = ((nominal * rng.uniform(0.9, 1.1, (20, 2)))[:, order]
             for nominal in (system.nominal_state, system.nominal_input))
-    model = Equations.of(FedReactor, sought_of(FedReactor, {}), plant, x, u)
+    model = Equations.of(FedReactor, estimated_parameters_of(FedReactor, {}), plant, x, u)
     # a minute has 60 s
     assert 60.0 * model.rate(x, u) == pytest.approx(
         system.derivative(x[:, order], u[:, order])[:, order], rel=1e-9)

@@ -15,9 +15,9 @@ from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.evaluation import run_closed_loop
-from koopman_ros.evaluation.closed_loop_test import check_law
-from koopman_ros.evaluation.model_comparison import Windows
-from koopman_ros.learning import Edmd, fit, Growth, NeuralDrift, roll_out, train
+from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
+from koopman_ros.evaluation.model_comparison import PredictionWindows
+from koopman_ros.learning import Edmd, fit, IncrementalTraining, NeuralDrift, roll_out, train
 from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
@@ -167,7 +167,7 @@ def test_observer_and_hindsight_know_what_an_input_does_at_each_state():
     rng = np.random.default_rng(0)
     inputs = PLANT.nominal_input + HALF_U * rng.uniform(-1.0, 1.0, (40, 2))
     episode = simulate(PLANT, x, inputs, 0.1)
-    past = Windows(episode.x, episode.u, np.full(40, 6.0), np.arange(40).reshape(4, 10))
+    past = PredictionWindows(episode.x, episode.u, np.full(40, 6.0), np.arange(40).reshape(4, 10))
     errors, fixed = (past.squares(one, np.ones(2)).mean(axis=0)
                      for one in (model, replace(model, input_terms=None)))
     assert np.all(errors < 0.1 * fixed)
@@ -176,11 +176,11 @@ def test_observer_and_hindsight_know_what_an_input_does_at_each_state():
 def test_lifts_and_drifts_are_learned_with_it():
     """Held to the true plant: the law holds all over the box, on the plant itself."""
     for plant, recipe in ((KNOWN, NeuralDrift(10, max_iterations=60)),
-                          (UNKNOWN, Growth(4, hidden_first=10, max_iterations=60))):
+                          (UNKNOWN, IncrementalTraining(4, hidden_first=10, max_iterations=60))):
         model = train(plant, samples(), recipe, starts=1, loops=0).model
         fresh = samples()
         assert fit(model, fresh.x, fresh.dxdt, fresh.u).rx < 1e-4
-        found = check_law(model, PLANT.derivative, loops=32)
+        found = evaluate_closed_loops(model, PLANT.derivative, loops=32)
         assert found.accepted, found
         path = roll_out(model, fresh.x[0], fresh.u[:5], 0.05)
         assert np.all(np.abs(path[1:5] - fresh.x[1:5]) < [1e-3, 0.1])

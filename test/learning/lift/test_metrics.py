@@ -12,9 +12,9 @@ from scipy.linalg import block_diag, expm
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import (
     evaluate,
-    Figures,
     Fit,
     fit,
+    LiftMetrics,
     roll_out,
     rollout_rmse,
 )
@@ -211,5 +211,5 @@ def test_the_error_of_roll_outs_is_measured_over_all_episodes():
     (np.array([np.inf, 0.1]), ('T', 'c'), {'rollout_rmse_c': 0.1}),
 ])
 def test_finite_figures_by_name(error, names, expected):
-    figures = Figures(Fit(0.1, np.nan, 3.0), np.ones(1), error)
+    figures = LiftMetrics(Fit(0.1, np.nan, 3.0), np.ones(1), error)
     assert figures.metrics(names) == {'rw': 0.1, 'cond': 3.0, **expected}

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from koopman_ros.core.datasets import DriftSamples, split_by_episode
-from koopman_ros.learning import fit, Growth, NeuralDrift, NoUsefulLift, train
+from koopman_ros.learning import fit, IncrementalTraining, NeuralDrift, train, TrainingFailed
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.neural_drift import NeuralDriftProblem, with_readout
@@ -82,7 +82,7 @@ class Given:
 @pytest.mark.parametrize(('plant', 'samples'), [
     (BENT, bent_samples()), (TWO_STATE, two_state_samples(300))], ids=['bent', 'two states'])
 def test_training_keeps_the_read_out_that_is_better_on_validation_episodes(plant, samples):
-    recipe = Given(Growth(plant.B.shape[0] + 1, hidden_first=6, max_iterations=20))
+    recipe = Given(IncrementalTraining(plant.B.shape[0] + 1, hidden_first=6, max_iterations=20))
     model = train(plant, samples, recipe, starts=1, loops=16).model
     training, validation, _ = split_by_episode(samples, 0)
     by_features = with_readout(model, training)
@@ -139,7 +139,7 @@ def test_a_neural_drift_is_learned(B):
 def test_a_plant_that_is_linear_needs_no_network():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    with pytest.raises(NoUsefulLift, match='does not predict the motion better than a linear'):
+    with pytest.raises(TrainingFailed, match='does not predict the motion better than a linear'):
         train(BENT, linear, NeuralDrift(3, max_iterations=20), starts=1)
 
 

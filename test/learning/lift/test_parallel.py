@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import koopman_ros
-from koopman_ros.evaluation.closed_loop_test import check_law
+from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import train
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.record import read_record
@@ -103,9 +103,10 @@ def test_loops_run_side_by_side(places):
         return x @ A.T + u @ B.T
 
     seen = []
-    one = check_law(model, rate, loops=64)
-    other = check_law(model, rate, loops=64, backend=places['joblib:2'], watch=seen.append)
-    assert check_law(model, rate, loops=64, backend=places['joblib:2'],
+    one = evaluate_closed_loops(model, rate, loops=64)
+    other = evaluate_closed_loops(model, rate, loops=64, backend=places['joblib:2'],
+                                  watch=seen.append)
+    assert evaluate_closed_loops(model, rate, loops=64, backend=places['joblib:2'],
                      watch=lambda _: True) is None
     for name in ('starts', 'setpoints', 'ratios', 'no_gain', 'excess'):
         assert getattr(other, name).tobytes() == getattr(one, name).tobytes()

@@ -12,9 +12,9 @@ from koopman_ros.control import feedback, Form, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.solvers import solve_riccati
-from koopman_ros.learning import Growth, train
+from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.learning.lift.prestabilization import Frame
+from koopman_ros.learning.lift.prestabilization import PrestabilizedFrame
 from koopman_ros.model import NetworkObservables
 
 # dx/dt = x + 0.3 x^2 + 2 u in deviations from 3 m and 0.5 m/s
@@ -49,13 +49,13 @@ def learned(plant, samples, recipe, starts=1):
 
 
 CASES = [
-    ('known', GROWING, growing, [0.8], Growth(
+    ('known', GROWING, growing, [0.8], IncrementalTraining(
         1, identity=False, hidden_first=6, max_iterations=80, pre_feedback=0.1), 1e-7),
-    ('learned', replace(GROWING, B=None), growing, [0.8], Growth(
+    ('learned', replace(GROWING, B=None), growing, [0.8], IncrementalTraining(
         1, identity=False, hidden_first=6, max_iterations=80, pre_feedback=0.1), 1e-7),
-    ('identity', GROWING, growing, [0.8], Growth(
+    ('identity', GROWING, growing, [0.8], IncrementalTraining(
         3, hidden_first=6, max_iterations=80, pre_feedback=0.1), 1e-5),
-    ('free', UPRIGHT, upright, [1.0, 2.0], Growth(
+    ('free', UPRIGHT, upright, [1.0, 2.0], IncrementalTraining(
         2, identity=False, decoder=0, hidden_first=16, max_iterations=300, pre_feedback=0.1),
         1e-5),
 ]
@@ -112,7 +112,7 @@ def a_frame(identity=True, terms=False):
     f = x @ np.array([[1.0, 0.4], [0.3, -0.5]]) + 0.1 * np.sin(x) + (
         u * (1.0 + x) if terms else 0.0)
     regressors = np.hstack([u, u * x]) if terms else None
-    frame = Frame.of(inputs, x, f, regressors, 0.5)
+    frame = PrestabilizedFrame.of(inputs, x, f, regressors, 0.5)
     lift = NetworkObservables(rng.normal(size=(5, 2)), rng.normal(size=5),
                               rng.normal(size=(3, 5)), identity)
     return frame, (x, f, regressors), lift
@@ -161,11 +161,12 @@ def test_the_frame_is_white_and_stable():
 def test_what_has_no_frame(B, states, message):
     x = np.random.default_rng(0).normal(size=(50, 2)) @ states
     with pytest.raises(ValueError, match=message):
-        Frame.of(InputModel(B.shape[1], 0, B), x, x * np.array([1.0, -1.0]), None, 1.0)
+        PrestabilizedFrame.of(InputModel(B.shape[1], 0, B), x, x * np.array([1.0, -1.0]), None,
+                              1.0)
 
 
 def test_starts_take_whitening_weights_in_turn():
-    recipe = Growth(2, whitening=1.0, other_whitenings=(10.0, 0.1))
+    recipe = IncrementalTraining(2, whitening=1.0, other_whitenings=(10.0, 0.1))
     taken = [recipe.of_start(number) for number in range(4)]
     assert [one.whitening for one in taken] == [1.0, 10.0, 0.1, 1.0]
     assert all(one == replace(recipe, whitening=one.whitening, other_whitenings=())
@@ -174,7 +175,7 @@ def test_starts_take_whitening_weights_in_turn():
 
 def test_of_two_whitening_weights_validation_takes_the_better_one():
     samples = samples_of(GROWING, growing, np.array([0.8]))
-    recipe = Growth(3, hidden_first=6, max_iterations=30)
+    recipe = IncrementalTraining(3, hidden_first=6, max_iterations=30)
     both = train(GROWING, samples, replace(recipe, other_whitenings=(1e6,)), starts=2,
                  refuse=False)
     assert both.starts == 4

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
-from koopman_ros.learning import Edmd, evaluate, fit, Growth, train
+from koopman_ros.learning import Edmd, evaluate, fit, IncrementalTraining, train
 from koopman_ros.learning.lift import training
 from koopman_ros.learning.lift.incremental import least_squares
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
@@ -60,7 +60,7 @@ def lifted(grown, data):
     (2, True, 1, (2,)), (5, True, 1, (2, 3, 4, 5)), (5, True, 3, (4, 5)), (1, False, 1, (1,)),
     (4, False, 2, (2, 3, 4))])
 def test_rounds(n_z, identity, n_x, expected):
-    assert Growth(n_z, identity=identity).rounds(n_x) == expected
+    assert IncrementalTraining(n_z, identity=identity).rounds(n_x) == expected
 
 
 @pytest.mark.parametrize(('n_z', 'identity', 'n_x', 'hint'), [
@@ -68,7 +68,7 @@ def test_rounds(n_z, identity, n_x, expected):
     (2, False, 3, '$')])
 def test_fewer_coordinates_than_a_lift_needs(n_z, identity, n_x, hint):
     with pytest.raises(ValueError, match=f'n_z = {n_z} is too small for {n_x} states{hint}'):
-        Growth(n_z, identity=identity).rounds(n_x)
+        IncrementalTraining(n_z, identity=identity).rounds(n_x)
 
 
 @pytest.mark.parametrize(('change', 'message'), [
@@ -81,13 +81,14 @@ def test_fewer_coordinates_than_a_lift_needs(n_z, identity, n_x, hint):
 ])
 def test_a_recipe_without_sense(change, message):
     with pytest.raises(ValueError, match=message):
-        Growth(**{'n_z': 2, **change})
+        IncrementalTraining(**{'n_z': 2, **change})
 
 
 @pytest.mark.parametrize('identity', [True, False])
 def test_widening_leaves_the_coordinates_as_they_were(identity):
     data = two_state_data()
-    recipe = Growth(5, identity=identity, hidden_first=4, hidden_more=2, max_iterations=5)
+    recipe = IncrementalTraining(5, identity=identity, hidden_first=4, hidden_more=2,
+                                 max_iterations=5)
     parent = grow(replace(recipe, n_z=4), data)
     # no step is taken, so that the start itself is returned
     child = replace(recipe, max_iterations=0).start(data, 5, parent, 3)
@@ -102,7 +103,7 @@ def test_widening_leaves_the_coordinates_as_they_were(identity):
 
 def test_a_new_coordinate_starts_near_a_product_that_the_others_do_not_span():
     data = bent_data()
-    child = Growth(2, hidden_first=30, max_iterations=0).start(data, 2, None, 0)
+    child = IncrementalTraining(2, hidden_first=30, max_iterations=0).start(data, 2, None, 0)
     # the only eigenfunction at hand is x, so that the product is x^2 less its share of x
     x = data.x
     target = x ** 2 - x @ least_squares(x, x ** 2)
@@ -115,20 +116,20 @@ def test_a_new_coordinate_starts_near_a_product_that_the_others_do_not_span():
     (2, False, 0, 0)])
 def test_when_there_is_a_decoder(n_x, identity, asked, expected):
     data = bent_data() if n_x == 1 else two_state_data()
-    recipe = Growth(3, identity=identity, decoder=asked, max_iterations=2)
+    recipe = IncrementalTraining(3, identity=identity, decoder=asked, max_iterations=2)
     assert grow(recipe, data).layout.decoder == expected
 
 
 def test_a_lift_that_cannot_grow_says_so():
     x = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]], dtype=torch.float64)
     with pytest.raises(ValueError, match='no new coordinate can be started: the samples are spa'):
-        grow(Growth(4), ScaledSamples(x, -x))
+        grow(IncrementalTraining(4), ScaledSamples(x, -x))
 
 
 def test_a_free_lift_finds_the_eigenfunction():
     """With dx/dt = -x - 0.3 x^2, z = x / (1 + 0.3 x) obeys dz/dt = -z."""
     data = bent_data()
-    grown = grow(Growth(1, identity=False, max_iterations=300), data)
+    grown = grow(IncrementalTraining(1, identity=False, max_iterations=300), data)
     z, x = lifted(grown, data).z[:, 0].numpy(), data.x[:, 0].numpy()
     exact = x / (1.0 + 0.3 * x)
     cosine = z @ exact / np.sqrt((z @ z) * (exact @ exact))
@@ -201,8 +202,8 @@ def test_figures_come_from_the_untouched_episodes():
 
 def test_there_is_a_model_for_every_size():
     held_out = split_by_episode(bent_samples(), 0)[2]
-    trained = train(BENT, bent_samples(), Growth(4, hidden_first=3, max_iterations=60), starts=2,
-                    loops=16)
+    trained = train(BENT, bent_samples(),
+                    IncrementalTraining(4, hidden_first=3, max_iterations=60), starts=2, loops=16)
     assert [model.n_z for model in trained.path] == [2, 3, 4]
     assert trained.path[-1] is trained.model
     assert trained.starts == 6
@@ -231,8 +232,8 @@ def test_same_seed_gives_the_same_bits():
     (BENT, bent_samples()), (small_plants.TWO_STATE, small_plants.two_state_samples())],
     ids=['bent', 'two states'])
 def test_b_is_learned(plant, samples):
-    trained = train(replace(plant, B=None), samples, Growth(3, max_iterations=150), starts=1,
-                    loops=0)
+    trained = train(replace(plant, B=None), samples, IncrementalTraining(3, max_iterations=150),
+                    starts=1, loops=0)
     model = trained.model
     B = model.B * model.states.scale[:, None] / model.inputs.scale
     np.testing.assert_allclose(B, plant.B, rtol=0, atol=1e-3)
@@ -248,7 +249,7 @@ def test_a_plant_without_inputs(B):
                   np.zeros(0), B)
     x = np.random.default_rng(0).uniform(0.0, 5.0, (200, 1))
     samples = DriftSamples(x, x * x, np.zeros((200, 0)), np.arange(200) // 20)
-    trained = train(plant, samples, Growth(2, max_iterations=150), starts=1)
+    trained = train(plant, samples, IncrementalTraining(2, max_iterations=150), starts=1)
     assert trained.law_check is None
     assert (trained.model.n_u, trained.model.B.shape) == (0, (1, 0))
     assert trained.figures.fit.rx < 1e-2 * trained.linear.fit.rx

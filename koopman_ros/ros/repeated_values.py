@@ -10,10 +10,10 @@ import time
 from builtin_interfaces.msg import Time
 import numpy as np
 
-from koopman_ros.core.message_fields import Place
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode, wall_timer
-from koopman_ros.ros.signals import Outlet
+from koopman_ros.ros.signals import SignalPublisher
 
 _PERIOD = 0.05  # s between two looks
 _REPEAT = 0.7  # s without an answer until a value is published again
@@ -22,7 +22,7 @@ _TIMEOUT = 4.0  # s
 
 @dataclass
 class _Value:
-    outlet: Outlet
+    outlet: SignalPublisher
     value: float
     due: float
     deadline: float
@@ -38,13 +38,13 @@ class RepeatedValues:
         self._timer = wall_timer(node, _PERIOD, self._on_timer)
         self._timer.cancel()
 
-    def send(self, name: str, place: Place, unit: str, value: float) -> Callable[[], None]:
+    def send(self, name: str, place: MessageField, unit: str, value: float) -> Callable[[], None]:
         """
         Publish the value of a signal until the function that is returned is called.
 
         :param unit: of the value.
         """
-        outlet = Outlet({name: place}, {name: unit}, lambda topic, kind: (
+        outlet = SignalPublisher({name: place}, {name: unit}, lambda topic, kind: (
             self._node.create_publisher(kind, topic, topics.LOOP_QOS)))
         now = time.monotonic()
         own = _Value(outlet, value, now, now + _TIMEOUT)

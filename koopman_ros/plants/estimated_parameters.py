@@ -19,7 +19,7 @@ _ON_EDGE = 1.0 - 1e-9  # of a range from -1 to 1: no search begins where nothing
 
 
 @dataclass(frozen=True)
-class Sought:
+class EstimatedParameter:
     """A constant that is looked for within a range."""
 
     name: str  #: of the field of the plant's class
@@ -62,7 +62,11 @@ class Sought:
         return float(0.5 * (low + high)), float(0.5 * (high - low))
 
 
-def sought_of(plant: Any, ranges: Mapping[str, tuple[float, float] | None]) -> tuple[Sought, ...]:
+def estimated_parameters_of(plant: Any,
+                            ranges: Mapping[str,
+                                            tuple[float,
+                                                  float] | None]) -> tuple[EstimatedParameter,
+                                                                           ...]:
     """
     Return the constants of a plant's class that are looked for.
 
@@ -86,5 +90,5 @@ def sought_of(plant: Any, ranges: Mapping[str, tuple[float, float] | None]) -> t
             raise ValueError(
                 f'the range of {name} is [{low:.10g}, {high:.10g}] {one.unit}, must rise and lie '
                 f'in [{one.lower:.10g}, {one.upper:.10g}] {one.unit}')
-        found.append(Sought(name, one.unit, one.default, low, high))
+        found.append(EstimatedParameter(name, one.unit, one.default, low, high))
     return tuple(found)
