@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dgees
 from koopman_ros.core.arrays import Array
 
 __all__ = ['RiccatiSolution', 'RiccatiStatus', 'over_interval', 'runge_kutta_step',
-           'solve_riccati']
+           'solve_riccati', 'transition']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
@@ -168,13 +168,7 @@ def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
     # of the size of F, or of 1 where that is 0
     weight *= interval / (size or interval)
     M[:N, N:] /= weight
-    # to a norm of 1/2 at most
-    doublings = max(0, math.frexp(size)[1] + 2)
-    M *= math.ldexp(interval, -doublings)
-    total = power = M
-    for k in range(2, _TERMS):
-        power = power.dot(M) / k
-        total = total + power
+    total, doublings = _part(M, interval, size)
     D, W = total[N:, N:], total[:N, N:]
     W = 0.5 * weight * (W + D.T.dot(W))
     W = W + W.T
@@ -183,6 +177,25 @@ def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
         W = 2.0 * W + DW + DW.T + DW.dot(D)
         D = 2.0 * D + D.dot(D)
     return D, W
+
+
+def transition(A: Array, interval: float) -> Array:
+    """Return exp(A interval) (n, n), by the same series."""
+    D, doublings = _part(A, interval, _size(A) * interval)
+    for _ in range(doublings):
+        D = 2.0 * D + D.dot(D)
+    return D + np.eye(len(A))
+
+
+def _part(M: Array, interval: float, size: float) -> tuple[Array, int]:
+    """Return exp(M h) - I for a part h of an interval, and how often h doubles to all of it."""
+    doublings = max(0, math.frexp(size)[1] + 2)
+    M = M * math.ldexp(interval, -doublings)
+    total = power = M
+    for k in range(2, _TERMS):
+        power = power.dot(M) / k
+        total = total + power
+    return total, doublings
 
 
 def _decays(real: float, imaginary: float) -> bool:

@@ -157,11 +157,11 @@ class NetworkObservables(Observables):
 
     def _jacobian(self, slope: Array) -> Array:
         """Return V diag(slope) W below the rows of the states: (..., h) -> (..., n_z, n_x)."""
-        free: Array = (self.V * slope[..., None, :]) @ self.W
-        if not self.identity:
-            return free
-        states = np.broadcast_to(np.eye(self.n_x), (*slope.shape[:-1], self.n_x, self.n_x))
-        return np.concatenate((states, free), axis=-2)
+        rows = self.n_z - len(self.V)
+        J = np.empty((*slope.shape[:-1], self.n_z, self.n_x))
+        J[..., :rows, :] = np.eye(rows, self.n_x)
+        np.matmul(self.V * slope[..., None, :], self.W, out=J[..., rows:, :])
+        return J
 
 
 @final

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
-from koopman_ros.core.solvers import over_interval, RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.core.solvers import (
+    over_interval,
+    RiccatiStatus,
+    runge_kutta_step,
+    solve_riccati,
+    transition,
+)
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
 
@@ -314,3 +320,9 @@ def test_a_step_of_no_length_stays():
     moved = runge_kutta_step(lambda x: -x, x, h)
     np.testing.assert_array_equal(moved[0], x[0])
     assert np.all(moved[1] < x[1])
+
+
+@pytest.mark.parametrize('interval', [1e-6, 0.3, 20.0])
+def test_transition_is_the_exponential(interval):
+    A = np.random.default_rng(0).normal(size=(5, 5)) - 3.0 * np.eye(5)
+    np.testing.assert_allclose(transition(A, interval), expm(A * interval), rtol=0, atol=1e-12)

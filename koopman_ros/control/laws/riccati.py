@@ -10,7 +10,6 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.linalg import expm
 
 from koopman_ros.control.laws.base import (
     Law,
@@ -21,7 +20,7 @@ from koopman_ros.control.laws.base import (
     Weights,
 )
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.core.solvers import RiccatiSolution, RiccatiStatus, solve_riccati, transition
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
@@ -72,7 +71,7 @@ class Feedback:
         n = len(loop)
         held = np.zeros((2 * n, 2 * n))
         held[:n, :n], held[:n, n:] = self.drift, self.action
-        step = expm(interval * held)[:n]
+        step = transition(held, interval)[:n]
         closed = step[:, :n] + step[:, n:]
         if not np.isfinite(closed).all():
             return math.inf
