@@ -38,7 +38,7 @@ _NOISE = {'pendulum': (2e-3, 1e-2), 'quadruple_tank': (1e-3, 1e-3, 5e-4, 5e-4)}
 _HELD, _BLOCK = 40, 20
 # Until then a controller does not know the time between samples, and plans nothing.
 _UNTIMED = 2
-_MARGIN = 0.3  # half widths of the training box by which the law may leave that
+_MARGIN = 0.3  # half-ranges of the training box by which the law may leave that
 _UNIFORM = 0.02  # of a sample, by which intervals of the horizon may differ from one
 #: of the range of an input, between the commands of each and those of the law. The lift's drift is
 #: not quite the plant's, which the others have; do-mpc counts the cost at the samples alone.

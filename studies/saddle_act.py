@@ -69,7 +69,7 @@ _SETTLED = 1200.0  # s of plant time, when the PI law has brought the reactor to
 _LEAD = 120.0  # s from the take-over to the first set-point
 # Set-points in K by the time in s from the take-over; then the jacket fouls.
 COURSE, FOULED, END = {0.0: SADDLE_TEMPERATURE, _LEAD: 355.0, 560.0: 345.0}, 1060.0, 1660.0
-_ANYWHERE = 10.0  # half widths of a trained range
+_ANYWHERE = 10.0  # half-ranges of a trained range
 _LATE = 120  # samples over which an offset is averaged
 _TIMEOUT = 900.0  # s for an experiment or a training
 _PLANT = 'two_state'

@@ -94,7 +94,7 @@ def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: 
     Run laws on the true reactor, sampled each second, from a state to a temperature.
 
     :param laws: best first.
-    :param margin: half widths of the training box by which they may leave that.
+    :param margin: half-ranges of the training box by which they may leave that.
     :param begin: in K; its coolant is on before.
     :param x0: (2,) in mol/L and K.
     """

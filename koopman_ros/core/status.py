@@ -55,7 +55,7 @@ class StatusCode(Enum):
         'two sources publish the measurement in turn, or its stamps go back again and again: end '
         'one of the publishers, and check the clock of the sensor')
     OUTSIDE_TRAINING = 'outside_training', (
-        'the state is further from the training data than the {margin:g} half widths that the '
+        'the state is further from the training data than the {margin:g} half-ranges that the '
         '{level:level} is allowed (the data span {ranges:ranges})')
     LAW_FAILED = 'law_failed', 'the {level:level} fails: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
@@ -83,7 +83,7 @@ class StatusCode(Enum):
         'it finds no plan within the limits of the inputs ({flag})')
     PLAN_MOVES = 'plan_moves', 'its plan still changes after {iterations} iterations'
     PLAN_OUTSIDE = 'plan_outside', (
-        'its plan leaves the training data by {outside:.2g} half widths, {margin:g} are allowed')
+        'its plan leaves the training data by {outside:.2g} half-ranges, {margin:g} are allowed')
     TOO_LATE = 'too_late', (
         'its plan took {seconds:.3g} s, {deadline:.3g} s are allowed')
     COMMAND_NOT_FINITE = 'command_not_finite', 'its command is not finite'

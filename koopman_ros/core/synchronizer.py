@@ -17,14 +17,14 @@ _LONGEST_WAIT = 10  # samples that are completed meanwhile
 
 
 @dataclass
-class Assembler:
+class SampleSynchronizer:
     """What waits to be put together, and what went wrong on the way, by name of the signal."""
 
     names: Sequence[str]  #: (n,) of the signals, in the order of a sample
     tolerance_ns: int = 0  #: how far stamps of one sample may be apart
     late: Counter[str] = field(default_factory=Counter)  #: came after their sample was complete
     missing: Counter[str] = field(default_factory=Counter)  #: did not come before a later sample
-    doubled: Counter[str] = field(default_factory=Counter)  #: came twice; the later one counts
+    duplicated: Counter[str] = field(default_factory=Counter)  #: came twice; the later one counts
     _open: dict[int, dict[str, float]] = field(default_factory=dict)  # in order of arrival
     _opened: dict[int, int] = field(default_factory=dict)  # after how many completed samples
     _completed: int = 0
@@ -52,7 +52,7 @@ class Assembler:
         at = min(near, key=lambda time: abs(time - stamp_ns), default=stamp_ns)
         parts = self._open.setdefault(at, {})
         self._opened.setdefault(at, self._completed)
-        self.doubled.update(name for name in values if name in parts)
+        self.duplicated.update(name for name in values if name in parts)
         parts.update(values)
         if len(parts) == len(self.names):
             del self._open[at], self._opened[at]

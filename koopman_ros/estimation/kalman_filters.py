@@ -33,7 +33,7 @@ _WANDERED, _A_DAY = 3.0, 86400.0
 _RANK = 1e-9
 _NO_VARIANCE = 1e-14  # likewise of a covariance
 # A prediction says nothing whose standard deviation is so many times that of a first guess, and so
-# many half widths of the training data. That also bounds the condition of the covariance, which
+# many half-ranges of the training data. That also bounds the condition of the covariance, which
 # rounding would make indefinite.
 _LOST = 10.0
 

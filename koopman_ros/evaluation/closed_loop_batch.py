@@ -153,7 +153,7 @@ class DriftPlant:
         slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
         itself = NetworkObservables.linear(n)
         return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
-                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
+                       readout=None, input_terms=None, pre_feedback=None, verified_loops=None)
 
 
 def target_of(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:

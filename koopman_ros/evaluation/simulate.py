@@ -239,7 +239,7 @@ class _Failed(Exception):  # noqa: N818
     """The loop cannot go on; the message says why."""
 
 
-# A set-point for all states is held where a steady state is so near, in half widths of the box.
+# A set-point for all states is held where a steady state is so near, in half-ranges of the box.
 _NEAR = 0.1
 
 

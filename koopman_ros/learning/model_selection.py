@@ -302,7 +302,7 @@ class _Learner:
                                      None, seconds))
         assert one.figures is not None
         return replace(one, model=replace(
-            model, tried_loops=None if one.law_check is None else one.law_check.tried,
+            model, verified_loops=None if one.law_check is None else one.law_check.tried,
             provenance=replace(
                 model.provenance, metrics=one.figures.metrics(model.states.names))))
 

@@ -49,7 +49,7 @@ from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport
 from koopman_ros.records.limits import bounded_reading
 
-# A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
+# A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
 
 # Shares of the whole at which reading, estimating, learning and judging begin and end.
@@ -367,7 +367,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
         metrics |= dict(zip(labels, map(float, values), strict=True))
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
-    return replace(model, tried_loops=decision.law_check.tried, provenance=replace(
+    return replace(model, verified_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
         method=f'{found.method}, {found.drift.form}', model_class=model_class,
         accepted=decision.accepted, reasons=decision.reasons))

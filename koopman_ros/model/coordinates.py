@@ -112,7 +112,7 @@ class Coordinates:
     @cached_property
     def half_widths(self) -> Array:
         """Half the width (n,) of the training box, in scaled deviations."""
-        return frozen(0.5 * (self.upper - self.lower) / self.scale, 'half widths', (len(self),))
+        return frozen(0.5 * (self.upper - self.lower) / self.scale, 'half-ranges', (len(self),))
 
     @cached_property
     def corners(self) -> Array:

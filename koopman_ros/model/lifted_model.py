@@ -101,7 +101,7 @@ class LiftedModel:
     #: (n_u, n_x) gain K of the pre-feedback that A holds under, in scaled coordinates, or None
     pre_feedback: Array | None = None
     #: closed loops of the model's law; None where they are not known, or none failed
-    tried_loops: VerifiedLoops | None = None
+    verified_loops: VerifiedLoops | None = None
 
     __repr__ = short_repr
 
@@ -121,7 +121,7 @@ class LiftedModel:
                              f'{self.input_terms.coefficients.shape}')
         for name, width in (
                 ('training_states', self.training_states and self.training_states.n_x),
-                ('tried_loops', self.tried_loops and self.tried_loops.n_x)):
+                ('verified_loops', self.verified_loops and self.verified_loops.n_x)):
             if width is not None and width != n_x:
                 raise ValueError(f'incompatible {name}: expected {n_x} states, got {width}')
 
@@ -262,15 +262,15 @@ class LiftedModel:
         """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B(0) u."""
         slope = self.drift_jacobian(np.zeros(self.n_x))
         return replace(self, observables=NetworkObservables.linear(self.n_x), A=slope,
-                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
+                       readout=None, input_terms=None, pre_feedback=None, verified_loops=None)
 
     def failed_near(self, x: Array, x_ref: Array) -> bool:
         """
         Tell whether the law failed in the tested loop nearest to a state and a set-point.
 
-        Both (n_x,) in scaled deviations; see :attr:`tried_loops`.
+        Both (n_x,) in scaled deviations; see :attr:`verified_loops`.
         """
-        return self.tried_loops is not None and self.tried_loops.failed_near(
+        return self.verified_loops is not None and self.verified_loops.failed_near(
             x, x_ref, self.states.half_widths)
 
     def distance(self, x: Array) -> float:
@@ -283,7 +283,7 @@ class LiftedModel:
         Return the distances of states from the training data.
 
         :param x: (N, n_x) in scaled deviations.
-        :return: (N,) in half widths of the training box: the larger of the distance from the box
+        :return: (N,) in half-ranges of the training box: the larger of the distance from the box
             and, where they are known, from the training states; infinity for a state that is not
             finite.
         """

@@ -157,7 +157,7 @@ def _signals(signals: Coordinates) -> dict[str, list[Any]]:
 
 def _tensors(model: LiftedModel) -> Tensors:
     """Return the arrays of a model by name."""
-    lift, tried, terms = model.observables, model.tried_loops, model.input_terms
+    lift, tried, terms = model.observables, model.verified_loops, model.input_terms
     if isinstance(lift, NetworkObservables):
         found: dict[str, NDArray[Any] | None] = {'W': lift.W, 'b': lift.b, 'V': lift.V}
     else:
@@ -169,7 +169,7 @@ def _tensors(model: LiftedModel) -> Tensors:
         'training_states': None if model.training_states is None else (
             model.training_states.states)}
     if tried is not None:
-        found |= {f'tried_loops.{one.name}': getattr(tried, one.name) for one in fields(tried)}
+        found |= {f'verified_loops.{one.name}': getattr(tried, one.name) for one in fields(tried)}
     return {name: np.ascontiguousarray(value) for name, value in found.items()
             if value is not None}
 
@@ -217,7 +217,7 @@ def _parsed(content: bytes) -> LiftedModel:
     if metadata['sha256'] != _checksum(about, tensors):
         raise ValueError('its checksum is wrong, so it was damaged or edited')
     for name, array in tensors.items():
-        expected = {'exponents': np.int64, 'tried_loops.lost': np.bool_}.get(name, np.float64)
+        expected = {'exponents': np.int64, 'verified_loops.lost': np.bool_}.get(name, np.float64)
         if array.dtype != expected:
             raise ValueError(f'the array {name!r} has type {array.dtype}, expected {expected}')
     return _model(about, tensors)
@@ -229,8 +229,8 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
             NetworkObservables(tensors.pop('W'), tensors.pop('b'), tensors.pop('V'),
                                identity=_of_type(bool, about, 'identity')))
     terms, known = tensors.pop('input_terms', None), tensors.pop('training_states', None)
-    tried = None if 'tried_loops.starts' not in tensors else VerifiedLoops(
-        *(tensors.pop(f'tried_loops.{one.name}') for one in fields(VerifiedLoops)))
+    tried = None if 'verified_loops.starts' not in tensors else VerifiedLoops(
+        *(tensors.pop(f'verified_loops.{one.name}') for one in fields(VerifiedLoops)))
     origin = dict(about['provenance'])
     origin['metrics'] = {name: float(value) for name, value in origin['metrics'].items()}
     origin['reasons'] = tuple(_of_type(list, origin, 'reasons'))
@@ -244,7 +244,7 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
         readout=tensors.pop('readout', None),
         input_terms=None if terms is None else InputTerms(terms),
         pre_feedback=tensors.pop('pre_feedback', None),
-        tried_loops=tried)
+        verified_loops=tried)
     if tensors:
         raise ValueError(f'it holds unknown arrays: {", ".join(sorted(tensors))}')
     return model

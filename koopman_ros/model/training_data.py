@@ -28,7 +28,7 @@ class TrainingStates:
     """
 
     states: Array  #: (M, n_x) in scaled deviations, M from 1 to 256
-    #: largest distance of any training state from the nearest of these, in half widths of the
+    #: largest distance of any training state from the nearest of these, in half-ranges of the
     #: training box
     fill_distance: float
 
@@ -54,7 +54,7 @@ class TrainingStates:
         """
         Choose by farthest points: each next one is the farthest from those chosen so far.
 
-        :param states: (N, n_x) all of the training data, in scaled deviations, as the half widths
+        :param states: (N, n_x) all of the training data, in scaled deviations, as the half-ranges
             (n_x,) of the training box.
         """
         middle = 0.5 * (states.min(axis=0) + states.max(axis=0))
@@ -70,7 +70,7 @@ class TrainingStates:
         Return the distance of states from the nearest one beyond the fill distance.
 
         :param x: (..., n_x) in scaled deviations.
-        :return: (...) in half widths, so 0 at every training state; NaN where x holds one.
+        :return: (...) in half-ranges, so 0 at every training state; NaN where x holds one.
         """
         nearest = _distances(x[..., None, :], self.states, half_widths).min(axis=-1)
         found: Array = np.maximum(nearest - self.fill_distance, 0.0)
@@ -95,7 +95,7 @@ class VerifiedLoops:
     def __post_init__(self) -> None:
         shape = np.shape(self.starts)
         if len(shape) != 2 or not 1 <= shape[0] <= MAX_TRIED_LOOPS:
-            raise ValueError(f'incompatible tried_loops: expected (N, n_x) with N from 1 to '
+            raise ValueError(f'incompatible verified_loops: expected (N, n_x) with N from 1 to '
                              f'{MAX_TRIED_LOOPS}, got {shape}')
         object.__setattr__(self, 'starts', frozen(self.starts, 'starts', shape))
         object.__setattr__(self, 'setpoints', frozen(self.setpoints, 'setpoints', shape))
@@ -114,7 +114,7 @@ class VerifiedLoops:
         """
         Tell whether the loop nearest to a state and a set-point, (n_x,) each and scaled, failed.
 
-        Of two loops at the same distance, in half widths, the one that arrived counts.
+        Of two loops at the same distance, in half-ranges, the one that arrived counts.
         """
         distances = np.maximum(_distances(self.starts, x, half_widths),
                                _distances(self.setpoints, x_ref, half_widths))

@@ -18,7 +18,7 @@ _STATUS = {'model file time': 'File written', 'model training data': 'Training d
            'model check': 'Check on recent data', 'law': 'Control law',
            'gain norm': 'Norm of the feedback gain',
            'predicted growth per sample': 'Predicted growth per sample'}
-_OUTSIDE = ' outside training box [half widths]'
+_OUTSIDE = ' outside training box [half-ranges]'
 _UNKNOWN = ('', 'none', 'nan')
 
 
@@ -57,5 +57,5 @@ def status_card(values: Mapping[str, str]) -> dict[str, str]:
         if key.endswith(_OUTSIDE):
             name = key.removesuffix(_OUTSIDE)
             subject = 'State' if name == 'distance' else name.capitalize()
-            found[f'{subject} outside the training range [half widths]'] = value
+            found[f'{subject} outside the training range [half-ranges]'] = value
     return {title: value for title, value in found.items() if value not in _UNKNOWN}

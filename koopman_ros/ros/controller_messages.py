@@ -69,7 +69,7 @@ def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) 
             states.items(),
             by_label(states, '{}', None if estimate is None else estimate.state).values(),
             strict=True)},
-        'distance_outside [half widths]': float(report.measurement.outside),
+        'distance_outside [half-ranges]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),
         'riccati_residual': float(law.residual),

@@ -14,7 +14,7 @@ from koopman_ros.control.state import TargetReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words, StatusCode
-from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import display_unit, shown
 from koopman_ros.parameters.controller import ControllerParameters
@@ -70,7 +70,7 @@ class StatusContext:
     report: StepReport
     counts: Counts
     timing: Timing
-    assembler: Assembler  #: of the measurements
+    assembler: SampleSynchronizer  #: of the measurements
     measured: Array  #: (n_y,) last measured, in the units of the signals
     complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
     unheard: Sequence[str]  #: topics of the commands without a subscriber
@@ -304,10 +304,10 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
                 else 'disturbance [{}]', None if estimate is None else estimate.disturbance, True),
         **by_label(signals.states, 'equivalent sensor bias [{}]', bias, True),
         **_estimated(now),
-        'distance outside training box [half widths]': float(report.measurement.outside),
-        'set-point outside training box [half widths]': (
+        'distance outside training box [half-ranges]': float(report.measurement.outside),
+        'set-point outside training box [half-ranges]': (
             np.nan if target is None else float(target.outside)),
-        f'{now.input} outside training box [half widths]': float(report.command.outside),
+        f'{now.input} outside training box [half-ranges]': float(report.command.outside),
         'Riccati residual': float(law.residual),
         'gain norm': float(law.gain),
         'predicted growth per sample': float(law.growth),
@@ -319,9 +319,9 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'measurements rejected': now.counts.refused,
         **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
            if 'mpc' in now.parameters.tuning.fallback_order else {}),
-        **{f'{what} parts of {name}': count for what, counts in (
+        **{f'{what} messages of {name}': count for what, counts in (
             ('late', now.assembler.late), ('missing', now.assembler.missing),
-            ('doubled', now.assembler.doubled)) for name, count in counts.items()},
+            ('duplicate', now.assembler.duplicated)) for name, count in counts.items()},
         'since last measurement [s]': timing.wall_silence,
         'age of measurement [s]': timing.age,
         'latency from stamp to command [s]': timing.age + timing.answer_seconds,

@@ -32,7 +32,7 @@ from koopman_ros.control.experiment import (
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name, MessageField
 from koopman_ros.core.status import Reason, reason, StatusCode
-from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.units import display_unit, NANOSECONDS, shown
 from koopman_ros.event_log import records
 from koopman_ros.parameters.signal_topics import SignalTopics
@@ -98,7 +98,7 @@ class ExperimentRun:
                           for span in (self.plan.upper - self.plan.lower).tolist()]
         self._owned = owned = NodeEntities(node)
         self.destroy = owned.destroy  #: commands no more
-        self._assembler = Assembler(
+        self._assembler = SampleSynchronizer(
             tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
         self._measured = SignalSubscriber(
             node, self._subscribe, wiring.measured, signals.states, self._on_measurement)

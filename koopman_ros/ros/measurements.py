@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rclpy.timer import Timer
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, SignalTopics
@@ -43,7 +43,7 @@ class Measurements:
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals
         self._node, self._matching, self._answer = node, matching, answer
-        self.assembler = Assembler(tuple(signals.states), round(tolerance * NANOSECONDS))
+        self.assembler = SampleSynchronizer(tuple(signals.states), round(tolerance * NANOSECONDS))
         self.applied = MeasuredInputs(signals.inputs)
         self.frame_id, self._frame_length = '', 0
         # by topic of the measurements with one publisher: the numbers of its messages

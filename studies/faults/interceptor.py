@@ -20,7 +20,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from koopman_ros.core.message_fields import MessageField
-from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
@@ -167,7 +167,7 @@ class Interceptor:
         self._awaited = 0  # commands, for what was delivered
         self._held: Mapping[str, float] = {}  # the command that the actuators stand at
         # what the controller is expected to put together
-        self._assembler = Assembler(on.states)
+        self._assembler = SampleSynchronizer(on.states)
         wiring, self._parts = on.wiring, list(by_topic(on.wiring.measured))
         if between:
             self._to_controller = self._publishers(wiring.measured)

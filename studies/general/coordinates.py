@@ -32,7 +32,7 @@ _HELD_OUT = 40
 _POLYNOMIALS = ('EDMD-3', 'EDMD-5')
 LIFTS = ('identity lift', 'free lift')
 _DEGREE = 3  # of the monomials in discrete time
-_FAR = 1e3  # half widths, beyond which a prediction has diverged
+_FAR = 1e3  # half-ranges, beyond which a prediction has diverged
 
 
 def noisy(samples: DriftSamples, seed: int) -> DriftSamples:

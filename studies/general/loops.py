@@ -21,7 +21,7 @@ from studies.general.systems import CASES, Regulation
 
 STARTS = 20
 OPTIMA = 5  # of the first of them, as the least cost takes a second to find
-ARRIVED = 0.1  # distance from the nominal state, in half widths of the box
+ARRIVED = 0.1  # distance from the nominal state, in half-ranges of the box
 HELD_TO = 1.05  # most that a law may cost, over the better of those that know the plant
 _SAMPLES = 800  # of the least cost, for each of which the inputs are held
 _MAX_EVALUATIONS = 5000  # of a law; what needs more chatters

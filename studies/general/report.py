@@ -39,7 +39,7 @@ def write_report(summary: Mapping[str, Any], folder: Path) -> None:
     sections = [
         f'{report.opening(summary)} From each seed a model of every class; from the same {STARTS} '
         'starts in the box of each plant, its law regulates the true plant to the nominal state. '
-        'Errors weigh 1 in half widths of the box and of the exciting steps. `rx`, roll-out and '
+        'Errors weigh 1 in half-ranges of the box and of the exciting steps. `rx`, roll-out and '
         'processor time are medians over the seeds with [smallest, largest]; `accepted` counts '
         'seeds. Of all starts and seeds: no gain, not arrived, and either not arrived or cost '
         f'more than {HELD_TO} times the better of two laws that know the plant; that cost ratio '

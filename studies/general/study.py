@@ -45,7 +45,7 @@ def predicted(case: Regulation, learned: Learned, held_out: DriftSamples) -> Met
     Judge a model on held-out episodes.
 
     :return: `rw`, `rx`; `rollout`, the root mean square error over an episode of the worst state,
-        in half widths of the box, None of a drift that is no better than none; `seconds` of
+        in half-ranges of the box, None of a drift that is no better than none; `seconds` of
         learning; `accepted`, None where nothing decides.
     """
     found = fit(learned.model, held_out.x, held_out.dxdt, held_out.u)

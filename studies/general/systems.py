@@ -126,7 +126,7 @@ def _case(system: ControlAffineSystem, lower: ArrayLike, upper: ArrayLike, input
 
     :param inputs: how far steps go to both sides of the nominal input.
     :param period: of the samples, of which an episode has `holds` and one.
-    :param room: how far they may leave it, in half widths.
+    :param room: how far they may leave it, in half-ranges.
     """
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     more = room * 0.5 * (upper - lower)

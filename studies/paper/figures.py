@@ -247,7 +247,7 @@ def _boxes_of(where: tuple[str, ...], campaign: Campaign, path: Path) -> str:
     left = ', '.join(f'that of the {name} box by {max(0.0, loops[name].distance(model)):.2g}'
                      for name, (_, model) in lifts.items())
     return ('Training boxes and the paths of the controlled system, which leave them by up to so '
-            f'many half widths: {left}.')
+            f'many half-ranges: {left}.')
 
 
 def _sensors(campaign: Campaign, path: Path) -> str:

@@ -17,7 +17,7 @@ from koopman_ros.evaluation.simulate import after_a_second
 from koopman_ros.model import LiftedModel
 from studies.partly_measured.cases import PartialCase
 
-MARGIN = 0.3  # half widths of the training box by which the laws may leave that
+MARGIN = 0.3  # half-ranges of the training box by which the laws may leave that
 _ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
 
 

@@ -44,7 +44,7 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
     :param bandwidth: of the observer, in 1/min.
     :param coolant_weight: in 1/K^2.
     :param fallback: whether the distance from the training data decides which law acts.
-    :param linear_model_margin: up to which the linear law does, in half widths.
+    :param linear_model_margin: up to which the linear law does, in half-ranges.
     """
     model = model or shipped_model()
     tuning = built(table_of(model).snapshot({

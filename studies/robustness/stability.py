@@ -226,7 +226,7 @@ def two_state_end(start: tuple[float, float]) -> End:
 
 
 def back_from_safe(system: ControlAffineSystem, linear_model_margin: float) -> Metrics:
-    """Start at rest under the safe coolant, `outside` the trained range by so many half widths."""
+    """Start at rest under the safe coolant, `outside` the trained range by so many half-ranges."""
     coldest = COOLANT_RANGE[0]
     rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
                             coldest, 320.0)])

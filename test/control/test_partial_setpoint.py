@@ -34,7 +34,7 @@ say = StatusFormatter(Displays({**dict.fromkeys(LEVELS, 'm'), **dict.fromkeys(FL
 def tanks(slope, gain, *, level=1.0, flow=3.0):
     """Return dh/dt = slope (h - level) + gain (q - flow), levels from 0 m to 2 m."""
     n, m = np.shape(gain)
-    # scales that are no half widths, so that units count
+    # scales that are no half-ranges, so that units count
     states = Coordinates(LEVELS[:n], ('m',) * n, np.full(n, level), np.full(n, 0.5),
                          np.zeros(n), np.full(n, 2.0 * level))
     inputs = Coordinates(FLOWS[:m], ('L/s',) * m, np.full(m, flow), np.full(m, 2.0),
@@ -201,7 +201,7 @@ def test_a_refusal_names_the_nearest_level_and_what_the_pump_would_need(
 
 
 def test_another_level_that_would_overflow_refuses_too():
-    # h1 - 1 = (0.1 (h2 - 1) - w2) / 0.2 may go to 2 m and by the margin of 0.1 half widths beyond
+    # h1 - 1 = (0.1 (h2 - 1) - w2) / 0.2 may go to 2 m and by the margin of 0.1 half-ranges beyond
     controller = loop(SERIES, 'h2', lower=-9.0, upper=9.0)
     state = disturbed(controller, [1.0, 1.0], [0.0, -0.2])
     refused = asked(controller, 1.6, state)[1]

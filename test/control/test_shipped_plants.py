@@ -36,7 +36,7 @@ from koopman_ros.parameters.plant import PlantTable
 from support.closed_loops import content, EPOCH, SECOND
 
 WILD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1.7e308, 0.0, -0.0, 5e-324]
-# of the half widths of the trained range, from its middle
+# of the half-ranges of the trained range, from its middle
 shares = st.one_of(st.floats(-1.0, 1.0), st.floats(-3.0, 3.0), st.sampled_from(WILD))
 waits = st.one_of(st.just(1.0), st.sampled_from([0.3, 4.0, 0.0, -1.0, -30.0, 3600.0, -1e6]))
 kinds = st.sampled_from(['run'] * 4 + ['measure', 'part', 'silence', 'setpoint', 'one setpoint',

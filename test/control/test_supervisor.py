@@ -239,7 +239,7 @@ def test_a_hot_reactor_that_stands_still_keeps_the_safe_coolant():
 
 @pytest.mark.parametrize('side', [-1.0, 1.0])
 def test_it_leads_back_from_either_side(side):
-    """A plant dx/dt = u - x + 0.2 whose safe input takes it to 4 half widths from its nominal."""
+    """A plant dx/dt = u - x + 0.2 whose safe input takes it to 4 half-ranges from its nominal."""
     box = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
     model = linearised_model(-np.eye(1), np.eye(1), box, replace(box, names=('u',)), 's',
                              Provenance('plant'))

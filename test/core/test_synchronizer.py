@@ -5,7 +5,7 @@
 
 import pytest
 
-from koopman_ros.core.synchronizer import Assembler
+from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.units import NANOSECONDS as SECOND
 
 NAMES = ('level', 'flow')
@@ -18,11 +18,11 @@ def taken(assembler, *parts):
 
 
 def counts(assembler):
-    return dict(assembler.late), dict(assembler.missing), dict(assembler.doubled)
+    return dict(assembler.late), dict(assembler.missing), dict(assembler.duplicated)
 
 
 def test_message_with_all_signals_is_a_sample_whatever_its_stamp():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     for stamp in (5, 5, 3, -SECOND):
         found = assembler.take(stamp, {'flow': 2.0, 'level': 1.0})
         assert (found[0], found[1].tolist()) == (stamp, [1.0, 2.0])
@@ -30,7 +30,7 @@ def test_message_with_all_signals_is_a_sample_whatever_its_stamp():
 
 
 def test_parts_of_one_stamp_are_a_sample_in_any_order():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     assert taken(assembler, (1, 'level', 1.0), (1, 'flow', 2.0), (2, 'flow', 4.0),
                  (2, 'level', 3.0)) == [(1, [1.0, 2.0]), (2, [3.0, 4.0])]
     # of several that are open, too
@@ -45,18 +45,18 @@ def test_parts_of_one_stamp_are_a_sample_in_any_order():
     (11, []), (-11, [])])
 def test_stamps_may_be_apart_by_the_tolerance(apart, found):
     """The stamp of the sample is the last of its parts."""
-    assembler = Assembler(NAMES, tolerance_ns=10)
+    assembler = SampleSynchronizer(NAMES, tolerance_ns=10)
     assert taken(assembler, (100, 'level', 1.0), (100 + apart, 'flow', 2.0)) == found
 
 
 def test_part_goes_to_the_nearest_of_the_samples_that_wait_for_it():
-    assembler = Assembler(('level', 'flow', 'heat'), tolerance_ns=10)
+    assembler = SampleSynchronizer(('level', 'flow', 'heat'), tolerance_ns=10)
     assert not taken(assembler, (100, 'level', 1.0), (115, 'level', 2.0), (109, 'flow', 3.0))
     assert taken(assembler, (116, 'heat', 4.0)) == [(116, [2.0, 3.0, 4.0])]
 
 
 def test_what_comes_after_its_sample_is_late():
-    assembler = Assembler(NAMES, tolerance_ns=10)
+    assembler = SampleSynchronizer(NAMES, tolerance_ns=10)
     assert taken(assembler, (100, 'level', 1.0), (100, 'flow', 2.0)) == [(100, [1.0, 2.0])]
     assert not taken(assembler, (100, 'level', 9.0), (90, 'flow', 9.0), (110, 'flow', 9.0))
     assert counts(assembler) == ({'level': 1, 'flow': 2}, {}, {})
@@ -64,7 +64,7 @@ def test_what_comes_after_its_sample_is_late():
 
 
 def test_what_does_not_come_before_a_later_sample_is_missing():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     assert taken(assembler, (1, 'level', 1.0), (2, 'level', 2.0), (3, 'flow', 3.0)) == []
     assert assembler.awaited == 'flow'
     assert taken(assembler, (3, 'level', 4.0)) == [(3, [4.0, 3.0])]
@@ -75,14 +75,14 @@ def test_what_does_not_come_before_a_later_sample_is_missing():
 
 
 def test_of_a_part_that_comes_twice_the_later_one_counts():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     assert taken(assembler, (1, 'level', 1.0), (1, 'level', 2.0), (1, 'flow', 3.0)) == [
         (1, [2.0, 3.0])]
     assert counts(assembler) == ({}, {}, {'level': 1})
 
 
 def test_time_that_is_set_back_begins_afresh():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     late = 100 * SECOND
     assert taken(assembler, (late, 'level', 1.0), (late, 'flow', 2.0), (late + 1, 'level', 3.0)
                  ) == [(late, [1.0, 2.0])]
@@ -97,7 +97,7 @@ def test_time_that_is_set_back_begins_afresh():
 
 
 def test_what_waits_is_bounded():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     assert not taken(assembler, *((stamp, 'level', 1.0) for stamp in range(1000)))
     assert len(assembler._open) == 100
     assert counts(assembler) == ({}, {'flow': 900}, {})
@@ -108,7 +108,7 @@ def test_what_waits_is_bounded():
 @pytest.mark.parametrize('samples', [9, 50, 100, 101, 150])
 @pytest.mark.parametrize('ahead', [3600 * SECOND, -3600 * SECOND])
 def test_a_clock_that_was_wrong_for_a_while_costs_those_samples_alone(samples, ahead):
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     assert len(taken(assembler, *((k * SECOND, name, 1.0) for k in range(10)
                                   for name in NAMES))) == 10
     for k in range(10, 10 + samples):
@@ -119,7 +119,7 @@ def test_a_clock_that_was_wrong_for_a_while_costs_those_samples_alone(samples, a
 
 
 def test_a_part_with_a_stamp_ahead_is_not_put_together_with_parts_of_that_time():
-    assembler = Assembler(NAMES)
+    assembler = SampleSynchronizer(NAMES)
     assert not taken(assembler, (60 * SECOND, 'level', 9.0))
     for k in range(59):
         assert taken(assembler, (k * SECOND, 'level', 1.0), (k * SECOND, 'flow', 2.0))

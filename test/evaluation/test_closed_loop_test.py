@@ -241,10 +241,10 @@ def test_a_model_keeps_the_loops_in_which_its_law_is_lost():
     found = evaluate_closed_loops(model, linear_rate(1.0))
     tried = found.tried
     assert tried is not None
-    model = replace(model, tried_loops=tried)
+    model = replace(model, verified_loops=tried)
     for start, setpoint, lost in zip(found.starts, found.setpoints, found.lost, strict=True):
         assert model.failed_near(start, setpoint) == lost
-    assert model.linearised.tried_loops is None
+    assert model.linearised.verified_loops is None
     # and nothing of a law that is lost nowhere
     assert evaluate_closed_loops(two_states(), two_state_rate, loops=16).tried is None
 
@@ -261,8 +261,8 @@ def test_tried_loops_that_do_not_fit_are_refused(starts, setpoints, lost):
 
 def test_tried_loops_of_another_plant_are_refused():
     tried = VerifiedLoops(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
-    with pytest.raises(ValueError, match='incompatible tried_loops: expected 1 states, got 2'):
-        replace(scalar(), tried_loops=tried)
+    with pytest.raises(ValueError, match='incompatible verified_loops: expected 1 states, got 2'):
+        replace(scalar(), verified_loops=tried)
 
 
 def levels_on_the_way(model, levels, start, setpoint):
@@ -287,7 +287,7 @@ def levels_on_the_way(model, levels, start, setpoint):
 def test_where_its_law_was_lost_the_controller_takes_the_next_one():
     found = too_steady_on_its_plant()
     assert 0 < found.lost.sum() < found.poor.sum() < found.loops
-    model = replace(too_steady(), tried_loops=found.tried)
+    model = replace(too_steady(), verified_loops=found.tried)
     for lost, expected in ((True, ('linear', StatusCode.LOST_HERE)), (False, ('sdre', None))):
         for k in np.flatnonzero(found.lost == lost)[:3]:
             first, *_ = levels_on_the_way(

@@ -335,7 +335,7 @@ def test_coordinates_scale_both_ways():
     np.testing.assert_allclose(c.to_deviation(c.to_physical(batch)), batch, rtol=0, atol=1e-15)
 
 
-# The box is [2, 3.5] x [-2, 2.5], with half widths 0.75 and 2.25.
+# The box is [2, 3.5] x [-2, 2.5], with half-ranges 0.75 and 2.25.
 @pytest.mark.parametrize(('value', 'violation'), [
     ([3.0, 0.0], 0.0), ([2.0, 2.5], 0.0), ([3.5, -2.0], 0.0), ([4.25, 0.0], 1.0),
     ([1.25, 0.0], 1.0), ([3.0, 7.0], 2.0), ([5.0, -4.25], 2.0), ([3.5, -8.75], 3.0),

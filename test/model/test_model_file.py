@@ -51,7 +51,7 @@ MODELS = {
     'read-out': replace(PLAIN, readout=RNG.normal(size=(2, 7))),
     'pre-feedback': replace(random_lift(n_u=2), pre_feedback=RNG.normal(size=(2, 2))),
     'input terms': replace(PLAIN, input_terms=InputTerms(RNG.normal(size=(5, 2, 1)))),
-    'tried loops': replace(PLAIN, tried_loops=VerifiedLoops(
+    'tried loops': replace(PLAIN, verified_loops=VerifiedLoops(
         *RNG.normal(size=(2, 7, 2)), np.arange(7) % 3 == 0)),
     'refused': with_origin(model_class='neural drift', accepted=False,
                            reasons=('too large', 'too few')),
@@ -216,8 +216,8 @@ ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     ('read-out', {'readout': np.zeros((7, 2))}, 'incompatible readout'),
     ('pre-feedback', {'pre_feedback': np.zeros((2, 3))}, 'incompatible pre_feedback'),
     ('input terms', {'input_terms': np.zeros((4, 2, 1))}, 'incompatible input terms'),
-    ('tried loops', {'tried_loops.lost': np.zeros(7)}, 'has type float64'),
-    ('tried loops', {'tried_loops.lost': None}, 'lost'),
+    ('tried loops', {'verified_loops.lost': np.zeros(7)}, 'has type float64'),
+    ('tried loops', {'verified_loops.lost': None}, 'lost'),
     ('monomials', {'exponents': np.eye(5, 2)}, 'has type float64'),
     ('monomials', {'exponents': -np.eye(5, 2, dtype=np.int64)}, 'at least 0'),
     ('monomials', {'exponents': np.array([[1, 0], [0, 1], [33, 0], [1, 1], [2, 0]])},

@@ -158,8 +158,8 @@ def test_a_model_is_described_in_words() -> None:
     assert training_ranges(model)['level_1'] == (model.states.lower[0], model.states.upper[0])
     assert status_card({
         'model': 'x', 'model file time': '2026-11-25T15:10:08.000+00:00', 'law': 'none',
-        'distance outside training box [half widths]': '0.5', 'gain norm': 'nan',
-        'coolant outside training box [half widths]': '0'}) == {
+        'distance outside training box [half-ranges]': '0.5', 'gain norm': 'nan',
+        'coolant outside training box [half-ranges]': '0'}) == {
         'File written': '2026-11-25 15:10:08',
-        'State outside the training range [half widths]': '0.5',
-        'Coolant outside the training range [half widths]': '0'}
+        'State outside the training range [half-ranges]': '0.5',
+        'Coolant outside the training range [half-ranges]': '0'}

@@ -43,7 +43,7 @@ class HostileSource:
         own.take_record('parameters', {'parameters': list(TEXTS)}, NOW)
         own.take_internals({f'estimated_other [{TEXT}]': 1.0})
         task = {TEXT: TEXT, 'model': TEXT, 'law': TEXT, 'model_file': TEXT, 'accepted': 'True',
-                f'{TEXT} outside training box [half widths]': TEXT, 'reason': TEXT,
+                f'{TEXT} outside training box [half-ranges]': TEXT, 'reason': TEXT,
                 'done [%]': TEXT}
         for name in ('controller: control', 'trainer: training', 'trainer: recording',
                      'trainer: experiment', *TEXTS):

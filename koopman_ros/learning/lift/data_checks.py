@@ -21,7 +21,7 @@ _ALIKE = 2.0
 # The share of all steps whose derivatives are alike where samples resolve the motion.
 _RESOLVED = 0.5
 _FEWEST_STEPS = 20
-# A steady state this near, in half widths, is taken for the nominal point; one farther away than
+# A steady state this near, in half-ranges, is taken for the nominal point; one farther away than
 # the other number is not suggested.
 _NEAR, _FAR = 0.02, 2.0
 # The drift there is told from zero where it is so many standard errors, and so many times what

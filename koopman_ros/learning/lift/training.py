@@ -244,7 +244,7 @@ def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, 
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
     if law_check is not None:
-        models[-1] = replace(models[-1], tried_loops=law_check.tried)
+        models[-1] = replace(models[-1], verified_loops=law_check.tried)
     return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check,
                    _ending(winner.grown, interrupted), tuple(models), tracker.finished,
                    tracker.steps)

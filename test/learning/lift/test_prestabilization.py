@@ -36,7 +36,7 @@ def upright(x):
 
 
 def samples_of(plant, drift, half, count=400, B=None):
-    """Return samples all over a box of half widths about the nominal state, with B(x) if given."""
+    """Return samples all over a box of half-ranges about the nominal state, with B(x) if given."""
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-half, half, (count, len(half))), rng.uniform(-1.0, 1.0, (count, 1))
     pushed = u @ plant.B.T if B is None else (B(x) @ u[..., None])[..., 0]
