@@ -110,7 +110,7 @@ def backend_of(text: str) -> Backend:
     :raises SchedulerLost: when no scheduler answers at the address.
     :raises WorkerLost: when the scheduler has no worker.
     """
-    if reason := scheduler_refusal(text):
+    if reason := executor_refusal(text):
         raise ValueError(reason)
     if not text:
         return Serial()
@@ -121,13 +121,13 @@ def backend_of(text: str) -> Backend:
     return Processes(1 if text == 'process' else int(text.partition(':')[2] or 0))
 
 
-def scheduler_refusal(text: str) -> str:
+def executor_refusal(text: str) -> str:
     """Return why a text names no backend, or an empty text."""
     if text in ('', 'process', 'joblib') or text.startswith(_ADDRESSES):
         return ''
     kind, _, count = text.partition(':')
     if kind == 'joblib' and count.isascii() and count.isdigit() and int(count):
         return ''
-    return (f'scheduler is {text!r}, must be empty for this process, process, joblib, joblib:N '
+    return (f'executor is {text!r}, must be empty for this process, process, joblib, joblib:N '
             'with N processes of at least 1, or the address of a Dask scheduler, like '
             'tcp://127.0.0.1:8786')

@@ -26,7 +26,7 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import short_name
 from koopman_ros.core.units import conversion, display_unit
-from koopman_ros.execution import scheduler_refusal
+from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
@@ -333,7 +333,7 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
         return (f'output = {values.output!r} is one file, which max_bag_size and '
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
-    if reason := scheduler_refusal(values.executor):
+    if reason := executor_refusal(values.executor):
         return reason
     try:
         parameters_of(values.identification_methods)
