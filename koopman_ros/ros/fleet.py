@@ -82,7 +82,7 @@ def _one_scheduler(schedulers: Mapping[str, str]) -> str:
     found = sorted(set(schedulers.values()))
     if len(found) > 1:
         raise ConfigurationError(
-            f'scheduler is {" and ".join(map(repr, found))} in different loops: give all plants '
+            f'executor is {" and ".join(map(repr, found))} in different loops: give all plants '
             'of one call the same, e.g. under /**')
     return found[0] if found else ''
 

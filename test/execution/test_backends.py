@@ -165,9 +165,9 @@ def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
 @pytest.mark.parametrize('text', [
     'joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
 def test_other_names_are_refused(text):
-    with pytest.raises(ValueError, match=f'scheduler is {text!r}, must be empty for this process'):
+    with pytest.raises(ValueError, match=f'executor is {text!r}, must be empty for this process'):
         backend_of(text)
     table = trainer_table(None, {
         'system': 'own', 'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})
-    assert table.check(table.snapshot({'executor': text})).startswith('scheduler is ')
+    assert table.check(table.snapshot({'executor': text})).startswith('executor is ')
     assert 'executor' not in table.check(table.snapshot({'executor': 'joblib:2'}))

@@ -213,7 +213,7 @@ def test_it_is_retrained_where_the_task_says(bag, tmp_path):
     assert models[0].A.tobytes() == models[1].A.tobytes()
     assert models[0].verified_loops == models[1].verified_loops
     for change, error, text in (
-            ({'executor': 'joblib:0'}, ValueError, "scheduler is 'joblib:0', must be"),
+            ({'executor': 'joblib:0'}, ValueError, "executor is 'joblib:0', must be"),
             ({'device': 'abacus'}, ValueError, "device is 'abacus', but torch")):
         with pytest.raises(error, match=text):
             retrain(replace(task(bag, tmp_path, 'linear'), **change))

@@ -50,4 +50,4 @@ def test_plants_of_one_call_are_trained_in_one_place(ros: Harness, tmp_path: Pat
     (tmp_path / 'site.yaml').write_text(yaml.safe_dump(site))
     program = ros.start('trainer', arguments=given)
     assert program.wait(30.0) == 1
-    assert "scheduler is '' and 'joblib:2' in different loops" in program.output()
+    assert "executor is '' and 'joblib:2' in different loops" in program.output()
