@@ -145,7 +145,7 @@ def _problem(case: PartialCase, controller: Controller) -> SqpProblem:
         raise ValueError(f'{case.plant}: the horizon has {len(lengths)} intervals of '
                          f'{lengths.min():g} to {lengths.max():g}, must be {INTERVALS} samples')
     return SqpProblem(EQUATIONS[case.plant], lengths, case.Q, case.R, case.cost_to_go, case.lower,
-                   case.upper, (model.states.scale, model.inputs.scale))
+                      case.upper, (model.states.scale, model.inputs.scale))
 
 
 def _sides(case: PartialCase, controller: Controller, sqp: Sqp) -> dict[str, Answer]:

@@ -75,7 +75,7 @@ def build(system: str, samples: int, hidden: int) -> PlanningCase:
     data = ScaledSamples(torch.from_numpy(x), torch.from_numpy(f))
     *before, _ = range(plant.n_x + 1, N_Z + 1)
     growth = IncrementalTraining(N_Z, hidden_first=hidden - _HIDDEN_MORE * len(before),
-                    hidden_more=_HIDDEN_MORE, whitening=WHITENING)
+                                 hidden_more=_HIDDEN_MORE, whitening=WHITENING)
     parent = growth.root(data)
     for n_z in before:
         parent = growth.start(data, n_z, parent, _SEED)

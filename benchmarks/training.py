@@ -65,7 +65,7 @@ class TrainingPlan:
 PLANS = {
     'quick': TrainingPlan(((300, 8),), 1.0, 10.0, 4e3, 1, learned=('two_tanks',)),
     'default': TrainingPlan(((300, 8), (2000, 8), (2000, 16), (2000, 32)), 20.0, 60.0, 8e3, 3,
-                    learned=('two_tanks', 'van_der_pol', 'pendulum', 'reactor_saddle')),
+                            learned=('two_tanks', 'van_der_pol', 'pendulum', 'reactor_saddle')),
 }
 
 

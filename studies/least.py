@@ -53,7 +53,7 @@ def least_course(task: Task, rates: Rates, lower: Array, upper: Array, *,
     found = opti.solve()
     return OptimalTrajectory(unit * np.asarray(found.value(x)).T,
                              np.reshape(found.value(u), u.shape).T,
-                  float(found.value(opti.f)))
+                             float(found.value(opti.f)))
 
 
 def _sample(task: Task, rates: Rates) -> casadi.Function:

@@ -134,7 +134,7 @@ def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
                       for report in loop.reports])
     error = (known - loop.states[:, 0])[(t > 60.0) & (t < FOULED)]
     return RunFigures((costs[0], costs[1]), (offsets[0], offsets[1]),
-                   float(np.sqrt(np.mean(error ** 2))))
+                      float(np.sqrt(np.mean(error ** 2))))
 
 
 def _gave_up(loop: Simulation) -> bool:

@@ -190,7 +190,7 @@ def _operate(operator: Operator, bag: Path, learned: Path) -> list[tuple[str, fl
     operator.begin('training', 'a lift is learned from temperature and coolant')
     operator.train(learned, _TIMEOUT)
     operator.set('controller', model=str(learned.resolve()), fallback_order=list(LAWS),
-              **{'temperature.setpoint_ramp': 0.0})
+                 **{'temperature.setpoint_ramp': 0.0})
     operator.begin('lift', 'the lift has taken over')
     begin = operator.seconds
     for when, value in COURSE.items():
@@ -229,7 +229,7 @@ def _reconstructed(rows: list[Row], estimates: Mapping[int, JointState], model: 
     left = float(np.std(measured - T))
     if not 0.8 * NOISE < left < 1.2 * NOISE:
         raise HarnessError(f"the plant's equations leave {left:.3g} K of the record, which has "
-                       f'{NOISE} K of noise')
+                           f'{NOISE} K of noise')
     found = np.full(len(rows), np.nan)
     for k, second in enumerate(seconds):
         message = estimates.get(FIRST_STAMP_NS + round(second * NANOSECONDS))

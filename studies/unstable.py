@@ -47,7 +47,7 @@ EPISODES, DURATION = 400, 0.1  # in min
 # A feedback under which the range has one steady state makes as many free coordinates as states
 # enough.
 LIFT = IncrementalTraining(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
-              pre_feedback=0.05, other_whitenings=(10.0,))
+                           pre_feedback=0.05, other_whitenings=(10.0,))
 RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift(16), 'free lift': LIFT}
 STARTS = 2
 UNLIMITED = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))

@@ -89,7 +89,7 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
         case Measurement():
             return EventOutcome(*controller.step(state, event.measured, event.stamp_ns,
                                                  event.applied,
-                                            event.seconds))
+                                                 event.seconds))
         case Silence():
             return EventOutcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():

@@ -42,7 +42,7 @@ class Feasibility:
         return self.level.controlled_states
 
     def infeasibility(self, goal: Array, others: Iterable[Array | None], command: Array | None,
-                whole: bool) -> Reason | None:
+                      whole: bool) -> Reason | None:
         """
         Return why a set-point (n_c,), in state units, cannot be held, or None.
 

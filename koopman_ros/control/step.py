@@ -290,4 +290,4 @@ class ControlStep(Configuration):
         aim = None if active is None else TargetReport(
             active, self.controlled.violation(active), *steady)
         return StepReport(state.mode, MANUAL if manual else self.order.levels[depth], depth, why,
-                      measured, known, aim, command)
+                          measured, known, aim, command)

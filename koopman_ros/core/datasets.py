@@ -278,7 +278,7 @@ class DriftSamples:
     def where(self, keep: NDArray[np.bool_]) -> DriftSamples:
         """Return the samples that a mask (N,) keeps."""
         return DriftSamples(self.x[keep], self.dxdt[keep], self.u[keep], self.episode[keep],
-                       None if self.time is None else self.time[keep])
+                            None if self.time is None else self.time[keep])
 
     def digest(self) -> str:
         """Return the SHA-256 of the samples, in hexadecimal."""

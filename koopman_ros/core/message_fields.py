@@ -202,7 +202,7 @@ def place(topic: str, name: str, unit: str,
         raise ValueError(f'where the number is in a {kind} is not known: name its field, e.g. '
                          'twist.linear.x or data[2]')
     return MessageField(said.get('topic', topic), kind, field.replace('{name}', name),
-                 said.get('unit') or carrier.unit or display_unit(unit))
+                        said.get('unit') or carrier.unit or display_unit(unit))
 
 
 def base_name(name: str, unit: str) -> str:

@@ -176,10 +176,10 @@ class ClosedLoopTest:
 
 
 def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
-              law: type[Law] = StateDependentRiccati,
-              limits: InputLimits | None = None, interval: float = 0.0, loops: int = LOOPS,
-              watch: Callable[[float], bool] = lambda _: False,
-              backend: Backend | None = None) -> ClosedLoopTest | None:
+                          law: type[Law] = StateDependentRiccati,
+                          limits: InputLimits | None = None, interval: float = 0.0,
+                          loops: int = LOOPS, watch: Callable[[float], bool] = lambda _: False,
+                          backend: Backend | None = None) -> ClosedLoopTest | None:
     """
     Let a model's law control a drift that the model was not learned from, all over its box.
 
@@ -220,7 +220,7 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
     given = LoopBatch(plant, replace(tuning, limits=limits), law, interval, samples,
-                  math.ceil(_STEPS * interval * fastest))
+                      math.ceil(_STEPS * interval * fastest))
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
         for first in range(0, max(1, len(starts)), _PART)}
@@ -245,7 +245,7 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
     x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
     return ClosedLoopTest(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
-                    int(np.sum(hopeless)))
+                          int(np.sum(hopeless)))
 
 
 def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:

@@ -75,7 +75,7 @@ def parse(text: str) -> EventRecord:
                 f'its records are of version {version!r}, this package reads {VERSION}: take the '
                 'package that recorded it')
         record = EventRecord(str(fields.pop('run')), int(fields.pop('number')),
-                        str(fields.pop('event')), fields)
+                             str(fields.pop('event')), fields)
         int(record.stamp_ns)
     except RecordError:
         raise

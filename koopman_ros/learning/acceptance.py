@@ -83,7 +83,7 @@ class HeldOut:
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
         found = evaluate_closed_loops(model, self._found.drift.rate, loops=loops, watch=watch,
-                          interval=period * self._seconds, backend=backend)
+                                      interval=period * self._seconds, backend=backend)
         if found is None:
             raise Stopped
         return found
@@ -138,8 +138,8 @@ class AcceptanceResult:
 
 def evaluate_model(found: Identified, learned: Trained | ClassComparison,
                    current: LiftedModel | None,
-           thresholds: Thresholds, *, loops: int = LOOPS,
-           watch: Callable[[float], bool] = lambda _: False) -> AcceptanceResult:
+                   thresholds: Thresholds, *, loops: int = LOOPS,
+                   watch: Callable[[float], bool] = lambda _: False) -> AcceptanceResult:
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
@@ -164,7 +164,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
                             held_out.linear_rmse,
-                    found.noise, law_check)
+                            found.noise, law_check)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:

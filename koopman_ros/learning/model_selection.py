@@ -198,7 +198,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             if name == choose:
                 raise
             found.append(ModelCandidate(name, None, math.inf, None, None,
-                                   time.perf_counter() - since, str(refusal)))
+                                        time.perf_counter() - since, str(refusal)))
     chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
     return ClassComparison(tuple(found), chosen, plant.state_names, plant.state_units)
 
@@ -299,7 +299,7 @@ class _Learner:
         """Judge a model, and note its figures in it."""
         model = replace(model, training_states=self._known)
         one = judge.judged(ModelCandidate(name, model, self.rx(model), evaluate(model, self._test),
-                                     None, seconds))
+                                          None, seconds))
         assert one.figures is not None
         return replace(one, model=replace(
             model, verified_loops=None if one.law_check is None else one.law_check.tried,

@@ -96,8 +96,8 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
     """
     if source.size() <= most:
         return TrainingRecord(*loop_episodes(source.bags, source.states, source.inputs,
-                                     tolerance_ns=source.tolerance_ns,
-                                     least_jumps=source.least_jumps))
+                                             tolerance_ns=source.tolerance_ns,
+                                             least_jumps=source.least_jumps))
     account = ImportReport()
     bags = {str(bag): (number, str(bag))
             for number, bag in enumerate(distinct(source.bags, account))}

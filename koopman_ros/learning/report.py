@@ -73,7 +73,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
            + ', which depends on the states, in the middle of the range'
            * found.drift.varying_input_matrix)
     yield table(('per second by', *(f'{name} [1/({unit})]' for name, unit in
-                                     zip(inputs.names, inputs.units, strict=True))),
+                                    zip(inputs.names, inputs.units, strict=True))),
                 ((f'{name} [{unit}]', *(f'{gain:.5g}' for gain in row)) for name, unit, row in zip(
                     states.names, states.units,
                     found.drift.input_matrix / SECONDS_PER_TIME_UNIT[retrained.plant.time_unit],

@@ -147,9 +147,10 @@ def _unknown(task: TrainingTask) -> PlantDescription:
     """Return the plant of a task without a lift; its nominal point is unknown."""
     states, inputs = task.states, task.inputs
     return PlantDescription(task.plant, tuple(signal.name for signal in states),
-                 tuple(signal.unit for signal in states), tuple(signal.name for signal in inputs),
-                 tuple(signal.unit for signal in inputs), 's', np.full(len(states), np.nan),
-                 np.full(len(inputs), np.nan), None)
+                            tuple(signal.unit for signal in states),
+                            tuple(signal.name for signal in inputs),
+                            tuple(signal.unit for signal in inputs), 's',
+                            np.full(len(states), np.nan), np.full(len(inputs), np.nan), None)
 
 
 def _known_gain(task: TrainingTask, plant: PlantDescription) -> Array | None:

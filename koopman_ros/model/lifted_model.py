@@ -161,8 +161,9 @@ class LiftedModel:
     def plant(self) -> PlantDescription:
         """The names, units and nominal point of its plant, without B."""
         return PlantDescription(self.provenance.plant, self.states.names, self.states.units,
-                     self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
-                     self.inputs.center, None, self.input_matrix_degree)
+                                self.inputs.names, self.inputs.units, self.time_unit,
+                                self.states.center,
+                                self.inputs.center, None, self.input_matrix_degree)
 
     @cached_property
     def seconds_per_time_unit(self) -> float:

@@ -300,7 +300,7 @@ class ControllerNode(ManagedNode):
 
     def _model_situation(self) -> ModelCheckContext:
         return ModelCheckContext(self._settings, self._loop.state, self._measured,
-                         self._recent.windows(self._settings.model_check_length))
+                                 self._recent.windows(self._settings.model_check_length))
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         before = self._table.values(self._settings)

@@ -132,7 +132,8 @@ class PanelNode(LoopNode):
                           ('active_setpoints', topics.LATCHED_QOS)):
             SignalSubscriber(self, lambda topic, hear, of,
                              qos=qos: matching.subscribe(topic, hear, of, qos),
-                  getattr(self._wiring, kind), self._signals.units, partial(self._on_signal, kind))
+                             getattr(self._wiring, kind), self._signals.units,
+                             partial(self._on_signal, kind))
         matching.subscribe(topics.CONTROLLER_INTERNALS, self._on_internals, qos=_WATCHING)
         matching.subscribe(topics.PREDICTED_TRAJECTORY, self._on_plan, qos=_WATCHING)
         matching.subscribe(topics.ACTIVE_CONSTRAINTS, self._on_limits, qos=_WATCHING)
@@ -227,7 +228,7 @@ class PanelNode(LoopNode):
         for status in message.status:
             values = {item.key: item.value for item in status.values}
             self.view.conditions.take_status(status.name, status.level[0], status.message, values,
-                                  time.time(), status.hardware_id)
+                                             time.time(), status.hardware_id)
             name = self.view.conditions.task(status.name)
             if name == REQUESTS:
                 self._requests.take_status(status.message)

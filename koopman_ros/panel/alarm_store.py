@@ -135,7 +135,7 @@ def _entry(time: float, key: str, priority: str, text: str, what: str, who: str)
     if what not in _EVENTS:
         raise ValueError(f'{what!r} must be one of {", ".join(_EVENTS)}')
     return AlarmLogEntry(_finite(time), sanitize_text(key, MAX_TEXT), Priority[priority],
-                 sanitize_text(text, MAX_TEXT), what, sanitize_text(who, MAX_WHO))
+                         sanitize_text(text, MAX_TEXT), what, sanitize_text(who, MAX_WHO))
 
 
 def _finite(value: float) -> float:

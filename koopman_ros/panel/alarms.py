@@ -330,4 +330,4 @@ class Alarms:
     def _note(self, time: float, record: _Record, what: str, who: str = '') -> None:
         self.noted += 1
         self._journal.append(AlarmLogEntry(time, record.key, record.priority, record.text, what,
-                                   sanitize_text(who, MAX_WHO)))
+                                           sanitize_text(who, MAX_WHO)))

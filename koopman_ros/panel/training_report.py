@@ -120,7 +120,7 @@ def read_comparison(folder: Path, model: str, since: float, output: str) -> Repl
         return ReplayComparison('the replay failed: ' + (
             sanitize_text(last, _MAX_LINE) or 'it has no output'), model=model, since=since)
     return ReplayComparison('', lines, _read_text(folder / 'report.md'),
-                      _read_picture(folder / 'replay.png'), model, since)
+                            _read_picture(folder / 'replay.png'), model, since)
 
 
 def _read_text(path: Path) -> str:

@@ -318,7 +318,7 @@ def _wiring(signals: Signals, given: Mapping[str, Any]) -> SignalTopics:
                        if f'{name}.{row.name}' in said})
 
     return SignalTopics(signals, {name: own(StatePlaces, name) for name in signals.states},
-                  {name: own(InputPlaces, name) for name in signals.inputs})
+                        {name: own(InputPlaces, name) for name in signals.inputs})
 
 
 def _plan(signals: Signals, values: TrainerParameters) -> None:

@@ -171,8 +171,8 @@ def describe(system: ControlAffineSystem) -> PlantDescription:
     """Return what training may know of a plant beside its data: all but the drift."""
     return PlantDescription(system.name, system.state_names, system.state_units,
                             system.input_names,
-                 system.input_units, system.time_unit, system.nominal_state,
-                 system.nominal_input, system.B)
+                            system.input_units, system.time_unit, system.nominal_state,
+                            system.nominal_input, system.B)
 
 
 class EquilibriumError(ValueError):

@@ -64,7 +64,7 @@ def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) 
     innovation = None if estimate is None else estimate.innovation
     values = {
         **by_label(inputs, 'disturbance [{}]',
-                None if estimate is None else estimate.disturbance, True),
+                   None if estimate is None else estimate.disturbance, True),
         **{f'estimated_{name} [{display_unit(unit)}]': value for (name, unit), value in zip(
             states.items(),
             by_label(states, '{}', None if estimate is None else estimate.state).values(),
@@ -76,7 +76,7 @@ def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) 
         'growth_per_sample': float(law.growth),
         **by_label(inputs, 'transfer [{}]', transfer, True),
         **by_label({name: signals.states[name] for name in signals.controlled}, 'setpoint [{}]',
-                None if target is None else target.setpoint),
+                   None if target is None else target.setpoint),
         # of a filter alone; at the end, so that the places of the others stay
         **({} if covariance is None else _spread(states, covariance)),
         **({f'innovation_{name} [standard deviations]': value for name, value in zip(

@@ -162,14 +162,14 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
             _ACTIONS[HOLD] if report.depth == 0 else _action(now))
         if now.timing.busy:
             return Severity.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
-                                 f'node is busy: {action}{doing}; ask for less at once')
+                                    f'node is busy: {action}{doing}; ask for less at once')
         if (why := now.timing.no_news(timeout)) is not None:
             what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
                     else 'two sources have published the measurement in turn')
             return Severity.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
-                                 'the clock of the sensor, and that it has one publisher')
+                                    'the clock of the sensor, and that it has one publisher')
         return Severity.ERROR, (f'no measurement{now.awaited} for more than {timeout:g} s: '
-                             f'{action}{doing}; check sensor and plant')
+                                f'{action}{doing}; check sensor and plant')
     if report.reason is not None and mode is Mode.MANUAL:
         return Severity.ERROR, f'{mode.value}: {now.reason}'
     if mode is Mode.AUTOMATIC and report.depth > 0:
@@ -301,7 +301,8 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         **{f'{name} [{display_unit(own)}]': value for (name, own), value in zip(
             inputs.items(), by_label(inputs, '{}', state.command).values(), strict=True)},
         **by_label(inputs, f'disturbance [{{}} of {now.input}]' if len(inputs) == 1
-                else 'disturbance [{}]', None if estimate is None else estimate.disturbance, True),
+                   else 'disturbance [{}]', None if estimate is None else estimate.disturbance,
+                   True),
         **by_label(signals.states, 'equivalent sensor bias [{}]', bias, True),
         **_estimated(now),
         'distance outside training box [half-ranges]': float(report.measurement.outside),

@@ -109,7 +109,7 @@ class ExperimentRun:
             node, self._subscribe, wiring.applied, signals.inputs, self._on_applied)
         if self._on_setpoints:
             SignalSubscriber(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
-                  signals.states, lambda heard: self._tracked.update(heard.values))
+                             signals.states, lambda heard: self._tracked.update(heard.values))
             self._subscribe(topics.EVENT_LOG, self._on_record, String)
         self._outlet = SignalPublisher(places, self._units, lambda topic, kind: owned.keep(
             node.create_publisher(kind, topic, topics.LOOP_QOS)))

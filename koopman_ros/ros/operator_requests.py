@@ -42,10 +42,10 @@ class OperatorRequests:
         # volatile, so that `ros2 topic pub` matches
         for name, place in wiring.setpoints.items():
             SignalSubscriber(node, matching.subscribe, {name: place}, wiring.signals.states,
-                  self._on_setpoint)
+                             self._on_setpoint)
         for name, place in wiring.manual.items():
             SignalSubscriber(node, matching.subscribe, {name: place}, wiring.signals.inputs,
-                  self._on_manual)
+                             self._on_manual)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
 
     @property

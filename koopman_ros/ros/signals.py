@@ -124,8 +124,9 @@ class SignalSubscriber:
         if values:
             header = getattr(message, 'header', None)
             self._hear(SignalSample(self._node.get_clock().now().to_msg() if header is None
-                             else header.stamp, header.frame_id if header else '', values,
-                             header is not None, topic, info['publication_sequence_number']))
+                                    else header.stamp, header.frame_id if header else '', values,
+                                    header is not None, topic,
+                                    info['publication_sequence_number']))
 
     def published(self) -> bool:
         """Tell whether anybody publishes one of the topics."""

@@ -90,14 +90,15 @@ def _twice() -> interceptor.Alteration:
 def _sensor(name: str, does: str, make: Maker, seconds: float, code: StatusCode | None = None,
             **details: Any) -> FaultCase:
     return FaultCase('sensor', name, f'{does}, {seconds:g} s',
-                partial(altered, make=make, seconds=seconds), True, code=code, **details)
+                     partial(altered, make=make, seconds=seconds), True, code=code, **details)
 
 
 def _in_a_step(group: str, name: str, does: str, make: Maker, seconds: float, *,
                what: str = 'measurements', largest_step: float = 2.0, **details: Any) -> FaultCase:
     return FaultCase(group, name, f'{does}, while the set-point steps, {seconds:g} s',
-                partial(altered, make=make, seconds=seconds, setpoint=REACTOR.other, what=what),
-                True, largest_step=largest_step, **details)
+                     partial(altered, make=make, seconds=seconds, setpoint=REACTOR.other,
+                             what=what),
+                     True, largest_step=largest_step, **details)
 
 
 _clock = partial(_in_a_step, 'clocks')
@@ -120,11 +121,11 @@ _MESSAGES = (
     _sensor('frozen-at-rest', 'bit-identical values', frozen, 120.0),
     FaultCase('sensor', 'frozen-in-a-step',
               'bit-identical values, 10 s after a step of the set-point, '
-         '90 s', partial(altered, make=frozen, seconds=90.0, setpoint=(42.0,), wait=10.0), True,
-         code=StatusCode.FROZEN),
+              '90 s', partial(altered, make=frozen, seconds=90.0, setpoint=(42.0,), wait=10.0),
+              True, code=StatusCode.FROZEN),
     _sensor('drift', 'drifts by 1 K/min', _shifted(lambda seconds: seconds / 60.0), 180.0),
     FaultCase('sensor', 'bias', 'wrong by +2 K, 300 s and more', operators.biased, True,
-         recovery=360.0, afterwards=420.0),
+              recovery=360.0, afterwards=420.0),
     _sensor('noise-burst', 'noise of 1 K', lambda: noise(1.0), 60.0),
     _sensor('noise-wild', 'noise of 10 K', lambda: noise(10.0), 60.0, StatusCode.JUMPED),
     _sensor('quantised', 'in steps of 0.5 K, the set-point between two of them',
@@ -153,8 +154,8 @@ _MESSAGES = (
     _clock('clock-jitter', 'stamps are up to 0.4 s wrong', lambda: stamped(_jittered), 120.0),
     _clock('clock-twins', 'two measurements with each stamp', _twins(0.01), 60.0),
     FaultCase('clocks', 'no-clock', 'use_sim_time is set, and nobody publishes /clock',
-         operators.without_clock, plant={**LOCKSTEP, 'publish_clock': False},
-         controller=_BY_CLOCK, says=(operators.NO_CLOCK,)))
+              operators.without_clock, plant={**LOCKSTEP, 'publish_clock': False},
+              controller=_BY_CLOCK, says=(operators.NO_CLOCK,)))
 
 _process, _neighbour = partial(FaultCase, 'processes'), partial(FaultCase, 'neighbours')
 _PROCESSES = (
@@ -217,18 +218,18 @@ def _cycled(changes: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, Any]]],
                 refused: bool = False) -> FaultCase:
     return FaultCase('operators', name, f'{REQUESTS} {does}',
-                partial(operators.storm_of_parameters, make=make, refused=refused))
+                     partial(operators.storm_of_parameters, make=make, refused=refused))
 
 
 def _setpoints(name: str, does: str, *values: float, code: StatusCode | None = None) -> FaultCase:
     return FaultCase('operators', name, f'set-points at 1 kHz{does}',
-                partial(operators.storm_of_setpoints, asked=tuple(
+                     partial(operators.storm_of_setpoints, asked=tuple(
                     {reactor.TEMPERATURE: value} for value in values)), code=code)
 
 
 def _constant(name: str, does: str, play: Callable[..., None], **details: Any) -> FaultCase:
     return FaultCase('disturbances', name, does, play,
-                **{'recovery': 360.0, 'afterwards': 600.0, 'offset': 0.01, **details})
+                     **{'recovery': 360.0, 'afterwards': 600.0, 'offset': 0.01, **details})
 
 
 _OPERATORS = (
@@ -247,9 +248,9 @@ _OPERATORS = (
                code=StatusCode.SETPOINT_OUTSIDE),
     _setpoints('setpoint-storm-alternating', ': 41 and 51 degC in turn', 41.0, 51.0),
     FaultCase('operators', 'mode-once', 'manual mode for a minute, and back, without a bump',
-         operators.mode_once, bump=_BUMP),
+              operators.mode_once, bump=_BUMP),
     FaultCase('operators', 'mode-storm', f'{REQUESTS} changes between automatic and manual mode',
-         operators.storm_of_modes),
+              operators.storm_of_modes),
     *(_constant(name, f'{does}, for good', partial(changed_for_good, parameters=changes))
       for name, does, changes in (
           ('heat-transfer-low', 'UA -20 %', scaled('heat_transfer_coefficient', 0.8)),

@@ -280,7 +280,8 @@ class Interceptor:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.trace.statuses += [
             SeenStatus(self.now, status.name, status.level[0], status.message,
-                   {item.key: item.value for item in status.values}) for status in message.status]
+                       {item.key: item.value for item in status.values})
+                       for status in message.status]
 
 
 def _whole(names: tuple[str, ...], hear: Callable[[Packet], None]) -> Callable[[Packet], None]:

@@ -30,7 +30,7 @@ PARTICIPANTS = 12  # at once; those of one machine find each other up to 32
 _FLOOD = (sys.executable, '-c', f'from {__name__} import flood; flood(5.0, {PARTICIPANTS})')
 KEPT = ('^controller: control: .*the old model is kept',)
 TWO_CONTROLLERS = ('^controller: control: 2 nodes command the coolant',
-                    '^plant: simulation: 2 nodes command the coolant')
+                   '^plant: simulation: 2 nodes command the coolant')
 TWO_PLANTS = ('^controller: control: .*2 nodes publish the temperature',)
 
 

@@ -81,7 +81,7 @@ def _sections(figures: dict[str, Any]) -> Iterator[str]:
         for group in dict.fromkeys(result['group'] for result in own.values()):
             yield f'## {plant.name}: {group}'
             yield plots.table(_HEAD, (_row(name, result) for name, result in own.items()
-                                        if result['group'] == group), (2, 3, 4, 5))
+                                      if result['group'] == group), (2, 3, 4, 5))
     failed = [f'**{name}**: {"; ".join(result["reasons"])}' for name, result in results.items()
               if result.get('reasons')]
     if failed:
@@ -125,7 +125,7 @@ def _draw(traces: Mapping[str, LoopTrace], path: Path) -> bool:
              and trace.commands and math.isfinite(trace.end)}
     if shown:
         with plots.drawing(path, 2, len(shown), size=(3.2 * len(shown), 5.2),
-                             sharex='col') as (_, panels):
+                           sharex='col') as (_, panels):
             for upper, lower, name in zip(panels, panels[len(shown):], shown, strict=False):
                 _draw_case(upper, lower, shown[name])
                 upper.set_title(name, fontsize='medium')

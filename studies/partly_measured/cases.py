@@ -169,13 +169,13 @@ CASES = {case.plant: case for case in (
          {'level_1': 0.15, 'level_2': 0.12}, 0.01, np.array([-0.3, 0.0]), 300.0, 900.0, 1800.0),
     # the motor holds it 57 degrees from upright
     PartialCase('pendulum', ('angle',), np.array([2e-3]), np.array([0.1]), np.array([2e-3, 0.5]),
-         np.array([1.0, 0.1]), np.ones(1), np.array([-15.0]), np.array([15.0]), 0.0625,
-         {'angle': 1.0}, {'angle': 0.0}, 0.1, np.array([0.5]), 1.5625, 5.3125, 10.5),
+                np.array([1.0, 0.1]), np.ones(1), np.array([-15.0]), np.array([15.0]), 0.0625,
+                {'angle': 1.0}, {'angle': 0.0}, 0.1, np.array([0.5]), 1.5625, 5.3125, 10.5),
     # the hotter, the quicker it converts: without its limit it goes to 326.6 K
     PartialCase('fed_reactor', ('concentration', 'temperature'), np.array([2e-3, 0.1]),
-         np.array([0.5, 0.05]), np.array([2e-3, 0.1]), np.array([1e5, 0.1]), np.full(2, 0.1),
-         np.array([60.0, 278.15]), np.array([150.0, 305.15]), 9.0,
-         {'concentration': 0.95, 'temperature': 315.0},
-         {'concentration': 0.88, 'temperature': 322.0}, 1.0, np.array([0.0, 1.0]), 225.0, 675.0,
-         1440.0, np.array([np.inf, 322.5])),
+                np.array([0.5, 0.05]), np.array([2e-3, 0.1]), np.array([1e5, 0.1]),
+                np.full(2, 0.1), np.array([60.0, 278.15]), np.array([150.0, 305.15]), 9.0,
+                {'concentration': 0.95, 'temperature': 315.0},
+                {'concentration': 0.88, 'temperature': 322.0}, 1.0, np.array([0.0, 1.0]), 225.0,
+                675.0, 1440.0, np.array([np.inf, 322.5])),
 )}

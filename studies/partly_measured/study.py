@@ -98,4 +98,5 @@ def judge(case: PartialCase, found: ComparedRun) -> ComparedFigures:
         farthest = float(np.max(np.abs(away[within])))
     excess = found.states - case.state_upper if len(case.state_upper) else np.zeros(1)
     return ComparedFigures(cost / least(case, begin).cost, (max(offsets[:2]), offsets[2]),
-                   farthest, float(max(np.max(excess), 0.0)), not max(offsets) <= case.reached)
+                           farthest, float(max(np.max(excess), 0.0)),
+                           not max(offsets) <= case.reached)

@@ -79,18 +79,18 @@ def cases() -> Iterator[Disturbed]:
     for words, change in (('−3 K', -3.0), ('+1.5 K', 1.5)):
         reference = float(two.nominal_state[1]) + change
         yield Disturbed(f'set-point {words} on the two-state reactor',
-                   [at(LEAD, at_setpoint(reference))], reference, two, two.nominal_state.tolist(),
-                   overshoot=True)
+                        [at(LEAD, at_setpoint(reference))], reference, two,
+                        two.nominal_state.tolist(), overshoot=True)
     yield Disturbed('sensor bias +2 K', [at(0.0, at_setpoint(START - 5.0))], START - 5.0,
-               x0=[START - 5.0], sensor=loop.biased(BIAS, LEAD))
+                    x0=[START - 5.0], sensor=loop.biased(BIAS, LEAD))
     end = LEAD + SATURATED_SECONDS
     for setpoint, words in ((SATURATED_SETPOINT, 'coolant saturated'),
                             (START, 'coolant in its range')):
         yield Disturbed(f'T_i +{WARM_FEED:g} K for 15 min, {words}, after its end',
-                   [at(0.0, at_setpoint(setpoint)),
-                    at(LEAD, on_plant(system=changed_reactor(feed=WARM_FEED))),
-                    at(end, on_plant(system=REACTOR))], setpoint, x0=[setpoint], since=end,
-                   overshoot=setpoint == SATURATED_SETPOINT, seconds=end + SECONDS)
+                        [at(0.0, at_setpoint(setpoint)),
+                         at(LEAD, on_plant(system=changed_reactor(feed=WARM_FEED))),
+                         at(end, on_plant(system=REACTOR))], setpoint, x0=[setpoint], since=end,
+                        overshoot=setpoint == SATURATED_SETPOINT, seconds=end + SECONDS)
     for tells, measured in told:
         yield _step(f', coolant stuck at {REACHED:g} K for 15 min, after its end{measured}',
                     at(end, on_plant(actuator=Actuator())), since=end,

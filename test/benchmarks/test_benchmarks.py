@@ -87,7 +87,7 @@ def test_plans_that_differ_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_plan_of_an_integrator_is_the_known_one_within_its_limits(tmp_path: Path) -> None:
     problem = SqpProblem(lambda x, u: u, np.full(2, 0.5), np.zeros(1), np.ones(1), np.eye(1),
-                      np.array([-1.5]), np.array([1.5]), (np.full(1, 2.0), np.full(1, 3.0)))
+                         np.array([-1.5]), np.array([1.5]), (np.full(1, 2.0), np.full(1, 3.0)))
     for compiler in [None, *filter(None, [shutil.which('cc')])]:
         one = Sqp(problem, solver_of(problem, tmp_path, compiler))
         # least of u^2 T + (x + u T)^2 with T = 1: u = -x / 2

@@ -316,7 +316,7 @@ def test_the_map_shows_each_loop_once(tmp_path):
 
 def test_ranges_are_told_to_what_tells():
     found = ClosedLoopTest(TWO, np.array([[2.0004, 300.0]]), np.array([[-1e-17, 310.012]]),
-                     np.array([np.inf]), np.array([False]), np.array([np.inf]), 0)
+                           np.array([np.inf]), np.array([False]), np.array([np.inf]), 0)
     assert found.region == 'begun at a 2 m, b 300 K and bound for a 0 m, b 310 K'
 
 

@@ -58,7 +58,7 @@ def trained(found, shipped):
 def no_loops(monkeypatch, shipped):
     """Leave the closed loops out where another figure decides."""
     passed = ClosedLoopTest(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool),
-                      np.ones(9), 0)
+                            np.ones(9), 0)
     monkeypatch.setattr(sys.modules[evaluate_model.__module__], 'check_law', lambda *_,
                         **__: passed)
 
@@ -349,7 +349,7 @@ def test_samples_lie_on_the_paths_of_the_drift():
     drift = cubic()
     records = tuple(held(drift, x0, u) for x0, u in ((2.5, -1.0), (-0.5, 1.5), (0.3, 0.2)))
     noisy = tuple(Episode(r.time, r.x + 0.05 * np.random.default_rng(k).standard_normal(r.x.shape),
-                         r.input_time, r.u) for k, r in enumerate(records))
+                          r.input_time, r.u) for k, r in enumerate(records))
     samples = drift_samples(drift, noisy)
     assert len(samples) == 3 * 59
     assert np.array_equal(samples.dxdt, drift.rate(samples.x, samples.u))

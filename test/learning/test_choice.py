@@ -93,9 +93,9 @@ def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     with pytest.raises(TrainingFailed, match=r'the lift with n_z = 2 does not predict the motion '
-                                           r'better than a linear model \(relative error rx = '
-                                           r'[0-9.e-]+ against [0-9.e-]+ on validation .*wider '
-                                           r'range$'):
+                       r'better than a linear model \(relative error rx = '
+                       r'[0-9.e-]+ against [0-9.e-]+ on validation .*wider '
+                       r'range$'):
         train(BENT, linear, SMALL, starts=1)
     trained = train(BENT, linear, SMALL, starts=1, refuse=False)
     # both are exact, to rounding: which has less of it depends on the processor
@@ -117,7 +117,7 @@ def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     exact = IncrementalTraining(3, identity=False, decoder=0, max_iterations=150)
     with pytest.raises(TrainingFailed,
                        match=r'does not predict the motion better than a linear .*, '
-                                           r'or use identity coordinates$'):
+                       r'or use identity coordinates$'):
         train(plant, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
     kept = train(plant, samples, replace(exact, identity=True), starts=1, loops=0)

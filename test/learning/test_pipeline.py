@@ -228,8 +228,8 @@ def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, do
 
 def test_a_task_survives_json():
     task = TrainingTask(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
-                (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)), seed=3,
-                input_gain={'temperature': {'other': 2.1}})
+                        (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)),
+                        seed=3, input_gain={'temperature': {'other': 2.1}})
     assert TrainingTask.from_json(json.dumps(asdict(task))) == task
     with pytest.raises(TypeError, match='nonsense'):
         TrainingTask.from_json(json.dumps({**asdict(task), 'nonsense': 1}))

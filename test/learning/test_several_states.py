@@ -78,8 +78,8 @@ def retrained(bag, tmp_path_factory):
     save(present, folder / 'present.safetensors')
     with quick_retraining(128):
         return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
-                            str(folder / 'present.safetensors'), STATES, INPUTS, coordinates=4,
-                            starts=1))
+                                    str(folder / 'present.safetensors'), STATES, INPUTS,
+                                    coordinates=4, starts=1))
 
 
 def test_lift_of_two_states_and_two_inputs_is_accepted(retrained):
@@ -152,7 +152,7 @@ def learned_errors(lagging, measured):
     episode = Episode(minutes, x, minutes, rows[:, 1:2] if measured else rows[:, 2:],
                       (True,) if measured else ())
     plant = PlantDescription('reactor', ('temperature',), ('K',), ('coolant',), ('K',), 'min',
-                  system.nominal_state, system.nominal_input, None)
+                             system.nominal_state, system.nominal_input, None)
     found = identify(plant, [episode], degrees=(1, 3), methods=methods(40)).drift
     states = np.linspace(308.0, 320.0, 25)[:, None]
     u = np.full((25, 1), 288.0)

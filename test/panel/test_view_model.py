@@ -56,7 +56,7 @@ def view(signals: Signals = REACTOR, **read: str) -> LoopViewModel:
 
 def measure(own: LoopViewModel, celsius: float, seconds: float, wall: float | None = None) -> None:
     own.take_signals('measured', {'temperature': to_kelvin(celsius)}, seconds,
-             NOW + seconds if wall is None else wall)
+                     NOW + seconds if wall is None else wall)
 
 
 def answered(own: LoopViewModel, level: str = 'sdre', mode: str = 'automatic', wall: float = NOW
@@ -78,7 +78,7 @@ def test_values_are_in_the_units_that_people_read() -> None:
     own.take_signals('predicted', {'temperature': to_kelvin(51.7)}, 1.0, NOW + 1.0)
     own.take_signals('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW + 1.0)
     own.take_internals({'disturbance [K]': 0.5, 'estimated_temperature [degC]': 51.0,
-                   'estimated_concentration [mol/L]': 0.88})
+                        'estimated_concentration [mol/L]': 0.88})
     now = own.snapshot(NOW + 1.0)
     (state,), (given,) = now.states, now.inputs
     assert (state.label, state.unit, state.controlled) == ('temperature', '°C', True)
@@ -100,7 +100,7 @@ def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
     own.take_model({'temperature': (to_kelvin(40.0), to_kelvin(60.0))}, {})
     measure(own, 50.0, 1.0)
     own.take_record('setpoint', {'accepted': True, 'signals': ['temperature'],
-                            'value': [to_kelvin(45.0)], 'reason': []}, NOW)
+                                 'value': [to_kelvin(45.0)], 'reason': []}, NOW)
     face = own.snapshot(NOW).states[0]
     assert face.unit == '°F'
     assert [face.measured, face.target, *face.training] == pytest.approx(
@@ -119,10 +119,10 @@ def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
 def test_a_plan_lies_ahead_until_nothing_is_planned() -> None:
     own = view(temperature='degF')
     own.take_plan(['temperature [degC]', 'coolant_temperature [degC]'], 100.0, [0.0, 1.0, 3.0],
-                [[50.0, 20.0], [45.0, 21.0], [40.0, 21.0]])
+                  [[50.0, 20.0], [45.0, 21.0], [40.0, 21.0]])
     own.take_limits({'at_range_coolant_temperature [-1 lower, 1 upper]': 1.0,
-                'at_rate_coolant_temperature [-1 falling, 1 rising]': 1.0,
-                'at_limit_temperature [-1 lower, 1 upper]': -1.0})
+                     'at_rate_coolant_temperature [-1 falling, 1 rising]': 1.0,
+                     'at_limit_temperature [-1 lower, 1 upper]': -1.0})
     answered(own, 'mpc')
     now = own.snapshot(NOW)
     assert [time for time, _ in now.states[0].plan] == [100.0, 101.0, 103.0]
@@ -184,7 +184,7 @@ def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
 def test_bars_hold_ranges_and_values() -> None:
     own = view()
     own.take_model({'temperature': (to_kelvin(32.0), to_kelvin(54.0)),
-                 'coolant_temperature': (to_kelvin(8.0), to_kelvin(28.0))}, {})
+                    'coolant_temperature': (to_kelvin(8.0), to_kelvin(28.0))}, {})
     own.take_parameters(CONTROLLER, {name: parameter(name, value) for name, value in {
         'coolant_temperature.min': 5.0, 'coolant_temperature.max': 32.0}.items()})
     measure(own, 43.0, 1.0)
@@ -210,9 +210,9 @@ def test_the_target_of_a_ramp_is_shown() -> None:
     for name, value in (('level_1', 0.10), ('level_2', 0.15)):
         own.take_signals('active_setpoints', {name: value}, 1.0, NOW)
     own.take_record('setpoint', {'value': [0.2], 'signals': ['level_2'], 'accepted': True,
-                            'reason': []}, NOW)
+                                 'reason': []}, NOW)
     own.take_record('setpoint', {'value': [9.9], 'signals': ['level_1'], 'accepted': False,
-                            'reason': ['setpoint_outside']}, NOW)
+                                 'reason': ['setpoint_outside']}, NOW)
     first, second = own.snapshot(NOW).states
     assert (first.setpoint, first.target, second.setpoint, second.target) == (0.1, 0.1, 0.15, 0.2)
 

@@ -243,7 +243,7 @@ def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
 def test_values_that_are_no_measurement(write: Callable[..., Path], topic: str, value: float
                                         ) -> None:
     messages = [Sent(s.topic, s.stamp, value if (s.topic, s.stamp) == (topic, 7) else s.value)
-            for s in loop(20)]
+                for s in loop(20)]
     (episode,), account = read(write(messages))
     assert account.dropped == {'outside -1e+12 to 1e+12 Pa': 1}
     assert len(episode) == (19 if topic == MEASURED else 20)

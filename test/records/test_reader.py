@@ -172,7 +172,7 @@ def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
         source.write_text(text, encoding='utf-8')
         assert text != whole
         with pytest.raises(records.BagReadError,
-                       match=r'metadata\.yaml.*is not the metadata of a'):
+                           match=r'metadata\.yaml.*is not the metadata of a'):
             records.read_messages(path)
     for written, other, kind in (
             ('storage_identifier: mcap', 'storage_identifier: sqlite3', 'sqlite3 files'),

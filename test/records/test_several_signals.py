@@ -113,7 +113,7 @@ def test_signals_of_several_topics_are_put_together_by_stamp(
     path = write([*jacket(1.0), *(s for k in range(1, 21) for s in (
         Sent('/warm', k, 50.0 + k), Sent('/cold', k + shift, 10.0 - k)))])
     episodes, account = records.loop_episodes([path], [WARM, COLD], [COMMANDED],
-                                           tolerance_ns=round(tolerance * SECOND))
+                                              tolerance_ns=round(tolerance * SECOND))
     assert sum(map(len, episodes)) == left
     assert account.dropped == dropped
     assert account.measurements == account.used + sum(account.dropped.values()) == 40
@@ -129,7 +129,7 @@ def test_missing_and_doubled_parts_are_named(write: Callable[..., Path]) -> None
     sent += [Sent('/warm', 5.0, 99.0, 5.5), Sent('/warm', 12.01, 77.0, 12.01)]
     path = write(sorted(sent, key=lambda s: s.received or s.stamp))
     (episode,), account = records.loop_episodes([path], [WARM, COLD], [COMMANDED],
-                                             tolerance_ns=SECOND // 20)
+                                                tolerance_ns=SECOND // 20)
     assert (episode.x[:, 0] - 323.15).round(9).tolist() == [
         k for k in range(1, 21) if k not in (3, 8)]
     assert account.dropped == {

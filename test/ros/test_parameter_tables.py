@@ -157,7 +157,7 @@ def test_what_is_dumped_can_be_loaded_again(ros: Harness, tmp_path: Path, node: 
     loaded = {name: parameter_value_to_python(message.value)
               for name, message in parameter_dict_from_yaml_file(str(file)).items()}
     reader = LoopNode(node, context=ros.node.context,
-                           cli_args=['--ros-args', '--params-file', str(file)])
+                      cli_args=['--ros-args', '--params-file', str(file)])
     started = {name: reader.get_parameter(name).value for name in defaults}
     reader.destroy_node()
     for read in (loaded, started):

@@ -31,7 +31,7 @@ from support.recorded_runs import Recorded, STEADY
 pytestmark = pytest.mark.filterwarnings('ignore::DeprecationWarning')
 
 CASE = FaultCase('test', 'test', '', lambda _: None, recovery=50.0,
-            says=('^controller: control: .*frozen',))
+                 says=('^controller: control: .*frozen',))
 BEGIN, END = 50, 60
 CONTROL, RECORDING = 'controller: control', 'trainer: recording'
 
@@ -150,8 +150,8 @@ def test_alterations_of_one_of_two_signals(
 def test_distances_and_steps_of_several_signals_are_the_largest() -> None:
     """Of tanks whose levels 3 and 4 have no set-point."""
     found = LoopTrace(QUADRUPLE_TANK, samples=[(float(t), (0.15, 0.11, t, t)) for t in range(3)],
-                  setpoints=[(0.0, (0.15, 0.1))],
-                  commands=[Command(0.0, (3.0, 3.0), 0), Command(1.0, (3.1, 10.5), 1)])
+                      setpoints=[(0.0, (0.15, 0.1))],
+                      commands=[Command(0.0, (3.0, 3.0), 0), Command(1.0, (3.1, 10.5), 1)])
     np.testing.assert_allclose(found.errors()[1], 0.01)
     np.testing.assert_allclose(found.steps()[1], 7.5)
     assert 'pump_2' in ''.join(out_of_range(found))
@@ -207,7 +207,7 @@ def test_a_case_that_is_not_survived(tmp_path: Path) -> None:
         loop.processes['controller'].process.kill()
 
     result, _ = run(FaultCase('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
-                         says=('nobody says this',)), tmp_path)
+                              says=('nobody says this',)), tmp_path)
     found = '; '.join(result['reasons'])
     for words in ('ended early, with code -9', 'not back', 'never said "nobody says this"'):
         assert words in found

@@ -57,7 +57,7 @@ def steady_state(system: plants.ControlAffineSystem, u: list[float], guess: list
 def reactor_weights(model: LiftedModel, R: float) -> control.Weights:
     """Weigh squared deviations in units of 10 K by 1 and by R."""
     return control.Weights(np.diag(np.square(model.states.scale / UNIT)),
-                   R * np.diag(np.square(model.inputs.scale / UNIT)))
+                           R * np.diag(np.square(model.inputs.scale / UNIT)))
 
 
 def run_reactor(model: LiftedModel, law: Law, R: float, minutes: float) -> tuple[float, float]:
@@ -112,7 +112,8 @@ class Reactor:
         x = np.append(plant.nominal_state[:-1], kelvin)
         u = plants.equilibrium_input(plant, x) if coolant is None else np.array([coolant])
         self.loop = evaluation.Loop(controller, controller.initialise(control.State(), u),
-                         plants.Process(plant, 0, x, u, actuator or plants.Actuator(), u))
+                                    plants.Process(plant, 0, x, u, actuator or plants.Actuator(),
+                                                   u))
         self.noise, self.sensor, self.input_sensor = noise, sensor, input_sensor
         self.waiting: list[control.Event | evaluation.Change] = []
         self.samples: list[Sample] = []

@@ -53,7 +53,7 @@ class KnownPlant:
         n_x, n_u = self.B.shape
         return PlantDescription('known', names('x', n_x), ('m',) * n_x, names('u', n_u),
                                 ('A',) * n_u, 's',
-                     np.zeros(n_x), np.zeros(n_u), None)
+                                np.zeros(n_x), np.zeros(n_u), None)
 
     def rate(self, x, u):
         """Evaluate dx/dt: (..., n_x) and (..., n_u) -> (..., n_x)."""

@@ -71,8 +71,9 @@ def task(bags: Sequence[Path], output: Path) -> TrainingTask:
     state, coolant = (MessageField(f'/{name}', TYPE, FIELD, 'K')
                       for name in ('temperature', 'coolant_temperature'))
     return TrainingTask(tuple(map(str, bags)), str(output), '',
-                (RecordedState('temperature', 'K', state),),
-                (RecordedInput('coolant_temperature', 'K', coolant),), plant='reactor at 1 Hz')
+                        (RecordedState('temperature', 'K', state),),
+                        (RecordedInput('coolant_temperature', 'K', coolant),),
+                        plant='reactor at 1 Hz')
 
 
 def source(bags: Sequence[Path]) -> RecordSource:

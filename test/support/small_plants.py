@@ -13,11 +13,11 @@ from koopman_ros.plants import two_state_example
 
 # dx/dt = -x - 0.3 x^2 + 2 u, in deviations from 3 m and 0.5 m/s
 BENT = PlantDescription('bent', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
-             np.array([0.5]), np.array([[2.0]]))
+                        np.array([0.5]), np.array([[2.0]]))
 # the same without its input
 UNFORCED = PlantDescription('unforced', ('level',), ('m',), (), (), 's', np.array([3.0]),
                             np.zeros(0),
-                 np.zeros((1, 0)))
+                            np.zeros((1, 0)))
 SMALL = IncrementalTraining(2, hidden_first=3, max_iterations=40)
 
 _EXAMPLE = two_state_example()
@@ -31,7 +31,7 @@ def bent_samples(episodes=6, length=30, seed=0):
     x = rng.uniform(-1.0, 1.5, (episodes * length, 1))
     u = rng.uniform(-1.0, 1.0, (episodes * length, 1))
     return DriftSamples(x + 3.0, -x - 0.3 * x * x + 2.0 * u, u + 0.5,
-                   np.repeat(np.arange(episodes), length))
+                        np.repeat(np.arange(episodes), length))
 
 
 def unforced_samples():

@@ -145,7 +145,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     # dot takes a third of the time of @ here
     riccati = solve_riccati(A, J.dot(B), Q, weights.R, interval=interval,
-                        max_gain=max_gain, max_residual=max_residual)
+                            max_gain=max_gain, max_residual=max_residual)
     drift = (model.onto_states(J, model.A.dot(M) + H) if model.readout is None
              else _averaged_jacobian(model, x, target, D))
     return Feedback(target.u - riccati.K.dot(z - target.z), Form.RECENTRED, riccati,
@@ -167,7 +167,7 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     A = _averaged_jacobian(model, x, target, _input_secant(model, x, target))
     B = model.input_matrix(x)
     riccati = solve_riccati(A, B, weights.Q, weights.R, interval=interval,
-                        max_gain=max_gain, max_residual=max_residual)
+                            max_gain=max_gain, max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
                     A, -B @ riccati.K)
 

@@ -47,8 +47,8 @@ _INVOLVED = 1e-3  # a constant with such a share of such a direction is not told
 
 
 def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], equations: Any,
-                  ranges: Mapping[str, tuple[float, float] | None] | None = None, *,
-                  seed: int = 0, watch: Watch = lambda *_: False) -> Identified:
+                        ranges: Mapping[str, tuple[float, float] | None] | None = None, *,
+                        seed: int = 0, watch: Watch = lambda *_: False) -> Identified:
     """
     Estimate constants of a plant's equations from a record of some of its states.
 

@@ -55,7 +55,7 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
     episodes = [episode for episode in episodes if len(episode) >= _SHORTEST]
     shifts = [_moved(episode, box, assumed) for episode in episodes]
     curves = smoothed([(episode.time, box.states.to_deviation(episode.x) - moved)
-                        for episode, moved in zip(episodes, shifts, strict=True)])
+                       for episode, moved in zip(episodes, shifts, strict=True)])
     for episode, moved, smooth in zip(episodes, shifts, curves, strict=True):
         v = box.inputs.to_deviation(episode.inputs_at(episode.time))
         rate = np.gradient(smooth, episode.time, axis=0, edge_order=2)

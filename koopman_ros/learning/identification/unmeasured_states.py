@@ -65,8 +65,8 @@ class _StructureCandidate:
 
 
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
-                    highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
-                    watch: Watch = lambda *_: False, backend: Backend | None = None
+                        highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
+                        watch: Watch = lambda *_: False, backend: Backend | None = None
                     ) -> Identified:
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.

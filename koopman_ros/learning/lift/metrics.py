@@ -61,7 +61,7 @@ class LiftMetrics:
 def evaluate(model: LiftedModel, samples: DriftSamples) -> LiftMetrics:
     """Evaluate all open-loop figures on held-out episodes; raises as :func:`fit`."""
     return LiftMetrics(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
-                  rollout_rmse(model, samples))
+                       rollout_rmse(model, samples))
 
 
 def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:

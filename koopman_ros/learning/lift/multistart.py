@@ -69,7 +69,7 @@ class Tracker:
         if self._watch is not None and not self.stop:
             self.stop = self._watch(MultistartProgress(self.n_z, self.finished, self._total,
                                                        iteration,
-                                             residual, self._rw, checked))
+                                                       residual, self._rw, checked))
         return self.stop
 
 

@@ -98,7 +98,7 @@ class NeuralDrift:
         # the read-out is fitted by itself; the A of the lift z = x is that of the linear fit
         found = layout.join(replace(layout.split(minimum.theta), A=A))
         return TrainedLift(layout, found, minimum.status, drift_alone=True,
-                     iterations=minimum.iterations)
+                           iterations=minimum.iterations)
 
 
 @dataclass(frozen=True)

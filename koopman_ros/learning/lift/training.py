@@ -229,7 +229,7 @@ def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, 
         with contextlib.suppress(KeyboardInterrupt):
             law_check = evaluate_closed_loops(winner.model,
                                               reference_drift(plant, box, parts, winner.model),
-                                  loops=loops, watch=watch, backend=backend)
+                                              loops=loops, watch=watch, backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
             refusal = TrainingFailed(

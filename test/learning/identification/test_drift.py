@@ -82,7 +82,7 @@ def test_regression_needs_enough_that_moves():
 
 def test_grid_has_samples_changes_and_steps_between():
     record = Episode(np.array([0.0, 1.0, 3.5]), np.array([[1.0], [2.0], [3.0]]),
-                    np.array([-1.0, 0.25, 9.0]), np.array([[5.0], [6.0], [7.0]]))
+                     np.array([-1.0, 0.25, 9.0]), np.array([[5.0], [6.0], [7.0]]))
     grid = Segments.of([record], 1.0)
     # 2.5 from the second to the third sample is halved twice at most 1 apart
     assert np.concatenate(([0.0], np.cumsum(grid.steps[:, 0]))) == pytest.approx(

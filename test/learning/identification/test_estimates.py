@@ -223,13 +223,13 @@ def test_noise_level():
     sigma = np.array([0.03, 0.005])
     rng = np.random.default_rng(0)
     noisy = Episode(clean.time, clean.x + sigma * rng.standard_normal(clean.x.shape),
-                   clean.input_time, clean.u)
+                    clean.input_time, clean.u)
     # of 1500 deviations the median strays by 3 %, twice that as third differences overlap
     assert noise_level([noisy], model) == pytest.approx(sigma, rel=0.12)
     # on irregular times
     times = np.cumsum(rng.uniform(0.01, 0.03, 1500))
     record = Episode(times, np.cos(times)[:, None] + 0.02 * rng.standard_normal((1500, 1)),
-                    np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))
+                     np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))
     model = DriftModel(box_of(CUBIC.plant, [record]), 1, np.zeros((2, 1)), np.zeros((1, 1)))
     assert noise_level([record], model) == pytest.approx([0.02], rel=0.12)
 

@@ -21,7 +21,7 @@ def plant(count: int) -> PlantDescription:
     names = tuple(f'pump_{k + 1}' for k in range(count))
     return PlantDescription('tanks', ('level',), ('m',), names, ('V',) * count, 's', NONE[:1],
                             NONE[:count],
-                 None)
+                            None)
 
 
 def steps(seed: int, hold: int, count: int = 3) -> np.ndarray:

@@ -45,7 +45,7 @@ class Vessel(Constants):
 TRUE = Vessel(gain=1.2, leak=0.4)
 VESSEL = PlantDescription('vessel', ('level',), ('m',), ('pump',), ('V',), 's', np.zeros(1),
                           np.zeros(1),
-               None)
+                          None)
 
 
 def vessel(seed, samples=170, noise=0.02, disturbed=0.0):
@@ -99,7 +99,7 @@ def test_two_tanks_all_of_which_is_measured():
     system = truth.system()
     plant = PlantDescription('tanks', system.state_names[::-1], ('m', 'm'),
                              system.input_names[::-1],
-                  ('V', 'V'), 's', np.full(2, np.nan), np.full(2, np.nan), None)
+                             ('V', 'V'), 's', np.full(2, np.nan), np.full(2, np.nan), None)
     design = RandomStepDesign([3.0, 0.0], [9.0, 4.0], 0.4 * system.nominal_state,
                               1.8 * system.nominal_state, (15.0, 45.0), 4.0, rtol=1e-9)
     run = random_steps(system, design, 800.0, 0)
@@ -107,7 +107,7 @@ def test_two_tanks_all_of_which_is_measured():
     time = 4.0 * np.arange(len(noisy))
     # in an order of the record's own
     found = estimate_parameters(plant, [Episode(time, noisy[:, ::-1], time[:-1], run.u[:, ::-1])],
-                          TwoTanks)
+                                TwoTanks)
     off = errors(found, truth)
     assert set(off) == {'orifice_1', 'orifice_2', 'pump_gain'}
     assert np.max(np.abs(list(off.values()))) < 3.0
@@ -146,7 +146,7 @@ def test_reactor_at_its_saddle_from_its_temperature_alone():
     truth = TwoStateReactor(heat_transfer_coefficient=4.6e4, reaction_enthalpy=-4.8e4)
     plant = PlantDescription('saddle', ('temperature',), ('K',), ('coolant_temperature',), ('K',),
                              's',
-                  np.full(1, np.nan), np.full(1, np.nan), None)
+                             np.full(1, np.nan), np.full(1, np.nan), None)
     said = []
     found = estimate_parameters(
         plant, [saddle(truth, 0)], TwoStateReactor,
@@ -187,7 +187,7 @@ def test_a_constant_at_an_end_of_its_range_is_said():
 
 def test_constants_that_act_alike_are_said():
     found = estimate_parameters(VESSEL, [vessel(0)], Vessel,
-                          {'gain': None, 'strength': (0.5, 2.0), 'leak': None})
+                                {'gain': None, 'strength': (0.5, 2.0), 'leak': None})
     gain, strength, leak = found.constants
     assert gain.standing is strength.standing is EstimateStatus.NOT_IDENTIFIABLE
     assert gain.value * strength.value == pytest.approx(1.2, rel=0.02)
@@ -222,8 +222,8 @@ def test_where_inputs_act_by_the_state_and_signals_have_another_order_and_time(t
     system = FedReactor().system()
     order = slice(None, None, -1 if turned else None)
     plant = PlantDescription('fed', system.state_names[order], system.state_units[order],
-                  system.input_names[order], system.input_units[order], 's', np.full(2, np.nan),
-                  np.full(2, np.nan), None)
+                             system.input_names[order], system.input_units[order], 's',
+                             np.full(2, np.nan), np.full(2, np.nan), None)
     rng = np.random.default_rng(0)
     x, u = ((nominal * rng.uniform(0.9, 1.1, (20, 2)))[:, order]
             for nominal in (system.nominal_state, system.nominal_input))

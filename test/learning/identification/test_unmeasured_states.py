@@ -14,7 +14,7 @@ from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import identify_unmeasured, Stopped
 
 PLANT = PlantDescription('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
-              np.zeros(1), None)
+                         np.zeros(1), None)
 PERIOD, NOISE = 0.2, 0.02
 A = np.array([[-0.5, 1.0], [-0.8, -0.2]])
 B = np.array([0.0, 1.0])
@@ -68,7 +68,7 @@ def test_modes_and_gain_of_a_linear_plant():
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
     found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
-                            highest_degree=2)
+                                highest_degree=2)
     drift = found.drift
     assert drift.degree >= 2
     for y in (-0.3, 0.0, 0.3):
@@ -90,8 +90,8 @@ def test_steady_states_of_an_unstable_plant_from_closed_loop():
 def test_a_known_input_matrix_is_kept():
     gain = 1.0
     found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])),
-                            [record(saddle, samples=200, gain=2.0, size=0.1)], 1,
-                            highest_degree=1)
+                                [record(saddle, samples=200, gain=2.0, size=0.1)], 1,
+                                highest_degree=1)
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
 

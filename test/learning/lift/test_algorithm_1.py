@@ -45,7 +45,7 @@ def van_der_pol(x, u):
 
 VAN_DER_POL = PlantDescription('Van der Pol', ('x1', 'x2'), ('1', '1'), ('u',), ('1',), 's',
                                np.zeros(2),
-                    np.zeros(1), np.array([[0.0], [1.0]]))
+                               np.zeros(1), np.array([[0.0], [1.0]]))
 
 
 def van_der_pol_samples(count=400, seed=0):

@@ -17,7 +17,7 @@ from support.small_plants import BENT, bent_samples, SMALL, TWO_STATE, two_state
 
 # dx/dt = -2 (x - 3) + u - 0.5
 DECAY = PlantDescription('decay', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
-              np.array([0.5]), np.array([[1.0]]))
+                         np.array([0.5]), np.array([[1.0]]))
 
 
 def decaying(noise=0.0, rate_noise=0.0):
@@ -31,7 +31,7 @@ def decaying(noise=0.0, rate_noise=0.0):
     rate = -2.0 * (x - 3.0) + u - 0.5
     x, rate = x + noise * rng.normal(size=x.shape), rate + rate_noise * rng.normal(size=x.shape)
     return DriftSamples(x.reshape(-1, 1), rate.reshape(-1, 1), u.reshape(-1, 1),
-                   np.repeat(np.arange(5), 60), np.tile(0.1 * np.arange(60), 5))
+                        np.repeat(np.arange(5), 60), np.tile(0.1 * np.arange(60), 5))
 
 
 @pytest.mark.parametrize('samples', [
@@ -53,7 +53,7 @@ def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period
     start = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
     x = np.stack([start @ expm(A * period * k).T for k in range(6)], axis=1).reshape(-1, 2)
     samples = DriftSamples(x, x @ A.T, np.zeros((240, 1)), np.repeat(np.arange(40), 6),
-                      np.tile(period * np.arange(6), 40))
+                           np.tile(period * np.arange(6), 40))
     check_rates(plant, samples)
     if period == 0.5:
         with pytest.raises(ValueError, match=r'0\.10\d times as much'):

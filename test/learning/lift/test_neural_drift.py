@@ -26,7 +26,7 @@ def samples_of(model, count=60, seed=1):
     xi, v = rng.uniform(-1.5, 1.5, (count, model.n_x)), rng.normal(size=(count, model.n_u))
     rate = model.states.scale * (model.drift(xi) + v @ model.B.T)
     return DriftSamples(model.states.to_physical(xi), rate, model.inputs.to_physical(v),
-                   np.arange(count) // 10)
+                        np.arange(count) // 10)
 
 
 @pytest.mark.parametrize('identity', [True, False])
@@ -95,7 +95,7 @@ def test_training_keeps_the_read_out_that_is_better_on_validation_episodes(plant
     noise = 0.3 * np.std(samples.dxdt) * np.random.default_rng(0).normal(size=samples.x.shape)
     noise[~np.isin(samples.episode, training.episode)] = 0.0
     rough = DriftSamples(samples.x[few], (samples.dxdt + noise)[few], samples.u[few],
-                    samples.episode[few])
+                         samples.episode[few])
     assert train(plant, rough, recipe, starts=1, refuse=False).model.readout is None
 
 

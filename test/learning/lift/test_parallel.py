@@ -107,7 +107,7 @@ def test_loops_run_side_by_side(places):
     other = evaluate_closed_loops(model, rate, loops=64, backend=places['joblib:2'],
                                   watch=seen.append)
     assert evaluate_closed_loops(model, rate, loops=64, backend=places['joblib:2'],
-                     watch=lambda _: True) is None
+                                 watch=lambda _: True) is None
     for name in ('starts', 'setpoints', 'ratios', 'no_gain', 'excess'):
         assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
     assert one.loops > 32

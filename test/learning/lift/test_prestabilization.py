@@ -20,11 +20,11 @@ from koopman_ros.model import NetworkObservables
 # dx/dt = x + 0.3 x^2 + 2 u in deviations from 3 m and 0.5 m/s
 GROWING = PlantDescription('growing', ('level',), ('m',), ('flow',), ('m/s',), 's',
                            np.array([3.0]),
-                np.array([0.5]), np.array([[2.0]]))
+                           np.array([0.5]), np.array([[2.0]]))
 # of a pendulum about its upright position, x2' = 4 sin x1 - 0.2 x2 + 3 u
 UPRIGHT = PlantDescription('upright', ('angle', 'rate'), ('rad', 'rad/s'), ('torque',), ('N m',),
                            's',
-                np.zeros(2), np.zeros(1), np.array([[0.0], [3.0]]))
+                           np.zeros(2), np.zeros(1), np.array([[0.0], [3.0]]))
 
 
 def growing(x):
@@ -41,7 +41,7 @@ def samples_of(plant, drift, half, count=400, B=None):
     x, u = rng.uniform(-half, half, (count, len(half))), rng.uniform(-1.0, 1.0, (count, 1))
     pushed = u @ plant.B.T if B is None else (B(x) @ u[..., None])[..., 0]
     return DriftSamples(x + plant.nominal_state, drift(x) + pushed, u + plant.nominal_input,
-                   np.arange(count) // (count // 10))
+                        np.arange(count) // (count // 10))
 
 
 def learned(plant, samples, recipe, starts=1):

@@ -246,7 +246,7 @@ def test_a_plant_without_inputs(B):
     system = scalar_example()
     plant = PlantDescription(system.name, system.state_names, system.state_units, (), (), 's',
                              np.zeros(1),
-                  np.zeros(0), B)
+                             np.zeros(0), B)
     x = np.random.default_rng(0).uniform(0.0, 5.0, (200, 1))
     samples = DriftSamples(x, x * x, np.zeros((200, 0)), np.arange(200) // 20)
     trained = train(plant, samples, IncrementalTraining(2, max_iterations=150), starts=1)
