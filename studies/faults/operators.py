@@ -141,6 +141,9 @@ def storm_of_modes(loop: FaultHarness) -> None:
     with loop.fault():
         _send(loop, SetBool, 'controller/set_automatic', requests())
         loop.ros.set_bool('controller/set_automatic', True)
+        # answers overtake messages: the storm is over once all its changes are recorded
+        loop.wait(lambda: sum('"event":"mode"' in text for _, text in loop.trace.records)
+                  >= REQUESTS, 'the changes of mode are not recorded')
 
 
 def mode_once(loop: FaultHarness, seconds: float = 60.0) -> None:
@@ -189,7 +192,7 @@ def out_of_reach(loop: FaultHarness) -> None:
 
 def limited(loop: FaultHarness) -> None:
     """Hold the temperature under a limit that is below its set-point, for a while."""
-    name = f'{reactor.TEMPERATURE}.max'
+    name = f'mpc.{reactor.TEMPERATURE}.max'
     limits: list[JointState] = loop.ros.listen(JointState, topics.ACTIVE_CONSTRAINTS)
     with loop.fault():
         refused = loop.set_parameters('controller', **{name: LIMIT})
