@@ -213,12 +213,13 @@ def test_a_stamp_that_is_not_later_moves_nothing_and_time_that_goes_back_aborts(
     progress = run(PAIR, 10, PAIR_INSIDE)[-1]
     for time_ns in (progress.time_ns, progress.time_ns - SECOND):
         assert advance(PAIR, progress, PAIR_INSIDE, time_ns) is progress
-    progress = advance(PAIR, progress, PAIR_INSIDE, START)
+    back = progress.time_ns - SECOND - 1
+    progress = advance(PAIR, progress, PAIR_INSIDE, back)
     assert progress.phase is ExperimentPhase.ABORTED
     assert 'went back' in say(progress.reason)
     # time starts afresh for the way home
     progress = advance(PAIR, replace(progress, command=np.array([299.0, 0.9])), PAIR_INSIDE,
-                       START + SECOND)
+                       back + SECOND)
     np.testing.assert_allclose(progress.command, [298.0, 0.88], rtol=1e-12)
 
 

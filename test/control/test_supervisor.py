@@ -72,6 +72,15 @@ def test_the_way_through_the_levels(requests, expected):
     assert [supervisor.level for supervisor in walk(requests)] == expected
 
 
+def test_a_longer_hold_timeout_does_not_revoke_the_safe_input():
+    supervisor = walk([HOLD] * 70)[-1]
+    assert supervisor.level == 'safe'
+    longer = replace(ORDER, hold_timeout=600.0)
+    for second in range(70, 90):
+        supervisor = supervisor.at(longer, HOLD, second * SECOND)
+        assert supervisor.level == 'safe'
+
+
 def test_reasons_tell_what_is_waited_for():
     recovering = walk([BEST, LINEAR, *[BEST] * 12])
     assert say(recovering[5].reason) == f'{say(FAR)} (over, waiting for it to stay so)'

@@ -49,7 +49,7 @@ class Bench:
         self.thermometer = ros.node.create_publisher(
             Temperature, '/unit_1/temperature',
             QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
-        self._time = 0.0
+        self.time = 0.0
         ros.meet(TRAINER)
 
     def ask(self, begin: bool) -> tuple[bool, str]:
@@ -68,12 +68,12 @@ class Bench:
         return answer
 
     def measure(self, celsius: float = 45.0) -> None:
-        self._time += 1.0
-        self.thermometer.publish(temperature(celsius, self._time))
+        self.time += 1.0
+        self.thermometer.publish(temperature(celsius, self.time))
 
     def answer(self, celsius: float = 45.0) -> float:
         self.measure(celsius)
-        self.ros.wait_until(lambda: self.commands and seconds(self.commands[-1]) == self._time)
+        self.ros.wait_until(lambda: self.commands and seconds(self.commands[-1]) == self.time)
         return float(self.commands[-1].temperature)
 
     def status(self, words: str) -> DiagnosticStatus:
@@ -229,6 +229,38 @@ def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Be
         False, 'refused: /bench publishes on /unit_1/jacket: end it, or choose another '
         'experiment_signal')
     ros.node.destroy_publisher(other)
+
+
+def test_one_input_in_manual_mode_until_the_controller_moves_it_elsewhere(
+        shared_bench: Bench) -> None:
+    bench, ros = shared_bench, shared_bench.ros
+    manual = ros.listen(Temperature, '/unit_1/manual_coolant_setpoint')
+    controller = ros.node.create_publisher(Temperature, JACKET, topics.LOOP_QOS)
+    bench.set(experiment_signal='manual')
+    # until the graph shows the controller to the trainer
+    ros.wait_until(lambda: bench.start() == (True, 'running on /unit_1/manual_coolant_setpoint'))
+
+    def request() -> Temperature:
+        bench.measure()
+        ros.wait_until(lambda: manual and seconds(manual[-1]) == bench.time)
+        return manual[-1]
+
+    # over more than one step
+    while len(manual) < 2 or np.ptp([message.temperature for message in manual]) < 2.0:
+        controller.publish(request())
+    assert value(bench.status('running'), 'topic') == '/unit_1/manual_coolant_setpoint'
+
+    def ignore_request() -> bool:
+        controller.publish(temperature(manual[-1].temperature + 5.0, bench.time))
+        status = ros.last_status(f'unit_1/{STATUS}')
+        return status is not None and 'aborted' in status.message
+
+    ros.wait_until(ignore_request)
+    status = bench.status('switch it to manual mode')
+    assert status.level == DiagnosticStatus.ERROR
+    ros.node.destroy_publisher(controller)
+    bench.ask(False)
+    bench.set(experiment_signal='command')
 
 
 def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coolant(
