@@ -17,11 +17,11 @@ from std_srvs.srv import Trigger
 from koopman_ros import plants
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import (
-    display_unit,
     LAST_STAMP_SECONDS,
     NANOSECONDS,
+    quantity_text,
     seconds_text,
-    shown,
+    values_by_name,
 )
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
 from koopman_ros.parameters.signal_topics import PLANT_KINDS, SIGNALS, SignalTopics
@@ -256,8 +256,9 @@ class PlantNode(ManagedNode):
             self._rejected += 1
             unit = self._signals.inputs[wrong[0]]
             self._rejection = (
-                f'{base_name(wrong[0], unit)} command {shown(self._heard[wrong[0]], unit)} '
-                f'{display_unit(unit)} is not finite and was rejected: the last good one is held')
+                f'{base_name(wrong[0], unit)} command '
+                f'{quantity_text(self._heard[wrong[0]], unit)} is not finite and was rejected: '
+                'the last good one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
         if not lockstep:
@@ -329,9 +330,9 @@ class PlantNode(ManagedNode):
         return TaskReport(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
             **self._plant.figures(),
-            **{f'{base_name(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
-               for (name, unit), value in zip(self._signals.inputs.items(),
-                                              self._plant.commanded.tolist(), strict=True)},
+            **values_by_name({base_name(name, unit): unit
+                              for name, unit in self._signals.inputs.items()},
+                             self._plant.commanded.tolist(), '{} command'),
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,

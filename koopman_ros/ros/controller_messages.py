@@ -3,8 +3,7 @@
 
 """Messages of the controller beside its commands: internals, plans, active limits, records."""
 
-from collections.abc import Callable, Collection, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
 import itertools
 import math
 import secrets
@@ -21,7 +20,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from koopman_ros.control import events, StepReport
 from koopman_ros.control.laws.base import Plan
 from koopman_ros.core.arrays import along_last, Array
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import display_unit, NANOSECONDS, shown, values_by_name
 from koopman_ros.event_log.records import EventRecord, fields_of, SNAPSHOT, START
 from koopman_ros.parameters.signal_topics import Signals, SignalTopics
 from koopman_ros.ros import topics
@@ -31,26 +30,21 @@ _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _AGAIN = 1.0  # s, within which two nodes know each other
 
 
-def labelled(names: Collection[str], text: str) -> list[str]:
-    """Return a label for each of some signals, which are named where there are several."""
-    return [text] if len(names) == 1 else [f'{name} {text}' for name in names]
+def labelled(signals: Mapping[str, str], quantity: str, values: Array | None,
+             note: str = '', difference: bool = False) -> dict[str, float]:
+    """
+    Return values under labels like ``set-point [degC]``, led by the signal if there are several.
 
-
-def by_label(signals: Mapping[str, str], text: str, values: Array | None,
-             difference: bool = False) -> dict[str, float]:
-    """Return values by label with the unit of each; `{}` in the text stands for that."""
+    :param signals: unit of each signal, by name.
+    :param values: (n,) in these units; None stands for NaN.
+    :param note: text after the unit.
+    :param difference: whether the values are differences, which stay in K.
+    """
+    prefixes = [''] if len(signals) == 1 else [f'{name} ' for name in signals]
     numbers = [math.nan] * len(signals) if values is None else values.tolist()
-    labels = _labels(tuple(signals.items()), text, difference)
-    if difference:
-        return dict(zip(labels, numbers, strict=True))
-    return {label: shown(value, unit) for label, unit, value in zip(
-        labels, signals.values(), numbers, strict=True)}
-
-
-@lru_cache(maxsize=256)
-def _labels(signals: tuple[tuple[str, str], ...], text: str, difference: bool) -> tuple[str, ...]:
-    return tuple(label.replace('{}', unit if difference else display_unit(unit))
-                 for label, (_, unit) in zip(labelled(dict(signals), text), signals, strict=True))
+    return {f'{prefix}{quantity} [{unit if difference else display_unit(unit)}{note}]':
+            number if difference else shown(number, unit)
+            for prefix, unit, number in zip(prefixes, signals.values(), numbers, strict=True)}
 
 
 def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> JointState:
@@ -63,19 +57,17 @@ def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) 
     covariance = None if estimate is None else estimate.covariance
     innovation = None if estimate is None else estimate.innovation
     values = {
-        **by_label(inputs, 'disturbance [{}]',
-                   None if estimate is None else estimate.disturbance, True),
-        **{f'estimated_{name} [{display_unit(unit)}]': value for (name, unit), value in zip(
-            states.items(),
-            by_label(states, '{}', None if estimate is None else estimate.state).values(),
-            strict=True)},
+        **labelled(inputs, 'disturbance', None if estimate is None else estimate.disturbance,
+                   difference=True),
+        **values_by_name(states, [math.nan] * len(states) if estimate is None
+                         else estimate.state.tolist(), 'estimated_{}'),
         'distance_outside [half-ranges]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),
         'riccati_residual': float(law.residual),
         'growth_per_sample': float(law.growth),
-        **by_label(inputs, 'transfer [{}]', transfer, True),
-        **by_label({name: signals.states[name] for name in signals.controlled}, 'setpoint [{}]',
+        **labelled(inputs, 'transfer', transfer, difference=True),
+        **labelled({name: signals.states[name] for name in signals.controlled}, 'setpoint',
                    None if target is None else target.setpoint),
         # of a filter alone; at the end, so that the places of the others stay
         **({} if covariance is None else _spread(states, covariance)),

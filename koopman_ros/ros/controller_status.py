@@ -16,10 +16,10 @@ from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words, StatusCode
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import Advance
-from koopman_ros.core.units import display_unit, shown
+from koopman_ros.core.units import display_unit, quantity_text, shown, values_by_name
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.signal_topics import Signals, words_of
-from koopman_ros.ros.controller_messages import by_label
+from koopman_ros.ros.controller_messages import labelled
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.timing import PAUSED, Timing
 
@@ -98,7 +98,7 @@ class StatusContext:
     def commanded(self, command: Array) -> str:
         """Write a command (n_u,) with names and units."""
         return ', '.join(
-            f'{base_name(name, unit)} at {shown(value, unit):.2f} {display_unit(unit)}'
+            f'{base_name(name, unit)} at {quantity_text(value, unit, ".2f")}'
             for (name, unit), value in zip(self.signals.inputs.items(), command.tolist(),
                                            strict=True))
 
@@ -186,7 +186,7 @@ def _action(now: StatusContext) -> str:
 
 def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
     """Yield every warning with the name of its condition, the most urgent first."""
-    report, states, tuning = now.report, now.controller.model.states, now.controller.tuning
+    report, states = now.report, now.controller.model.states
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         yield CONNECTIONS, now.complaint
@@ -259,17 +259,16 @@ def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
         place, unit = states.names.index(name), now.signals.states[name]
         found, width = float(target.state[place]), 2.0 * states.half_widths[place]
         if abs(found - wanted) > _REACHED * width * states.scale[place]:
-            return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
-                    f'cannot be held within the range of the {now.input}: '
-                    f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
+            return (f'the set-point {quantity_text(wanted, unit)} of {name} cannot be held within '
+                    f'the range of the {now.input}: {quantity_text(found, unit)} is the nearest')
     for (name, unit), wanted, low, high in zip(
             now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
             limits.upper.tolist(), strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
             return (f'the set-point would need the {base_name(name, unit)} at '
-                    f'{shown(wanted, unit):.6g} {display_unit(unit)}, its range is '
-                    f'{shown(low, unit):.6g} to {shown(high, unit):.6g}: it is not reached')
+                    f'{quantity_text(wanted, unit)}, its range is {shown(low, unit):.6g} to '
+                    f'{shown(high, unit):.6g}: it is not reached')
     return ''
 
 
@@ -287,7 +286,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
     # a bias of what is not measured is no sensor's
     bias = None if estimate is None or signals.estimated else (
         now.controller.equivalent_bias(state))
-    unit = {name: signals.states[name] for name in signals.controlled}
+    controlled = {name: signals.states[name] for name in signals.controlled}
     return {
         'condition': condition,
         'mode': state.mode.value,
@@ -295,15 +294,13 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'law': law.form or 'none',
         'reason': now.reason or 'none',
         **now.model(),
-        **{f'{name} [{display_unit(own)}]': shown(value, own) for (name, own), value in zip(
-            signals.states.items(), now.measured.tolist(), strict=True)},
-        **by_label(unit, 'set-point [{}]', None if target is None else target.setpoint),
-        **{f'{name} [{display_unit(own)}]': value for (name, own), value in zip(
-            inputs.items(), by_label(inputs, '{}', state.command).values(), strict=True)},
-        **by_label(inputs, f'disturbance [{{}} of {now.input}]' if len(inputs) == 1
-                   else 'disturbance [{}]', None if estimate is None else estimate.disturbance,
-                   True),
-        **by_label(signals.states, 'equivalent sensor bias [{}]', bias, True),
+        **values_by_name(signals.states, now.measured.tolist()),
+        **labelled(controlled, 'set-point', None if target is None else target.setpoint),
+        **values_by_name(inputs, [math.nan] * len(inputs) if state.command is None
+                         else state.command.tolist()),
+        **labelled(inputs, 'disturbance', None if estimate is None else estimate.disturbance,
+                   f' of {now.input}' if len(inputs) == 1 else '', difference=True),
+        **labelled(signals.states, 'equivalent sensor bias', bias, difference=True),
         **_estimated(now),
         'distance outside training box [half-ranges]': float(report.measurement.outside),
         'set-point outside training box [half-ranges]': (
@@ -312,7 +309,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'Riccati residual': float(law.residual),
         'gain norm': float(law.gain),
         'predicted growth per sample': float(law.growth),
-        **by_label(inputs, 'transfer [{}]', transfer, True),
+        **labelled(inputs, 'transfer', transfer, difference=True),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,

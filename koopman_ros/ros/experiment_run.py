@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -33,7 +33,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name, MessageField
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.synchronizer import SampleSynchronizer
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import NANOSECONDS, quantity_text, values_by_name
 from koopman_ros.event_log import records
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
@@ -118,14 +118,11 @@ class ExperimentRun:
     def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
                    latched: bool = False) -> Subscription:
         # a sensor driver may publish best effort
-        offers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
-        reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
-                       for info in offers)
-        latched = latched or (bool(offers) and all(
-            info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for info in offers))
-        return self._owned.keep(self._node.create_subscription(
-            kind, topic, callback, topics.profile(
-                topics.LOOP_QOS.depth, reliable=reliable, latched=latched)))
+        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        qos = topics.matching_profile(topics.LOOP_QOS, publishers, topics.LOOP_QOS.depth)
+        if latched:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        return self._owned.keep(self._node.create_subscription(kind, topic, callback, qos))
 
     @property
     def topics(self) -> str:
@@ -150,7 +147,7 @@ class ExperimentRun:
     def _listed(self, preposition: str, values: Array) -> str:
         """Write values (m,) with their names and units."""
         return ', '.join(
-            f'{self._called(name)} {preposition} {shown(value, unit):.6g} {display_unit(unit)}'
+            f'{self._called(name)} {preposition} {quantity_text(value, unit)}'
             for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True))
 
     @property
@@ -179,8 +176,7 @@ class ExperimentRun:
             if not any(map(math.isfinite, found)):
                 self._node.get_logger().warning(
                     f'experiment: {self._called(name)} is not measured and was not commanded: '
-                    f'the steps begin at its safe value, {shown(start[i], unit):.6g} '
-                    f'{display_unit(unit)}')
+                    f'the steps begin at its safe value, {quantity_text(start[i], unit)}')
         return start
 
     def _on_applied(self, heard: SignalSample) -> None:
@@ -198,8 +194,8 @@ class ExperimentRun:
 
     def figures(self, what: str, values: Array) -> dict[str, float]:
         """Return values (m,) by name with unit."""
-        return {f'{self._called(name)} {what} [{display_unit(unit)}]': shown(value, unit)
-                for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True)}
+        return values_by_name({self._called(name): unit for name, unit in self._units.items()},
+                              values.tolist(), f'{{}} {what}')
 
     def stop(self, phase: ExperimentPhase, why: Reason | None = None) -> None:
         """End the steps; the signals then go home."""

@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool
 from koopman_ros.control import events, Mode
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import NANOSECONDS, quantity_text
 from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.ros import topics
 from koopman_ros.ros.control_loop import ControlLoop
@@ -64,8 +64,8 @@ class OperatorRequests:
             when = f', holds from {heard.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
             unit = self._signals.states[name]
             self._log.info(
-                f'set-point {shown(value, unit):.6g} {display_unit(unit)} of {name} accepted'
-                f'{when}', throttle_duration_sec=1.0)
+                f'set-point {quantity_text(value, unit)} of {name} accepted{when}',
+                throttle_duration_sec=1.0)
         self._changed()
 
     def _on_manual(self, heard: SignalSample) -> None:
@@ -106,8 +106,8 @@ class OperatorRequests:
         """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
         within = self._loop.controller.tuning.limits.within(requested)
         return ', '.join(
-            f'manual {base_name(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
-            f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
+            f'manual {base_name(name, unit)} {quantity_text(wanted, unit, ".2f")} is limited to '
+            f'{quantity_text(limit, unit, ".2f")}'
             for (name, unit), wanted, limit in zip(
                 self._signals.inputs.items(), requested.tolist(), within.tolist(), strict=True)
             if wanted != limit)

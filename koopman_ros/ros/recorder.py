@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -111,7 +110,7 @@ class Recorder:
             if (message_type := self._types[topic]) is None:
                 continue
             _, usual = self._known.get(self._names[topic], (None, topics.LOOP_QOS))
-            wanted = _matching_qos(usual, publishers)
+            wanted = topics.matching_profile(usual, publishers, _QUEUE_DEPTH)
             existing = self._subscriptions.get(topic)
             if existing is not None:
                 present = existing.qos_profile
@@ -248,14 +247,6 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
         return latest_ns
     return source_ns if empty_ns - _LONGEST_WAY_NS <= source_ns <= latest_ns else min(
         max(source_ns, empty_ns), latest_ns)
-
-
-def _matching_qos(usual: QoSProfile, publishers: list[TopicEndpointInfo]) -> QoSProfile:
-    """Ask for reliability and history only where every publisher offers them."""
-    offers = [info.qos_profile for info in publishers] or [usual]
-    reliable = all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers)
-    latched = all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
-    return topics.profile(_QUEUE_DEPTH, reliable=reliable, latched=latched)
 
 
 def _offered(profile: QoSProfile) -> Qos:

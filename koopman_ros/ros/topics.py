@@ -100,6 +100,16 @@ def profile(depth: int, *, reliable: bool, latched: bool = False) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
+def matching_profile(usual: QoSProfile, publishers: Collection[TopicEndpointInfo], depth: int
+                     ) -> QoSProfile:
+    """Ask for reliability and history only where every publisher offers them."""
+    offers = [info.qos_profile for info in publishers] or [usual]
+    return profile(
+        depth,
+        reliable=all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers),
+        latched=all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers))
+
+
 def message_class(type_name: str) -> Any:
     """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
