@@ -18,7 +18,6 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.experiment_run import ExperimentRun, other_publishers, stepped
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import NodeEntities
 from koopman_ros.ros.signals import SignalSample, SignalSubscriber
 
 
@@ -41,17 +40,14 @@ class PlantExperiment:
         self._run: ExperimentRun | None = None
         self._outcome = TaskReport(Severity.OK, 'no experiment')
         self._diagnostics = node.diagnostics.add('experiment', self._status)
-        # a group of its own: the service waits for the first measurement
-        self._owned = NodeEntities(node)
         self._commanded = {} if commanded is None else commanded
         # best effort fits every publisher
-        SignalSubscriber(node, lambda topic, callback,
-                         kind: self._owned.keep(node.create_subscription(
-            kind, topic, callback, topics.profile(1, reliable=False))),
-            wiring.commands, wiring.signals.inputs, self._on_command)
-        self._owned.keep(node.create_service(
-            SetBool, '~/experiment', self._on_service,
-            callback_group=MutuallyExclusiveCallbackGroup()))
+        qos = topics.profile(1, reliable=False)
+        SignalSubscriber(node, lambda topic, callback, kind: node.create_subscription(
+            kind, topic, callback, qos), wiring.commands, wiring.signals.inputs, self._on_command)
+        # a group of its own: the service waits for the first measurement
+        node.create_service(SetBool, '~/experiment', self._on_service,
+                            callback_group=MutuallyExclusiveCallbackGroup())
 
     def complete(self) -> None:
         """Bring the inputs back as far as the rate limit allows in 2 s, and let go."""
@@ -64,12 +60,6 @@ class PlantExperiment:
     def _on_command(self, heard: SignalSample) -> None:
         self._commanded |= {name: value for name, value in heard.values.items()
                             if math.isfinite(value)}
-
-    def destroy(self) -> None:
-        """Take the service down, and a run with it: the inputs are left where they are."""
-        self._let_go(self._outcome)
-        self._owned.destroy()
-        self._diagnostics.destroy()
 
     async def _on_service(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:

@@ -38,8 +38,8 @@ from koopman_ros.event_log import records
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.ros import topics
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import NodeEntities
 from koopman_ros.ros.signals import MeasuredInputs, SignalPublisher, SignalSample, SignalSubscriber
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
@@ -96,8 +96,7 @@ class ExperimentRun:
         self._sent: Array | None = None
         self._monitors = [TrackingMonitor(span)
                           for span in (self.plan.upper - self.plan.lower).tolist()]
-        self._owned = owned = NodeEntities(node)
-        self.destroy = owned.destroy  #: commands no more
+        self._subscriptions: list[Subscription] = []
         self._assembler = SampleSynchronizer(
             tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
         self._measured = SignalSubscriber(
@@ -111,9 +110,17 @@ class ExperimentRun:
             SignalSubscriber(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
                              signals.states, lambda heard: self._tracked.update(heard.values))
             self._subscribe(topics.EVENT_LOG, self._on_record, String)
-        self._outlet = SignalPublisher(places, self._units, lambda topic, kind: owned.keep(
+        self._outlet = SignalPublisher(places, self._units, lambda topic, kind: (
             node.create_publisher(kind, topic, topics.LOOP_QOS)))
-        owned.timer(_TICK, self._on_tick)
+        self._timer = wall_timer(node, _TICK, self._on_tick)
+
+    def destroy(self) -> None:
+        """Command no more."""
+        self._node.destroy_timer(self._timer)
+        for publisher in self._outlet.publishers:
+            self._node.destroy_publisher(publisher)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
 
     def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
                    latched: bool = False) -> Subscription:
@@ -122,7 +129,8 @@ class ExperimentRun:
         qos = topics.matching_profile(topics.LOOP_QOS, publishers, topics.LOOP_QOS.depth)
         if latched:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        return self._owned.keep(self._node.create_subscription(kind, topic, callback, qos))
+        self._subscriptions.append(self._node.create_subscription(kind, topic, callback, qos))
+        return self._subscriptions[-1]
 
     @property
     def topics(self) -> str:
