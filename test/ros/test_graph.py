@@ -83,31 +83,26 @@ def check(ros: Harness, node: str, seen: Seen, system: str = 'reactor') -> None:
     assert seen == granted
 
 
-@pytest.mark.parametrize(('node', 'parameters'), [
-    ('plant', {'system': 'two_state', 'speed': 2.0}),
-    ('controller', {'use_sim_time': True}),
-    ('player', {'bag': 'all.mcap', 'rate': 0.0, 'clock': True}),
-])
-def test_a_node_does_what_it_is_granted(
-        ros: Harness, tmp_path: Path, node: str, parameters: dict[str, Any]) -> None:
-    if 'bag' in parameters:
-        parameters = {**parameters, 'bag': tmp_path / parameters['bag']}
+@pytest.mark.parametrize(('node', 'parameters', 'system'), [
+    ('plant', {'system': 'two_state', 'speed': 2.0}, 'reactor'),
+    ('plant', {'speed': 2.0}, 'two_tanks'),
+    ('controller', {'use_sim_time': True}, 'reactor'),
+    ('controller', {'use_sim_time': True}, 'two_tanks'),
+    ('player', {'rate': 0.0, 'clock': True}, 'reactor')])
+def test_a_node_uses_exactly_the_names_that_its_policy_grants(
+        ros: Harness, tmp_path: Path, node: str, parameters: dict[str, Any], system: str) -> None:
+    arguments: tuple[str, ...] = ()
+    if node == 'player':
+        parameters = {**parameters, 'bag': tmp_path / 'all.mcap'}
         with BagWriter(parameters['bag']) as writer:
             for number, name in enumerate(player_table().snapshot({}).topics):
                 writer.add_topic(f'/{name}', message_definition('sensor_msgs/msg/Temperature'), ())
                 writer.write(f'/{name}', serialize_message(temperature(40.0, 1.0)), number)
-    ros.start(node, parameters)
-    check(ros, node, {})
-
-
-@pytest.mark.parametrize(('node', 'parameters'), [
-    ('plant', {'speed': 2.0}), ('controller', {'use_sim_time': True})])
-def test_a_node_of_another_plant_does_what_its_policy_grants(
-        ros: Harness, node: str, parameters: dict[str, Any]) -> None:
-    file = config_directory() / 'plants' / 'two_tanks.yaml'
-    process = ros.start(node, parameters, ('--params-file', str(file)))
-    check(ros, node, {}, 'two_tanks')
-    # the file is that of the whole loop
+    if system != 'reactor':
+        # the file of the whole loop
+        arguments = ('--params-file', str(config_directory() / 'plants' / f'{system}.yaml'))
+    process = ros.start(node, parameters, arguments)
+    check(ros, node, {}, system)
     assert 'ignored' not in process.output()
 
 
