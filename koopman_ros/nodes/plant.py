@@ -80,21 +80,21 @@ class PlantNode(ManagedNode):
         # when it last came, by name of the input
         self._commanded = dict.fromkeys(signals.inputs, self._wall_start)
 
-        self._heard: dict[str, float] = {}  # of the commands for the last measurement
+        self._received: dict[str, float] = {}  # of the commands for the last measurement
         wiring = SignalTopics(signals, parameters.states, parameters.inputs, PLANT_KINDS)
         # the subscriptions first: a controller that hears the measurement has then seen them, too
-        self._matching = matching = topics.EndpointMonitor(
+        self._endpoints = endpoints = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), {
                 place.topic: f'command the {base_name(name, signals.inputs[name])}'
                 for name, place in wiring.commands.items()} | {
                 place.topic: f'publish the {name}' for name, place in wiring.measured.items()})
-        self._command_inlet = SignalSubscriber(
-            self, matching.subscribe, wiring.commands, signals.inputs, self._on_command)
-        self._clock_publisher = matching.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
+        self._command_subscriber = SignalSubscriber(
+            self, endpoints.subscribe, wiring.commands, signals.inputs, self._on_command)
+        self._clock_publisher = endpoints.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
             parameters.publish_clock and not self._real_time) else None
         # the states last: who has found them has found the inputs, too
         self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
-        self._states = SignalPublisher(wiring.measured, signals.states, matching.publish)
+        self._states = SignalPublisher(wiring.measured, signals.states, endpoints.publish)
         counted = {wiring.measured[name].topic
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
         self._counted = [publisher for publisher in self._states.publishers
@@ -136,7 +136,7 @@ class PlantNode(ManagedNode):
             self._wall_start = time.monotonic() - passed / self._settings.speed
 
     def _latched(self, topic: str, kind: Any) -> Any:
-        return self._matching.publish(topic, kind, topics.LATCHED_QOS)
+        return self._endpoints.publish(topic, kind, topics.LATCHED_QOS)
 
     def _now_ns(self) -> int:
         """Return the plant time that the wall clock stands for."""
@@ -169,8 +169,8 @@ class PlantNode(ManagedNode):
         if self._phase is RunPhase.WAITING:
             listeners = min(publisher.get_subscription_count() for publisher in self._counted)
             if listeners >= self._settings.lockstep_subscribers and all(
-                    self.count_publishers(heard.topic_name) > 0
-                    for heard in self._command_inlet.subscriptions):
+                    self.count_publishers(subscription.topic_name) > 0
+                    for subscription in self._command_subscriber.subscriptions):
                 self._phase = RunPhase.RUNNING
                 self._measure()
             return
@@ -206,7 +206,7 @@ class PlantNode(ManagedNode):
         elif self._advance(instant):
             sample, self._sample = self._sample, self._sample + 1
             self._answered = False
-            self._heard = {}
+            self._received = {}
             self._wall_published = time.monotonic()
             self._publish(sample)
         self._diagnostics.publish_if_changed()
@@ -231,38 +231,38 @@ class PlantNode(ManagedNode):
             return False
         return True
 
-    def _on_command(self, heard: SignalSample) -> None:
+    def _on_command(self, received: SignalSample) -> None:
         if not self.active:
             return
         lockstep = self._settings.lockstep
-        if lockstep and heard.stamped and heard.stamp_ns != self._plant.time_ns:
+        if lockstep and received.stamped and received.stamp_ns != self._plant.time_ns:
             # it answers no measurement that is open: late, or from somebody else
             self._foreign += 1
             return
-        self._heard |= heard.values
-        if lockstep and len(self._heard) < len(self._signals.inputs):
+        self._received |= received.values
+        if lockstep and len(self._received) < len(self._signals.inputs):
             return
-        wrong = [name for name, value in self._heard.items() if not math.isfinite(value)]
+        wrong = [name for name, value in self._received.items() if not math.isfinite(value)]
         if not wrong:
             self._commands += 1
-            self._commanded |= dict.fromkeys(self._heard, time.monotonic())
+            self._commanded |= dict.fromkeys(self._received, time.monotonic())
             self._rejection = ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
                 followed = dict(zip(self._signals.inputs, self._plant.commanded.tolist(),
                                     strict=True))
-                self._plant.command(np.array(list((followed | self._heard).values())))
+                self._plant.command(np.array(list((followed | self._received).values())))
         else:
             self._rejected += 1
             unit = self._signals.inputs[wrong[0]]
             self._rejection = (
                 f'{base_name(wrong[0], unit)} command '
-                f'{quantity_text(self._heard[wrong[0]], unit)} is not finite and was rejected: '
+                f'{quantity_text(self._received[wrong[0]], unit)} is not finite and was rejected: '
                 'the last good one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
         if not lockstep:
-            self._heard = {}
+            self._received = {}
         elif self._phase is RunPhase.RUNNING and not self._answered:
             self._answered, self._waiting_in_vain = True, False
             self._continue_lockstep()
@@ -319,7 +319,7 @@ class PlantNode(ManagedNode):
             level = Severity.ERROR
         elif self._rejection:
             level, message = Severity.WARN, self._rejection
-        elif complaint := self._matching.complaint:
+        elif complaint := self._endpoints.complaint:
             level, message = Severity.WARN, complaint
         elif self._phase is RunPhase.WAITING:
             level = Severity.WARN

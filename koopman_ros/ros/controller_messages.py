@@ -130,15 +130,15 @@ def active_constraints(signals: Signals, plan: Plan, stamp: Time, frame_id: str)
 class ReportPublisher:
     """Publish the report of a step: tracked set-points, prediction, internals and plan."""
 
-    def __init__(self, matching: topics.EndpointMonitor, wiring: SignalTopics) -> None:
+    def __init__(self, endpoints: topics.EndpointMonitor, wiring: SignalTopics) -> None:
         states = wiring.signals.states
         self._setpoints = SignalPublisher(
             wiring.active_setpoints, states,
-            lambda topic, kind: matching.publish(topic, kind, topics.LATCHED_QOS))
-        self._predicted = SignalPublisher(wiring.predicted, states, matching.publish)
-        self._internals = matching.publish(topics.CONTROLLER_INTERNALS)
-        self._plan = matching.publish(topics.PREDICTED_TRAJECTORY)
-        self._active_limits = matching.publish(topics.ACTIVE_CONSTRAINTS)
+            lambda topic, kind: endpoints.publish(topic, kind, topics.LATCHED_QOS))
+        self._predicted = SignalPublisher(wiring.predicted, states, endpoints.publish)
+        self._internals = endpoints.publish(topics.CONTROLLER_INTERNALS)
+        self._plan = endpoints.publish(topics.PREDICTED_TRAJECTORY)
+        self._active_limits = endpoints.publish(topics.ACTIVE_CONSTRAINTS)
         self._published: Array | None = None  # (n_c,) set-points
 
     def publish(self, signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> None:
@@ -148,7 +148,7 @@ class ReportPublisher:
                                    or (target.setpoint != self._published).any()):
             self._published = target.setpoint
             self._setpoints.send(target.setpoint, stamp, frame_id)
-        if predicted is not None and self._predicted.heard():
+        if predicted is not None and self._predicted.has_subscribers():
             self._predicted.send(predicted, stamp, frame_id)
         if topics.has_subscribers(self._internals):
             self._internals.publish(internals(signals, report, stamp, frame_id))
@@ -167,12 +167,12 @@ class RecordPublisher:
     may know this publisher later than this one knows it, and miss what was published meanwhile.
     """
 
-    def __init__(self, matching: topics.EndpointMonitor, snapshot: Callable[[], Mapping[str, Any]],
-                 lock: threading.Lock) -> None:
+    def __init__(self, endpoints: topics.EndpointMonitor,
+                 snapshot: Callable[[], Mapping[str, Any]], lock: threading.Lock) -> None:
         self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
         self._started = False
-        self._publisher = matching.publish(topics.EVENT_LOG, matched=self._on_matched)
+        self._publisher = endpoints.publish(topics.EVENT_LOG, matched=self._on_matched)
 
     def start(self) -> None:
         """Publish the state from which the controller begins to act."""

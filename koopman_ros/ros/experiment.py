@@ -54,11 +54,11 @@ class PlantExperiment:
         run = self._run
         if run is not None:
             run.stop(ExperimentPhase.ENDED)
-            run.farewell()
-            self._let_go(self._verdict(run))
+            run.return_before_exit()
+            self._release(self._verdict(run))
 
-    def _on_command(self, heard: SignalSample) -> None:
-        self._commanded |= {name: value for name, value in heard.values.items()
+    def _on_command(self, received: SignalSample) -> None:
+        self._commanded |= {name: value for name, value in received.values.items()
                             if math.isfinite(value)}
 
     async def _on_service(self, request: SetBool.Request, response: SetBool.Response
@@ -77,13 +77,13 @@ class PlantExperiment:
             response.message = f'refused: {reason}' if reason else (
                 f'running on {self._run.topics if self._run else ""}')
             if reason:
-                self._let_go(TaskReport(Severity.WARN, response.message))
-        self._say(response.message)
+                self._release(TaskReport(Severity.WARN, response.message))
+        self._report(response.message)
         return response
 
     def _start(self) -> str:
         """Take the plant in hand, or return why not."""
-        self._let_go(self._outcome)
+        self._release(self._outcome)
         resolve = self._node.resolve_topic_name
         for place in stepped(self.settings, self._wiring).values():
             topic = resolve(place.topic)
@@ -110,8 +110,8 @@ class PlantExperiment:
             return False, 'no experiment is running'
         if self._run.running:
             self._run.stop(ExperimentPhase.ENDED)
-            return True, f'ended: {self._run.going_home}; call again to let go'
-        self._let_go(self._verdict(self._run))
+            return True, f'ended: {self._run.return_text}; call again to let go'
+        self._release(self._verdict(self._run))
         return True, 'the trainer does not command any more'
 
     def _on_end(self, why: Reason | None) -> None:
@@ -119,14 +119,14 @@ class PlantExperiment:
         run = self._run
         assert run is not None
         if why is None:
-            self._say(self._verdict(run).message)
+            self._report(self._verdict(run).message)
             return
         # an experiment that was over is over as it was
         run.stop(ExperimentPhase.ABORTED, why)
-        self._let_go(self._verdict(run))
-        self._say(f'the trainer does not command any more: {self._words(why)}')
+        self._release(self._verdict(run))
+        self._report(f'the trainer does not command any more: {self._words(why)}')
 
-    def _let_go(self, outcome: TaskReport) -> None:
+    def _release(self, outcome: TaskReport) -> None:
         run, self._run = self._run, None
         self._outcome = outcome
         if run is not None:
@@ -134,7 +134,7 @@ class PlantExperiment:
             if not run.started.done():
                 run.started.set_result(reason(StatusCode.ENDED_EARLY))
 
-    def _say(self, sentence: str) -> None:
+    def _report(self, sentence: str) -> None:
         # two lines, because rclpy allows one severity a line
         if self._status().level is Severity.OK:
             self._node.get_logger().info(f'experiment: {sentence}')
@@ -156,7 +156,7 @@ class PlantExperiment:
         verdict = self._verdict(run)
         if run.progress is None:
             return verdict
-        held = '' if run.running else f'; {run.going_home}'
+        held = '' if run.running else f'; {run.return_text}'
         left = max(0.0, run.plan.duration - run.progress.elapsed) if run.running else 0.0
         return TaskReport(verdict.level, verdict.message + held, {
             'topic': run.topics,

@@ -124,14 +124,14 @@ class EndpointMonitor:
     message.
 
     :param on_change: called when the complaint is another.
-    :param single: what is done on topics on which only one node may publish, in words.
+    :param exclusive: what is done on topics on which only one node may publish, in words.
     """
 
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
-                 single: Mapping[str, str] | None = None) -> None:
-        self._node, self._on_change, self._single = node, on_change, single or {}
+                 exclusive: Mapping[str, str] | None = None) -> None:
+        self._node, self._on_change, self._exclusive = node, on_change, exclusive or {}
         self._own: list[Publisher | Subscription] = []
-        self._said: tuple[str, ...] = ('', '')
+        self._last_complaints: tuple[str, ...] = ('', '')
         self._shared: dict[str, bool] = {}
         self._next_look = 0.0  # by the steady clock
         self._loops = 1 if node.hosting is None else node.hosting.loops
@@ -140,7 +140,7 @@ class EndpointMonitor:
     @property
     def complaint(self) -> str:
         """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
-        return next(filter(None, self._said), '')
+        return next(filter(None, self._last_complaints), '')
 
     def shared(self, topic: str) -> bool:
         """Tell whether several nodes publish on a topic on which only one may."""
@@ -176,12 +176,12 @@ class EndpointMonitor:
         self._next_look = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
 
     def _look(self) -> None:
-        conflicts = {topic: self._conflict(topic) for topic in self._single}
+        conflicts = {topic: self._conflict(topic) for topic in self._exclusive}
         self._shared = {topic: bool(conflict) for topic, conflict in conflicts.items()}
         complaints = dict.fromkeys(
             complaint for own in self._own for complaint in self._complaints(own))
         said = '; '.join(filter(None, conflicts.values())), '; '.join(complaints)
-        before, self._said = self._said, said
+        before, self._last_complaints = self._last_complaints, said
         for complaint in said:
             if complaint and complaint not in before:
                 self._node.get_logger().warning(complaint)
@@ -195,7 +195,7 @@ class EndpointMonitor:
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
                        if info.topic_type in kinds)
         return '' if len(names) < 2 else (
-            f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
+            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; end all but one')
 
     def _complaints(self, own: Publisher | Subscription) -> list[str]:
         topic, kind = own.topic_name, type_name(own.msg_type)
