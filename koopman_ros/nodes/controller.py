@@ -89,7 +89,7 @@ class ControllerNode(ManagedNode):
         self._last_command: Array | None = None
 
     def configure(self) -> None:
-        """Load the model and make what the loop needs; nothing is commanded yet."""
+        """Load the model and create the loop, which does not command yet."""
         table = self._table
         self._settings = parameters = self.current(table)
         # the one of the start, unless its name was changed since then
@@ -112,7 +112,7 @@ class ControllerNode(ManagedNode):
         self._report = self._logged = StepReport(
             Mode.AUTOMATIC, next(iter(self._loop.controller.levels)))
         self._safe_input_warning = ''
-        # until when a status is not looked at again while level and whether there is a reason stay
+        # no status is collected until then, unless the level or the presence of a reason changes
         self._last_status, self._status_pending = (0.0, '', False), False
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
         self._counts = status.Counts()
@@ -129,7 +129,7 @@ class ControllerNode(ManagedNode):
         self._watchdog.start()
 
     def _connect(self, wiring: SignalTopics) -> None:
-        """Make publishers, subscriptions, services and the timer of the watch."""
+        """Create publishers, subscriptions, services and the timer of the watch."""
         exclusive = self._exclusive_topics(wiring)
         self._endpoints = endpoints = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), exclusive)
@@ -161,7 +161,7 @@ class ControllerNode(ManagedNode):
             self._records.start()
 
     def deactivate(self) -> None:
-        """Answer nothing that waits; a command of the watchdog that is on its way goes out."""
+        """Discard waiting measurements; a command that the watchdog is sending still goes out."""
         with self._loop.lock:
             self._loop.active = False
             self._measurements.end()
@@ -169,13 +169,13 @@ class ControllerNode(ManagedNode):
                 self._last_command = self._loop.state.command
 
     def complete(self) -> None:
-        """Let nobody command while the middleware is taken down."""
+        """Stop watchdog and model reload before the middleware shuts down."""
         if self._watchdog is not None:
             self._watchdog.end()
             self._models.end()
 
     def _exclusive_topics(self, wiring: SignalTopics) -> dict[str, str]:
-        """Return what is done on topics on which only one node may publish."""
+        """Return the action on each topic on which only one node may publish."""
         own = self._signals.defaults().values()
         return {place.topic: f'{verb} the {what}' for verb, places in (
             ('command', {base_name(name, self._signals.inputs[name]): place
@@ -235,7 +235,7 @@ class ControllerNode(ManagedNode):
             self._records.watch()
 
     def _on_busy_executor(self, seconds: float) -> None:
-        """Stand in for the executor; called in the watchdog's thread."""
+        """Command in place of the busy executor; called in the watchdog's thread."""
         commanded = self._loop.watch(self._timing.busy_silence(seconds))
         if commanded is None:
             return
@@ -254,7 +254,7 @@ class ControllerNode(ManagedNode):
                               stamp_message(commanded.stamp_ns), self._measurements.frame_id)
 
     def _report_command(self, commanded: Commanded) -> None:
-        """Publish and log what is known beside the command."""
+        """Publish and log the report of a command."""
         report = commanded.report
         with self._report_lock:
             self._publish_report(commanded)
@@ -269,8 +269,7 @@ class ControllerNode(ManagedNode):
         if report.measurement.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
                                       'afresh', throttle_duration_sec=1.0)
-        # of many measurements in a moment the first is told of, and the last, by the watch at the
-        # latest
+        # of many measurements within PERIOD the status shows the first, and then the last
         until, *told = self._last_status
         now = time.monotonic()
         self._status_pending = [report.level, report.reason is None] == told and now < until
@@ -313,7 +312,7 @@ class ControllerNode(ManagedNode):
         self._exchange(records.PARAMETERS, fields)
 
     def _exchange(self, event: str, fields: Mapping[str, object]) -> None:
-        """Put the parameters and the model of now in force."""
+        """Switch to the present parameters and model."""
         before = self._loop.controller.model.states.names
         self._loop.exchange(built(self._settings, self._models.in_force.model),
                             lambda: self._records.publish(event, fields))
@@ -326,7 +325,7 @@ class ControllerNode(ManagedNode):
         self._diagnostics.publish_if_changed()
 
     def _check_safe_input(self) -> None:
-        """Say that the safe input leads out of the model's range, once for each reason."""
+        """Warn if the safe input leads out of the model's range, once for each reason."""
         before = self._safe_input_warning
         self._safe_input_warning = rests_outside(self._loop.controller)
         if self._safe_input_warning not in ('', before):

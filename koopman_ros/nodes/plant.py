@@ -41,7 +41,7 @@ _SILENCE = 3.0  # s without a command, and five periods, after which somebody sh
 
 
 class RunPhase(Enum):
-    """What the plant is doing; the value is the sentence an operator reads."""
+    """Phase of the simulation; the value is the message for the operator."""
 
     WAITING = 'waiting for the loop: no controller yet'
     RUNNING = 'running'
@@ -61,7 +61,7 @@ class PlantNode(ManagedNode):
         self._settings = self.declare_table(table, (*SIGNALS, 'model'))
 
     def configure(self) -> None:
-        """Build the plant at its initial state, and what publishes it."""
+        """Create the plant at its initial state, its publishers and subscriptions."""
         table = self._table
         self._settings = parameters = self.current(table)
         self._signals = signals = table.described
@@ -119,7 +119,7 @@ class PlantNode(ManagedNode):
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def activate(self) -> None:
-        """Let time go on from where it stood."""
+        """Resume the plant's time."""
         self._commanded = dict.fromkeys(self._signals.inputs, time.monotonic())
         if not self._sample:
             return
@@ -139,7 +139,7 @@ class PlantNode(ManagedNode):
         return self._endpoints.publish(topic, kind, topics.LATCHED_QOS)
 
     def _now_ns(self) -> int:
-        """Return the plant time that the wall clock stands for."""
+        """Return the plant time at the present wall time."""
         elapsed = time.monotonic() - self._wall_start
         return self._start_ns + round(elapsed * self._settings.speed * NANOSECONDS)
 
@@ -163,7 +163,7 @@ class PlantNode(ManagedNode):
         self._measure()
 
     def _on_poll(self) -> None:
-        """Start lock-step when the loop is complete, and watch for a command that is missing."""
+        """Start lock-step once the loop is complete, and watch for a missing command."""
         if not self.active:
             return
         if self._phase is RunPhase.WAITING:
@@ -212,7 +212,7 @@ class PlantNode(ManagedNode):
         self._diagnostics.publish_if_changed()
 
     def _publish(self, sample: int) -> None:
-        """Publish the plant as it stands, the states, which are answered, last."""
+        """Publish inputs, then states, to which the controller responds."""
         stamp, frame_id = stamp_message(self._plant.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
@@ -221,7 +221,7 @@ class PlantNode(ManagedNode):
         self._states.send(measured, stamp, frame_id, variance, resolution)
 
     def _advance(self, time_ns: int) -> bool:
-        """Bring the process to an instant; a plant that ran away stops."""
+        """Simulate up to an instant; stop a plant that diverges."""
         try:
             self._plant.advance(time_ns)
         except plants.IntegrationError as error:
@@ -276,7 +276,6 @@ class PlantNode(ManagedNode):
         return self._advance(min(now, ahead))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Put the plant back to its initial state; time goes on."""
         if self._phase in (RunPhase.FINISHED, RunPhase.OUT_OF_STAMPS):
             response.message = ('the duration is over: start the plant again'
                                 if self._phase is RunPhase.FINISHED else self._phase.value)
@@ -294,7 +293,7 @@ class PlantNode(ManagedNode):
         return response
 
     def _resynchronise(self) -> None:
-        """Resume after a stop: time has stood still for the plant."""
+        """Resume after a stop, during which the plant's time stood still."""
         if self._settings.lockstep:
             self._answered = True
             self._continue_lockstep()
@@ -341,7 +340,7 @@ class PlantNode(ManagedNode):
         })
 
     def _unanswered(self) -> bool:
-        """Tell whether no command arrives of an input, be it from the start or for some time."""
+        """Return whether commands of an input are missing."""
         if self._phase is not RunPhase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
         period = self._settings.sample_period / (self._settings.speed or math.inf)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of the controller beside its commands: internals, plans, active limits, records."""
+"""Messages of the controller: internals, plans, active constraints, event log."""
 
 from collections.abc import Callable, Mapping
 import itertools
@@ -48,7 +48,7 @@ def labelled(signals: Mapping[str, str], quantity: str, values: Array | None,
 
 
 def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> JointState:
-    """Return what a person would plot beside the signals, under names with units."""
+    """Return internal values of the controller for plots, under names with units."""
     law, estimate = report.command.law, report.estimate
     inputs, target = signals.inputs, report.target
     transfer = np.zeros(len(inputs)) if report.command.transfer is None else (
@@ -142,7 +142,7 @@ class ReportPublisher:
         self._published: Array | None = None  # (n_c,) set-points
 
     def publish(self, signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> None:
-        """Publish a report; the set-points where they are others."""
+        """Publish a report; the set-points only if they have changed."""
         target, predicted, plan = report.target, report.measurement.predicted, report.command.plan
         if target is not None and (self._published is None
                                    or (target.setpoint != self._published).any()):
@@ -186,7 +186,7 @@ class RecordPublisher:
                 self._due = time.monotonic() + _AGAIN
 
     def watch(self) -> None:
-        """Publish the state to whoever listens, where that is due."""
+        """Publish a snapshot if one is due and there is a subscriber."""
         if time.monotonic() > self._due and topics.has_subscribers(self._publisher):
             self.publish_snapshot()
 
@@ -196,7 +196,7 @@ class RecordPublisher:
         self._due = time.monotonic() + _SNAPSHOT_PERIOD
 
     def publish_event(self, event: events.Event, outcome: events.EventOutcome) -> None:
-        """Publish an event and what it led to."""
+        """Publish an event with its outcome."""
         if topics.has_subscribers(self._publisher):
             self.publish(*fields_of(event, outcome))
         elif self._started:
@@ -211,7 +211,7 @@ class RecordPublisher:
         if not self._started:
             return
         number, self._number = self._number, self._number + 1
-        # who comes later begins at a snapshot
+        # a later subscriber begins at a snapshot
         if topics.has_subscribers(self._publisher):
             self._publisher.publish(String(data=EventRecord(self._run, number, event,
                                                             fields).text()))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Status of the controller: that of the control level, and one for each kind of warning."""
+"""Status of the controller: one of its control level, and one for each kind of warning."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ _INACTIVE = 'inactive'
 
 @dataclass
 class Counts:
-    """How many measurements came, late, not at all or refused, and how many plans did not."""
+    """Counts of measurements (all, late, missed, refused) and of failed plans."""
 
     measurements: int = 0
     late: int = 0
@@ -61,7 +61,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class StatusContext:
-    """What the statuses are made of."""
+    """Inputs of :func:`statuses`."""
 
     controller: Controller
     parameters: ControllerParameters
@@ -72,7 +72,7 @@ class StatusContext:
     timing: Timing
     assembler: SampleSynchronizer  #: of the measurements
     measured: Array  #: (n_y,) last measured, in the units of the signals
-    complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
+    complaint: str  #: problem on the graph, e.g. a second controller; or empty
     unheard: Sequence[str]  #: topics of the commands without a subscriber
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
@@ -82,12 +82,12 @@ class StatusContext:
 
     @property
     def reason(self) -> str:
-        """Why the level acts, in words, or empty."""
+        """Reason of the present level, or empty."""
         return words_of(self.signals)(self.report.reason)
 
     @property
     def input(self) -> str:
-        """What an operator calls the inputs."""
+        """Names of the inputs for an operator."""
         return ' and '.join(base_name(name, unit) for name, unit in self.signals.inputs.items())
 
     @property
@@ -144,7 +144,7 @@ def _in_order(now: StatusContext) -> str:
 
 
 def _control(now: StatusContext) -> tuple[Severity, str]:
-    """Return what keeps the best law from acting, or an empty sentence."""
+    """Return why the preferred law does not act, or an empty message."""
     report, mode = now.report, now.state.mode
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
@@ -185,7 +185,7 @@ def _action(now: StatusContext) -> str:
 
 
 def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
-    """Yield every warning with the name of its condition, the most urgent first."""
+    """Yield each warning with its condition, the most urgent first."""
     report, states = now.report, now.controller.model.states
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
@@ -249,7 +249,7 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
 
 
 def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
-    """Say that the inputs do not suffice for the set-point as things are, or return ''."""
+    """Return why the set-point is out of reach of the inputs, or ''."""
     if target.state is None or target.input is None:
         return ''
     states, limits = now.controller.model.states, now.controller.tuning.limits
@@ -328,7 +328,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
 
 
 def _estimated(now: StatusContext) -> dict[str, object]:
-    """Return what is estimated of states that are not measured, and how well it fits."""
+    """Return the estimates of unmeasured states, and their consistency with the noise."""
     estimate, states = now.report.estimate, now.controller.model.states
     found: dict[str, object] = {}
     if estimate is None or estimate.deviation is None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Identification experiments of the trainer: its service, and a sentence for each end."""
+"""Service and status of the trainer's identification experiments."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PlantExperiment:
                             callback_group=MutuallyExclusiveCallbackGroup())
 
     def complete(self) -> None:
-        """Bring the inputs back as far as the rate limit allows in 2 s, and let go."""
+        """Return the inputs as far as the rate limit allows in 2 s, then stop commanding."""
         run = self._run
         if run is not None:
             run.stop(ExperimentPhase.ENDED)
@@ -82,7 +82,7 @@ class PlantExperiment:
         return response
 
     def _start(self) -> str:
-        """Take the plant in hand, or return why not."""
+        """Start a run; return the reason if it cannot start."""
         self._release(self._outcome)
         resolve = self._node.resolve_topic_name
         for place in stepped(self.settings, self._wiring).values():
@@ -105,7 +105,7 @@ class PlantExperiment:
         return ''
 
     def _stop(self) -> tuple[bool, str]:
-        """End the steps, or let go of the plant when they are over."""
+        """End the steps, or stop commanding if the steps have ended."""
         if self._run is None:
             return False, 'no experiment is running'
         if self._run.running:
@@ -115,7 +115,7 @@ class PlantExperiment:
         return True, 'the trainer does not command any more'
 
     def _on_end(self, why: Reason | None) -> None:
-        """Say that the steps are over, or stop commanding at once for a reason."""
+        """Report the end of the steps, or stop commanding at once for a reason."""
         run = self._run
         assert run is not None
         if why is None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A run of an identification experiment: from its first measurement until it lets go."""
+"""A run of an identification experiment, from its first measurement to its last command."""
 
 from __future__ import annotations
 
@@ -135,12 +135,12 @@ class ExperimentRun:
 
     @property
     def topics(self) -> str:
-        """Where it publishes."""
+        """Topics of the stepped signals."""
         return ', '.join(dict.fromkeys(self._topics))
 
     @property
     def running(self) -> bool:
-        """Whether it waits for its first measurement, or steps."""
+        """Whether the run waits for its first measurement, or steps."""
         return self.progress is None or self.progress.phase is ExperimentPhase.RUNNING
 
     @property
@@ -150,7 +150,7 @@ class ExperimentRun:
 
     @property
     def return_text(self) -> str:
-        """Say where the signals go when the steps are over."""
+        """Values to which the signals return after the steps."""
         return f'{self._values_text("to", self.plan.home)}, held there'
 
     def _values_text(self, preposition: str, values: Array) -> str:
@@ -161,7 +161,7 @@ class ExperimentRun:
 
     @property
     def _inputs_missing(self) -> bool:
-        """Whether the present inputs are likely to be known in a moment."""
+        """Whether to wait for messages with the present inputs."""
         if self._inputs is None or time.monotonic() - self._first_at > _INPUT_WAIT:
             return False
         # a controller answers the first measurement, too
@@ -193,7 +193,7 @@ class ExperimentRun:
         self._answer_first()
 
     def _answer_first(self) -> None:
-        """Answer the first measurement when the present inputs are known, or after a moment."""
+        """Answer the first measurement once the present inputs are known, or after 0.5 s."""
         if self._first is not None and not self._inputs_missing:
             first, self._first = self._first, None
             self._answer(*first)
@@ -207,12 +207,12 @@ class ExperimentRun:
                               values.tolist(), f'{{}} {what}')
 
     def stop(self, phase: ExperimentPhase, why: Reason | None = None) -> None:
-        """End the steps; the signals then go home."""
+        """End the steps; the signals then return."""
         if self.progress is not None:
             self.progress = end(self.progress, phase, why)
 
     def return_before_exit(self) -> None:
-        """Answer measurements for a moment with the way back, and leave the signals there."""
+        """Return the signals for at most 2 s, and leave them there."""
         if self.progress is None:
             return
         deadline = time.monotonic() + _RETURN_TIME
@@ -235,7 +235,7 @@ class ExperimentRun:
         return self.progress is not None and bool((self.progress.command == self.plan.home).all())
 
     def _waiting_stamps(self) -> list[int]:
-        """Take one measurement from each topic, past the executor; return their stamps."""
+        """Take one measurement from each topic without the executor; return their stamps."""
         found = []
         for subscription in self._measured.subscriptions:
             with (handle := subscription.handle):
@@ -266,7 +266,7 @@ class ExperimentRun:
             self._on_end(None)
 
     def _started(self, stamp_ns: int, measured: Array, frame_id: str) -> bool:
-        """Start with a measurement, if all is known that has to be; tell whether it did."""
+        """Start if set-points and inputs are known; return whether the run has started."""
         if self.started.done() or self._setpoints_missing:
             return False
         self._first_at = min(self._first_at, time.monotonic())
@@ -292,13 +292,13 @@ class ExperimentRun:
         self._publisher.send(values, stamp_message(stamp_ns), self._frame_id)
 
     def _on_command(self, received: SignalSample) -> None:
-        """Watch a controller that should be in manual mode."""
+        """Check that the controller follows the manual commands."""
         self._answer_first()
         if self.progress is not None and not self._on_setpoints:
             self._is_followed(received.values, StatusCode.NOT_FOLLOWED)
 
     def _on_record(self, message: String) -> None:
-        """Watch a controller that should be in automatic mode."""
+        """Check that the controller stays in automatic mode."""
         with contextlib.suppress(records.RecordError):
             mode = records.parse(message.data).fields.get('mode')
             self._automatic = self._automatic or mode == 'automatic'
@@ -310,7 +310,7 @@ class ExperimentRun:
                     self.started.set_result(why)
 
     def _is_followed(self, values: Mapping[str, float], code: StatusCode) -> bool:
-        """Tell whether a controller does as it is asked; where it does not, all is over."""
+        """Return whether the controller follows the requests; end the experiment if not."""
         assert self.progress is not None
         now = time.monotonic()
         for i, name in enumerate(self._units):
@@ -324,7 +324,7 @@ class ExperimentRun:
         return True
 
     def _on_tick(self) -> None:
-        """Look for other commanders, and for measurements that stay away."""
+        """Check for other publishers and for missing measurements."""
         self._answer_first()
         why = None
         for topic in dict.fromkeys(self._topics):
@@ -352,7 +352,7 @@ class ExperimentRun:
 
 
 def other_publishers(node: Node, topic: str, own: int = 0) -> str:
-    """Name the nodes that publish on a topic, but for so many publishers of a node's own."""
+    """Return the nodes that publish on a topic, except `own` publishers of this node."""
     # a publisher may be known before its node is
     names = ['another node' if 'UNKNOWN' in info.node_name else topics.node_name(info)
              for info in node.get_publishers_info_by_topic(topic)]

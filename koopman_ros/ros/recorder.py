@@ -51,12 +51,6 @@ class _OutsideTheExecutor(CallbackGroup):
     def can_execute(self, entity: object) -> bool:
         return False
 
-    def beginning_execution(self, entity: object) -> bool:
-        return False
-
-    def ending_execution(self, entity: object) -> None:
-        pass
-
 
 class Recorder:
     """
@@ -127,7 +121,7 @@ class Recorder:
             message_type, topic, lambda _: None, qos, callback_group=self._group, raw=True)
 
     def _look_for_the_clock(self) -> None:
-        """Complain where receipts tell another time than that of the plant."""
+        """Warn if times of receipt are not the plant's time."""
         unstamped = [topic for topic, name in self._names.items() if name in self._known
                      and name not in topics.TYPES and not hasattr(self._known[name][0], 'header')]
         if self.simulated:
@@ -153,7 +147,7 @@ class Recorder:
         self._record_in_order(self._subscriptions)
 
     def flush(self) -> None:
-        """Hand what is recorded to the operating system."""
+        """Pass the recorded messages to the operating system."""
         self._writer.flush()
 
     def close(self) -> None:
@@ -192,7 +186,7 @@ class Recorder:
         return waiting
 
     def _record_in_order(self, subscriptions: Mapping[str, Subscription]) -> None:
-        """Record in the order of receipt; the order within a topic stays whatever the clock."""
+        """Record in the order of receipt; the order within a topic is always kept."""
         waiting = [self._waiting(topic, each) for topic, each in subscriptions.items()]
         if self._clock is not None:
             # last, so that no /clock received before a message is missing; first of one instant
@@ -217,7 +211,7 @@ class Recorder:
             self.counts[taken.topic] += 1
 
     def _hear(self, data: bytes) -> None:
-        """Take the node's time from a message on /clock, but for one that is no time."""
+        """Set the node's time from a message on /clock; ignore an invalid time."""
         now = deserialize_message(data, Clock).clock
         if now.sec >= 0 and now.nanosec < NANOSECONDS:
             self._now_ns = stamp_nanoseconds(now)
