@@ -3,7 +3,7 @@
 
 """Units: conversion between them, and how values of a signal are written for people."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 import math
@@ -130,6 +130,24 @@ def printed(unit: str) -> str:
 def shown(values: Numbers, unit: str) -> Numbers:
     """Return values as people read them."""
     return conversion(unit, display_unit(unit))(values)
+
+
+def quantity_text(value: float, unit: str, number_format: str = '.6g') -> str:
+    """Write a value as people read it, with its unit, e.g. '46.5 degC'."""
+    return f'{shown(value, unit):{number_format}} {display_unit(unit)}'
+
+
+def values_by_name(units: Mapping[str, str], values: Sequence[float], label: str = '{}'
+                   ) -> dict[str, float]:
+    """
+    Return values as people read them, by name and unit, e.g. ``'temperature [degC]'``.
+
+    :param units: unit of each signal, by name.
+    :param values: (n,) in these units.
+    :param label: text in which ``{}`` stands for the name.
+    """
+    return {f'{label.format(name)} [{display_unit(unit)}]': shown(value, unit)
+            for (name, unit), value in zip(units.items(), values, strict=True)}
 
 
 @cache

@@ -89,7 +89,7 @@ class ControllerNode(ManagedNode):
         self._last_command: Array | None = None
 
     def configure(self) -> None:
-        """Load the model and make what the loop needs; nothing is commanded yet."""
+        """Load the model and create the loop, which does not command yet."""
         table = self._table
         self._settings = parameters = self.current(table)
         # the one of the start, unless its name was changed since then
@@ -108,12 +108,12 @@ class ControllerNode(ManagedNode):
             lambda command, stamp_ns: self._commands.send(
                 command, stamp_message(stamp_ns), self._measurements.frame_id),
             lambda event, outcome: self._records.publish_event(event, outcome))
-        self._telling = threading.Lock()
+        self._report_lock = threading.Lock()
         self._report = self._logged = StepReport(
             Mode.AUTOMATIC, next(iter(self._loop.controller.levels)))
-        self._rests_outside = ''
-        # until when a status is not looked at again while level and whether there is a reason stay
-        self._told, self._untold = (0.0, '', False), False
+        self._safe_input_warning = ''
+        # no status is collected until then, unless the level or the presence of a reason changes
+        self._last_status, self._status_pending = (0.0, '', False), False
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
         self._counts = status.Counts()
         self._measured = np.full(len(signals.states), np.nan)
@@ -122,31 +122,31 @@ class ControllerNode(ManagedNode):
         self._diagnostics = self.diagnostics.add_group(self._statuses, status.TASKS)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
-        self._warn_of_rest()
+        self._check_safe_input()
         # objects of the start are not searched for garbage between two samples
         gc.freeze()
-        self._watchdog = Watchdog(self._on_busy)
+        self._watchdog = Watchdog(self._on_busy_executor)
         self._watchdog.start()
 
     def _connect(self, wiring: SignalTopics) -> None:
-        """Make publishers, subscriptions, services and the timer of the watch."""
-        single = self._single(wiring)
-        self._matching = matching = topics.EndpointMonitor(
-            self, lambda: self._diagnostics.publish_if_changed(), single)
-        self._commands = SignalPublisher(wiring.commands, self._signals.inputs, matching.publish)
-        self._reports = ReportPublisher(matching, wiring)
+        """Create publishers, subscriptions, services and the timer of the watch."""
+        exclusive = self._exclusive_topics(wiring)
+        self._endpoints = endpoints = topics.EndpointMonitor(
+            self, lambda: self._diagnostics.publish_if_changed(), exclusive)
+        self._commands = SignalPublisher(wiring.commands, self._signals.inputs, endpoints.publish)
+        self._reports = ReportPublisher(endpoints, wiring)
         self._measurements = Measurements(
-            self, matching, wiring, single, self._settings.synchronisation_tolerance,
+            self, endpoints, wiring, exclusive, self._settings.synchronisation_tolerance,
             self._answer)
         self._requests = OperatorRequests(
-            self, matching, wiring, self._loop, self._measurements.applied,
+            self, endpoints, wiring, self._loop, self._measurements.applied,
             lambda: self._diagnostics.publish_if_changed())
         # a group of its own, or measurements would wait until a model is read
         self.create_service(Trigger, '~/reload_model', self._models.on_reload,
                             callback_group=MutuallyExclusiveCallbackGroup())
         wall_timer(self, PERIOD, self._on_watch)
         self._records = RecordPublisher(
-            matching, lambda: records.snapshot(
+            endpoints, lambda: records.snapshot(
                 self._loop.state, self._table.values(self._settings),
                 self._models.in_force.identity), self._loop.lock)
 
@@ -161,7 +161,7 @@ class ControllerNode(ManagedNode):
             self._records.start()
 
     def deactivate(self) -> None:
-        """Answer nothing that waits; a command of the watchdog that is on its way goes out."""
+        """Discard waiting measurements; a command that the watchdog is sending still goes out."""
         with self._loop.lock:
             self._loop.active = False
             self._measurements.end()
@@ -169,13 +169,13 @@ class ControllerNode(ManagedNode):
                 self._last_command = self._loop.state.command
 
     def complete(self) -> None:
-        """Let nobody command while the middleware is taken down."""
+        """Stop watchdog and model reload before the middleware shuts down."""
         if self._watchdog is not None:
             self._watchdog.end()
             self._models.end()
 
-    def _single(self, wiring: SignalTopics) -> dict[str, str]:
-        """Return what is done on topics on which only one node may publish."""
+    def _exclusive_topics(self, wiring: SignalTopics) -> dict[str, str]:
+        """Return the action on each topic on which only one node may publish."""
         own = self._signals.defaults().values()
         return {place.topic: f'{verb} the {what}' for verb, places in (
             ('command', {base_name(name, self._signals.inputs[name]): place
@@ -194,7 +194,7 @@ class ControllerNode(ManagedNode):
             self._counts.measurements += 1
             self._counts.refused += 1
             if (held := self._loop.hold_between_sources(stamp_ns)) is not None:
-                self._tell(held)
+                self._report_command(held)
             return
         since_ns = stamp_ns if before.time_ns is None else before.time_ns
         countable = None if advance is Advance.OLD else self._timing.countable(
@@ -217,7 +217,7 @@ class ControllerNode(ManagedNode):
             event, report.measurement, before.command, self._settings.model_check_length)
         self._measured = sample.values
         self._counts.take(report)
-        self._tell(Commanded(report, stamp_ns))
+        self._report_command(Commanded(report, stamp_ns))
 
     def _on_watch(self) -> None:
         self._timing.busy = False
@@ -225,38 +225,38 @@ class ControllerNode(ManagedNode):
         self._watchdog.beat()
         commanded = self._loop.watch(self._timing.silence, acting=True)
         if commanded is not None:
-            self._tell(commanded)
+            self._report_command(commanded)
         if self._loop.state.command is None or not self.active or all(
                 map(topics.has_subscribers, self._commands.publishers)):
             self._received = time.monotonic()
-        if self._untold:
-            self._say(self._report, time.monotonic())
+        if self._status_pending:
+            self._publish_status(self._report, time.monotonic())
         with self._loop.lock:
             self._records.watch()
 
-    def _on_busy(self, seconds: float) -> None:
-        """Stand in for the executor; called in the watchdog's thread."""
+    def _on_busy_executor(self, seconds: float) -> None:
+        """Command in place of the busy executor; called in the watchdog's thread."""
         commanded = self._loop.watch(self._timing.busy_silence(seconds))
         if commanded is None:
             return
         self._timing.busy = True
         # the executor may be stuck in there
-        if self._telling.acquire(blocking=False):
+        if self._report_lock.acquire(blocking=False):
             try:
                 self._publish_report(commanded)
                 self._diagnostics.publish_if_changed()
             finally:
-                self._telling.release()
+                self._report_lock.release()
 
     def _publish_report(self, commanded: Commanded) -> None:
         self._report = commanded.report
         self._reports.publish(self._signals, commanded.report,
                               stamp_message(commanded.stamp_ns), self._measurements.frame_id)
 
-    def _tell(self, commanded: Commanded) -> None:
-        """Publish and log what is known beside the command."""
+    def _report_command(self, commanded: Commanded) -> None:
+        """Publish and log the report of a command."""
         report = commanded.report
-        with self._telling:
+        with self._report_lock:
             self._publish_report(commanded)
         if report.level not in (self._logged.level, MANUAL):
             change = f'{level_words(self._logged.level)} -> {level_words(report.level)}'
@@ -269,17 +269,16 @@ class ControllerNode(ManagedNode):
         if report.measurement.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
                                       'afresh', throttle_duration_sec=1.0)
-        # of many measurements in a moment the first is told of, and the last, by the watch at the
-        # latest
-        until, *told = self._told
+        # of many measurements within PERIOD the status shows the first, and then the last
+        until, *told = self._last_status
         now = time.monotonic()
-        self._untold = [report.level, report.reason is None] == told and now < until
-        if not self._untold:
-            self._say(report, now)
+        self._status_pending = [report.level, report.reason is None] == told and now < until
+        if not self._status_pending:
+            self._publish_status(report, now)
 
-    def _say(self, report: StepReport, now: float) -> None:
-        self._told = now + PERIOD, report.level, report.reason is None
-        self._untold = False
+    def _publish_status(self, report: StepReport, now: float) -> None:
+        self._last_status = now + PERIOD, report.level, report.reason is None
+        self._status_pending = False
         self._diagnostics.publish_if_changed()
 
     def _statuses(self) -> dict[str, TaskReport]:
@@ -287,7 +286,7 @@ class ControllerNode(ManagedNode):
         situation = status.StatusContext(
             loop.controller, self._settings, self._signals, loop.state, self._report,
             self._counts, self._timing, self._measurements.assembler, self._measured,
-            complaint=self._matching.complaint or self._measurements.complaint,
+            complaint=self._endpoints.complaint or self._measurements.complaint,
             unheard=[publisher.topic_name for publisher in self._commands.publishers
                      if not topics.has_subscribers(publisher)],
             unheard_for=time.monotonic() - self._received,
@@ -295,7 +294,7 @@ class ControllerNode(ManagedNode):
             request=self._requests.complaint,
             model_refused=self._models.refused,
             model=lambda: {**self._models.figures(),
-                           'safe input': self._rests_outside or 'within reach'})
+                           'safe input': self._safe_input_warning or 'within reach'})
         return status.statuses(situation) if self.active else status.inactive(situation)
 
     def _model_situation(self) -> ModelCheckContext:
@@ -313,7 +312,7 @@ class ControllerNode(ManagedNode):
         self._exchange(records.PARAMETERS, fields)
 
     def _exchange(self, event: str, fields: Mapping[str, object]) -> None:
-        """Put the parameters and the model of now in force."""
+        """Switch to the present parameters and model."""
         before = self._loop.controller.model.states.names
         self._loop.exchange(built(self._settings, self._models.in_force.model),
                             lambda: self._records.publish(event, fields))
@@ -322,14 +321,15 @@ class ControllerNode(ManagedNode):
             # what is estimated is something else; what was last said is of another model
             self._signals = signals_of(model, self._signals.controlled, self._signals.states)
             self._report = replace(self._report, estimate=None, target=None)
-        self._warn_of_rest()
+        self._check_safe_input()
         self._diagnostics.publish_if_changed()
 
-    def _warn_of_rest(self) -> None:
-        """Say that the safe input leads out of the model's range, once for each reason."""
-        before, self._rests_outside = self._rests_outside, rests_outside(self._loop.controller)
-        if self._rests_outside not in ('', before):
-            self.get_logger().warning(self._rests_outside)
+    def _check_safe_input(self) -> None:
+        """Warn if the safe input leads out of the model's range, once for each reason."""
+        before = self._safe_input_warning
+        self._safe_input_warning = rests_outside(self._loop.controller)
+        if self._safe_input_warning not in ('', before):
+            self.get_logger().warning(self._safe_input_warning)
 
 
 def main(args: list[str] | None = None) -> int:

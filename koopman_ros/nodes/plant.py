@@ -17,11 +17,11 @@ from std_srvs.srv import Trigger
 from koopman_ros import plants
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import (
-    display_unit,
     LAST_STAMP_SECONDS,
     NANOSECONDS,
+    quantity_text,
     seconds_text,
-    shown,
+    values_by_name,
 )
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
 from koopman_ros.parameters.signal_topics import PLANT_KINDS, SIGNALS, SignalTopics
@@ -41,7 +41,7 @@ _SILENCE = 3.0  # s without a command, and five periods, after which somebody sh
 
 
 class RunPhase(Enum):
-    """What the plant is doing; the value is the sentence an operator reads."""
+    """Phase of the simulation; the value is the message for the operator."""
 
     WAITING = 'waiting for the loop: no controller yet'
     RUNNING = 'running'
@@ -61,7 +61,7 @@ class PlantNode(ManagedNode):
         self._settings = self.declare_table(table, (*SIGNALS, 'model'))
 
     def configure(self) -> None:
-        """Build the plant at its initial state, and what publishes it."""
+        """Create the plant at its initial state, its publishers and subscriptions."""
         table = self._table
         self._settings = parameters = self.current(table)
         self._signals = signals = table.described
@@ -80,21 +80,21 @@ class PlantNode(ManagedNode):
         # when it last came, by name of the input
         self._commanded = dict.fromkeys(signals.inputs, self._wall_start)
 
-        self._heard: dict[str, float] = {}  # of the commands for the last measurement
+        self._received: dict[str, float] = {}  # of the commands for the last measurement
         wiring = SignalTopics(signals, parameters.states, parameters.inputs, PLANT_KINDS)
         # the subscriptions first: a controller that hears the measurement has then seen them, too
-        self._matching = matching = topics.EndpointMonitor(
+        self._endpoints = endpoints = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), {
                 place.topic: f'command the {base_name(name, signals.inputs[name])}'
                 for name, place in wiring.commands.items()} | {
                 place.topic: f'publish the {name}' for name, place in wiring.measured.items()})
-        self._command_inlet = SignalSubscriber(
-            self, matching.subscribe, wiring.commands, signals.inputs, self._on_command)
-        self._clock_publisher = matching.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
+        self._command_subscriber = SignalSubscriber(
+            self, endpoints.subscribe, wiring.commands, signals.inputs, self._on_command)
+        self._clock_publisher = endpoints.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
             parameters.publish_clock and not self._real_time) else None
         # the states last: who has found them has found the inputs, too
         self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
-        self._states = SignalPublisher(wiring.measured, signals.states, matching.publish)
+        self._states = SignalPublisher(wiring.measured, signals.states, endpoints.publish)
         counted = {wiring.measured[name].topic
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
         self._counted = [publisher for publisher in self._states.publishers
@@ -119,7 +119,7 @@ class PlantNode(ManagedNode):
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def activate(self) -> None:
-        """Let time go on from where it stood."""
+        """Resume the plant's time."""
         self._commanded = dict.fromkeys(self._signals.inputs, time.monotonic())
         if not self._sample:
             return
@@ -136,10 +136,10 @@ class PlantNode(ManagedNode):
             self._wall_start = time.monotonic() - passed / self._settings.speed
 
     def _latched(self, topic: str, kind: Any) -> Any:
-        return self._matching.publish(topic, kind, topics.LATCHED_QOS)
+        return self._endpoints.publish(topic, kind, topics.LATCHED_QOS)
 
     def _now_ns(self) -> int:
-        """Return the plant time that the wall clock stands for."""
+        """Return the plant time at the present wall time."""
         elapsed = time.monotonic() - self._wall_start
         return self._start_ns + round(elapsed * self._settings.speed * NANOSECONDS)
 
@@ -163,14 +163,14 @@ class PlantNode(ManagedNode):
         self._measure()
 
     def _on_poll(self) -> None:
-        """Start lock-step when the loop is complete, and watch for a command that is missing."""
+        """Start lock-step once the loop is complete, and watch for a missing command."""
         if not self.active:
             return
         if self._phase is RunPhase.WAITING:
             listeners = min(publisher.get_subscription_count() for publisher in self._counted)
             if listeners >= self._settings.lockstep_subscribers and all(
-                    self.count_publishers(heard.topic_name) > 0
-                    for heard in self._command_inlet.subscriptions):
+                    self.count_publishers(subscription.topic_name) > 0
+                    for subscription in self._command_subscriber.subscriptions):
                 self._phase = RunPhase.RUNNING
                 self._measure()
             return
@@ -206,13 +206,13 @@ class PlantNode(ManagedNode):
         elif self._advance(instant):
             sample, self._sample = self._sample, self._sample + 1
             self._answered = False
-            self._heard = {}
+            self._received = {}
             self._wall_published = time.monotonic()
             self._publish(sample)
         self._diagnostics.publish_if_changed()
 
     def _publish(self, sample: int) -> None:
-        """Publish the plant as it stands, the states, which are answered, last."""
+        """Publish inputs, then states, to which the controller responds."""
         stamp, frame_id = stamp_message(self._plant.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
@@ -221,7 +221,7 @@ class PlantNode(ManagedNode):
         self._states.send(measured, stamp, frame_id, variance, resolution)
 
     def _advance(self, time_ns: int) -> bool:
-        """Bring the process to an instant; a plant that ran away stops."""
+        """Simulate up to an instant; stop a plant that diverges."""
         try:
             self._plant.advance(time_ns)
         except plants.IntegrationError as error:
@@ -231,37 +231,38 @@ class PlantNode(ManagedNode):
             return False
         return True
 
-    def _on_command(self, heard: SignalSample) -> None:
+    def _on_command(self, received: SignalSample) -> None:
         if not self.active:
             return
         lockstep = self._settings.lockstep
-        if lockstep and heard.stamped and heard.stamp_ns != self._plant.time_ns:
+        if lockstep and received.stamped and received.stamp_ns != self._plant.time_ns:
             # it answers no measurement that is open: late, or from somebody else
             self._foreign += 1
             return
-        self._heard |= heard.values
-        if lockstep and len(self._heard) < len(self._signals.inputs):
+        self._received |= received.values
+        if lockstep and len(self._received) < len(self._signals.inputs):
             return
-        wrong = [name for name, value in self._heard.items() if not math.isfinite(value)]
+        wrong = [name for name, value in self._received.items() if not math.isfinite(value)]
         if not wrong:
             self._commands += 1
-            self._commanded |= dict.fromkeys(self._heard, time.monotonic())
+            self._commanded |= dict.fromkeys(self._received, time.monotonic())
             self._rejection = ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
                 followed = dict(zip(self._signals.inputs, self._plant.commanded.tolist(),
                                     strict=True))
-                self._plant.command(np.array(list((followed | self._heard).values())))
+                self._plant.command(np.array(list((followed | self._received).values())))
         else:
             self._rejected += 1
             unit = self._signals.inputs[wrong[0]]
             self._rejection = (
-                f'{base_name(wrong[0], unit)} command {shown(self._heard[wrong[0]], unit)} '
-                f'{display_unit(unit)} is not finite and was rejected: the last good one is held')
+                f'{base_name(wrong[0], unit)} command '
+                f'{quantity_text(self._received[wrong[0]], unit)} is not finite and was rejected: '
+                'the last good one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
         if not lockstep:
-            self._heard = {}
+            self._received = {}
         elif self._phase is RunPhase.RUNNING and not self._answered:
             self._answered, self._waiting_in_vain = True, False
             self._continue_lockstep()
@@ -275,7 +276,6 @@ class PlantNode(ManagedNode):
         return self._advance(min(now, ahead))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Put the plant back to its initial state; time goes on."""
         if self._phase in (RunPhase.FINISHED, RunPhase.OUT_OF_STAMPS):
             response.message = ('the duration is over: start the plant again'
                                 if self._phase is RunPhase.FINISHED else self._phase.value)
@@ -293,7 +293,7 @@ class PlantNode(ManagedNode):
         return response
 
     def _resynchronise(self) -> None:
-        """Resume after a stop: time has stood still for the plant."""
+        """Resume after a stop, during which the plant's time stood still."""
         if self._settings.lockstep:
             self._answered = True
             self._continue_lockstep()
@@ -318,7 +318,7 @@ class PlantNode(ManagedNode):
             level = Severity.ERROR
         elif self._rejection:
             level, message = Severity.WARN, self._rejection
-        elif complaint := self._matching.complaint:
+        elif complaint := self._endpoints.complaint:
             level, message = Severity.WARN, complaint
         elif self._phase is RunPhase.WAITING:
             level = Severity.WARN
@@ -329,9 +329,9 @@ class PlantNode(ManagedNode):
         return TaskReport(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
             **self._plant.figures(),
-            **{f'{base_name(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
-               for (name, unit), value in zip(self._signals.inputs.items(),
-                                              self._plant.commanded.tolist(), strict=True)},
+            **values_by_name({base_name(name, unit): unit
+                              for name, unit in self._signals.inputs.items()},
+                             self._plant.commanded.tolist(), '{} command'),
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,
@@ -340,7 +340,7 @@ class PlantNode(ManagedNode):
         })
 
     def _unanswered(self) -> bool:
-        """Tell whether no command arrives of an input, be it from the start or for some time."""
+        """Return whether commands of an input are missing."""
         if self._phase is not RunPhase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
         period = self._settings.sample_period / (self._settings.speed or math.inf)

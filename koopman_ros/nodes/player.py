@@ -111,7 +111,7 @@ class PlayerNode(LoopNode):
                           'fewer topics')
 
     def _begin(self) -> None:
-        """Start when everybody who shall hear is there."""
+        """Start once all subscribers are there."""
         wanted = self._settings.wait_for_subscribers
         missing = [publisher.topic_name for publisher in self._outlets.values()
                    if publisher.get_subscription_count() < wanted]
@@ -130,7 +130,7 @@ class PlayerNode(LoopNode):
                 'wait_for_subscribers to 0')
 
     def _play_in_time(self) -> None:
-        """Publish what is due, and sleep until the next message is."""
+        """Publish the messages that are due, and wait for the next."""
         while self._next is not None and self._due <= time.monotonic():
             message = self._next
             self._publish(message)
@@ -148,7 +148,7 @@ class PlayerNode(LoopNode):
         self._say_progress()
 
     def _play_in_lockstep(self) -> None:
-        """Publish up to the next measurement, whose answer continues it."""
+        """Publish up to the next measurement; its command continues the play-back."""
         for _ in range(_BURST):
             if self._next is None:
                 self._finish()
@@ -175,7 +175,7 @@ class PlayerNode(LoopNode):
         self._say_progress()
 
     def _whole(self, message: records.BagMessage) -> bool:
-        """Tell whether a part of a measurement is its last one."""
+        """Return whether a message completes a measurement."""
         stamp_ns = _stamp_ns(message) or 0
         if stamp_ns != self._parts[0]:
             self._parts = (stamp_ns, set())
@@ -216,7 +216,7 @@ class PlayerNode(LoopNode):
 
 
 def _stamp_ns(message: records.BagMessage) -> int | None:
-    """Return the stamp of a message, None for one that has none or an unset one."""
+    """Return the stamp of a message; None if it has none or is unset."""
     try:
         return stamp_nanoseconds(message.message.header.stamp) or None
     except (AttributeError, TypeError):

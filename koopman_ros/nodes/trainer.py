@@ -40,7 +40,7 @@ class TrainerNode(ManagedNode):
         self.declare_table(table)
 
     def configure(self) -> None:
-        """Make what records, experiments and trains; nothing of it begins yet."""
+        """Create recording, experiments and training; none of them starts yet."""
         table, present = self._table, self._present
         self._settings = settings = self.current(table)
         if reason := topics.unusable(self, settings.topics):
@@ -51,7 +51,7 @@ class TrainerNode(ManagedNode):
             present.provenance.plant or settings.system)
         wiring = SignalTopics(signals, settings.states, settings.inputs)
         for kind in wiring.kinds:
-            # what is in none of its messages is refused now, and not when a bag holds nothing
+            # a field that its message type lacks is refused now, not when a bag holds nothing
             list(by_topic(getattr(wiring, kind)))
         self._recording = Recording(self, settings, wiring)
         self._experiment = PlantExperiment(self, settings, wiring, self._commanded)
@@ -61,7 +61,7 @@ class TrainerNode(ManagedNode):
                           lambda changed, _: topics.unusable(self, changed.topics))
 
     def activate(self) -> None:
-        """Begin with what is asked for."""
+        """Start the task of the parameters."""
         settings = self._settings
         assert self._training and self._recording
         try:
@@ -73,7 +73,7 @@ class TrainerNode(ManagedNode):
             raise ConfigurationError(f'cannot {settings.task}: {error}') from error
 
     def deactivate(self) -> None:
-        """End what is under way, as at the end of the process."""
+        """End recording, experiment and training, as at the end of the process."""
         self.complete()
 
     def complete(self) -> None:

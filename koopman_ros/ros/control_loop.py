@@ -96,7 +96,7 @@ class ControlLoop:
         return None
 
     def hold_between_sources(self, stamp_ns: int) -> Commanded | None:
-        """Hold the command: it is not known which of two sources measures the plant."""
+        """Hold the command while two sources publish the measurement."""
         with self.lock:
             commanded = self._command(self.timing.silence, StatusCode.TWO_SOURCES, stamp_ns)
             if commanded is None and self.state.command is not None:
@@ -105,7 +105,7 @@ class ControlLoop:
 
     def watch(self, silence: float, acting: bool = False) -> Commanded | None:
         """
-        Command what is due without a measurement; return what was.
+        Send a command that is due without a measurement, and return it.
 
         :param acting: whether the law may be computed for a request of the operator.
         """
@@ -130,7 +130,7 @@ class ControlLoop:
         return outcome
 
     def exchange(self, controller: Controller, record: Callable[[], None]) -> None:
-        """Put another controller in force, and publish a record of that."""
+        """Switch to another controller, and publish a record of the switch."""
         with self.lock:
             predecessor, self.controller = self.controller, controller
             self.state = controller.switch_to(predecessor, self.state)
@@ -167,14 +167,14 @@ class ControlLoop:
         return Commanded(outcome.report, stamp_ns)
 
     def _manual_waits(self, silence: float) -> bool:
-        """Tell whether a manual command is not reached, and no measurement came lately."""
+        """Return whether a manual command is not reached and no measurement came lately."""
         state, wanted = self.state, self.state.manual_input
         return (state.mode is Mode.MANUAL and wanted is not None and state.command is not None
                 and silence * NANOSECONDS > _WATCH_STEP and not np.array_equal(
                     self.controller.tuning.limits.within(wanted), state.command))
 
     def _setpoint_waits(self, silence: float) -> bool:
-        """Tell whether a set-point is not reached, and a measurement is overdue."""
+        """Return whether a set-point is not reached and a measurement is overdue."""
         state, setpoint = self.state, self.state.setpoint
         interval = 0.0 if math.isinf(state.interval) else state.interval
         if (state.mode is not Mode.AUTOMATIC or state.time_ns is None

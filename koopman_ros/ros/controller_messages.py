@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of the controller beside its commands: internals, plans, active limits, records."""
+"""Messages of the controller: internals, plans, active constraints, event log."""
 
-from collections.abc import Callable, Collection, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
 import itertools
 import math
 import secrets
@@ -21,7 +20,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from koopman_ros.control import events, StepReport
 from koopman_ros.control.laws.base import Plan
 from koopman_ros.core.arrays import along_last, Array
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import display_unit, NANOSECONDS, shown, values_by_name
 from koopman_ros.event_log.records import EventRecord, fields_of, SNAPSHOT, START
 from koopman_ros.parameters.signal_topics import Signals, SignalTopics
 from koopman_ros.ros import topics
@@ -31,30 +30,25 @@ _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _AGAIN = 1.0  # s, within which two nodes know each other
 
 
-def labelled(names: Collection[str], text: str) -> list[str]:
-    """Return a label for each of some signals, which are named where there are several."""
-    return [text] if len(names) == 1 else [f'{name} {text}' for name in names]
+def labelled(signals: Mapping[str, str], quantity: str, values: Array | None,
+             note: str = '', difference: bool = False) -> dict[str, float]:
+    """
+    Return values under labels like ``set-point [degC]``, led by the signal if there are several.
 
-
-def by_label(signals: Mapping[str, str], text: str, values: Array | None,
-             difference: bool = False) -> dict[str, float]:
-    """Return values by label with the unit of each; `{}` in the text stands for that."""
+    :param signals: unit of each signal, by name.
+    :param values: (n,) in these units; None stands for NaN.
+    :param note: text after the unit.
+    :param difference: whether the values are differences, which stay in K.
+    """
+    prefixes = [''] if len(signals) == 1 else [f'{name} ' for name in signals]
     numbers = [math.nan] * len(signals) if values is None else values.tolist()
-    labels = _labels(tuple(signals.items()), text, difference)
-    if difference:
-        return dict(zip(labels, numbers, strict=True))
-    return {label: shown(value, unit) for label, unit, value in zip(
-        labels, signals.values(), numbers, strict=True)}
-
-
-@lru_cache(maxsize=256)
-def _labels(signals: tuple[tuple[str, str], ...], text: str, difference: bool) -> tuple[str, ...]:
-    return tuple(label.replace('{}', unit if difference else display_unit(unit))
-                 for label, (_, unit) in zip(labelled(dict(signals), text), signals, strict=True))
+    return {f'{prefix}{quantity} [{unit if difference else display_unit(unit)}{note}]':
+            number if difference else shown(number, unit)
+            for prefix, unit, number in zip(prefixes, signals.values(), numbers, strict=True)}
 
 
 def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> JointState:
-    """Return what a person would plot beside the signals, under names with units."""
+    """Return internal values of the controller for plots, under names with units."""
     law, estimate = report.command.law, report.estimate
     inputs, target = signals.inputs, report.target
     transfer = np.zeros(len(inputs)) if report.command.transfer is None else (
@@ -63,19 +57,17 @@ def internals(signals: Signals, report: StepReport, stamp: Time, frame_id: str) 
     covariance = None if estimate is None else estimate.covariance
     innovation = None if estimate is None else estimate.innovation
     values = {
-        **by_label(inputs, 'disturbance [{}]',
-                   None if estimate is None else estimate.disturbance, True),
-        **{f'estimated_{name} [{display_unit(unit)}]': value for (name, unit), value in zip(
-            states.items(),
-            by_label(states, '{}', None if estimate is None else estimate.state).values(),
-            strict=True)},
+        **labelled(inputs, 'disturbance', None if estimate is None else estimate.disturbance,
+                   difference=True),
+        **values_by_name(states, [math.nan] * len(states) if estimate is None
+                         else estimate.state.tolist(), 'estimated_{}'),
         'distance_outside [half-ranges]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),
         'riccati_residual': float(law.residual),
         'growth_per_sample': float(law.growth),
-        **by_label(inputs, 'transfer [{}]', transfer, True),
-        **by_label({name: signals.states[name] for name in signals.controlled}, 'setpoint [{}]',
+        **labelled(inputs, 'transfer', transfer, difference=True),
+        **labelled({name: signals.states[name] for name in signals.controlled}, 'setpoint',
                    None if target is None else target.setpoint),
         # of a filter alone; at the end, so that the places of the others stay
         **({} if covariance is None else _spread(states, covariance)),
@@ -138,25 +130,25 @@ def active_constraints(signals: Signals, plan: Plan, stamp: Time, frame_id: str)
 class ReportPublisher:
     """Publish the report of a step: tracked set-points, prediction, internals and plan."""
 
-    def __init__(self, matching: topics.EndpointMonitor, wiring: SignalTopics) -> None:
+    def __init__(self, endpoints: topics.EndpointMonitor, wiring: SignalTopics) -> None:
         states = wiring.signals.states
         self._setpoints = SignalPublisher(
             wiring.active_setpoints, states,
-            lambda topic, kind: matching.publish(topic, kind, topics.LATCHED_QOS))
-        self._predicted = SignalPublisher(wiring.predicted, states, matching.publish)
-        self._internals = matching.publish(topics.CONTROLLER_INTERNALS)
-        self._plan = matching.publish(topics.PREDICTED_TRAJECTORY)
-        self._active_limits = matching.publish(topics.ACTIVE_CONSTRAINTS)
+            lambda topic, kind: endpoints.publish(topic, kind, topics.LATCHED_QOS))
+        self._predicted = SignalPublisher(wiring.predicted, states, endpoints.publish)
+        self._internals = endpoints.publish(topics.CONTROLLER_INTERNALS)
+        self._plan = endpoints.publish(topics.PREDICTED_TRAJECTORY)
+        self._active_limits = endpoints.publish(topics.ACTIVE_CONSTRAINTS)
         self._published: Array | None = None  # (n_c,) set-points
 
     def publish(self, signals: Signals, report: StepReport, stamp: Time, frame_id: str) -> None:
-        """Publish a report; the set-points where they are others."""
+        """Publish a report; the set-points only if they have changed."""
         target, predicted, plan = report.target, report.measurement.predicted, report.command.plan
         if target is not None and (self._published is None
                                    or (target.setpoint != self._published).any()):
             self._published = target.setpoint
             self._setpoints.send(target.setpoint, stamp, frame_id)
-        if predicted is not None and self._predicted.heard():
+        if predicted is not None and self._predicted.has_subscribers():
             self._predicted.send(predicted, stamp, frame_id)
         if topics.has_subscribers(self._internals):
             self._internals.publish(internals(signals, report, stamp, frame_id))
@@ -175,12 +167,12 @@ class RecordPublisher:
     may know this publisher later than this one knows it, and miss what was published meanwhile.
     """
 
-    def __init__(self, matching: topics.EndpointMonitor, snapshot: Callable[[], Mapping[str, Any]],
-                 lock: threading.Lock) -> None:
+    def __init__(self, endpoints: topics.EndpointMonitor,
+                 snapshot: Callable[[], Mapping[str, Any]], lock: threading.Lock) -> None:
         self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
         self._started = False
-        self._publisher = matching.publish(topics.EVENT_LOG, matched=self._on_matched)
+        self._publisher = endpoints.publish(topics.EVENT_LOG, matched=self._on_matched)
 
     def start(self) -> None:
         """Publish the state from which the controller begins to act."""
@@ -194,7 +186,7 @@ class RecordPublisher:
                 self._due = time.monotonic() + _AGAIN
 
     def watch(self) -> None:
-        """Publish the state to whoever listens, where that is due."""
+        """Publish a snapshot if one is due and there is a subscriber."""
         if time.monotonic() > self._due and topics.has_subscribers(self._publisher):
             self.publish_snapshot()
 
@@ -204,7 +196,7 @@ class RecordPublisher:
         self._due = time.monotonic() + _SNAPSHOT_PERIOD
 
     def publish_event(self, event: events.Event, outcome: events.EventOutcome) -> None:
-        """Publish an event and what it led to."""
+        """Publish an event with its outcome."""
         if topics.has_subscribers(self._publisher):
             self.publish(*fields_of(event, outcome))
         elif self._started:
@@ -219,7 +211,7 @@ class RecordPublisher:
         if not self._started:
             return
         number, self._number = self._number, self._number + 1
-        # who comes later begins at a snapshot
+        # a later subscriber begins at a snapshot
         if topics.has_subscribers(self._publisher):
             self._publisher.publish(String(data=EventRecord(self._run, number, event,
                                                             fields).text()))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Status of the controller: that of the control level, and one for each kind of warning."""
+"""Status of the controller: one of its control level, and one for each kind of warning."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words, StatusCode
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import Advance
-from koopman_ros.core.units import display_unit, shown
+from koopman_ros.core.units import display_unit, quantity_text, shown, values_by_name
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.signal_topics import Signals, words_of
-from koopman_ros.ros.controller_messages import by_label
+from koopman_ros.ros.controller_messages import labelled
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.timing import PAUSED, Timing
 
@@ -38,7 +38,7 @@ _INACTIVE = 'inactive'
 
 @dataclass
 class Counts:
-    """How many measurements came, late, not at all or refused, and how many plans did not."""
+    """Counts of measurements (all, late, missed, refused) and of failed plans."""
 
     measurements: int = 0
     late: int = 0
@@ -61,7 +61,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class StatusContext:
-    """What the statuses are made of."""
+    """Inputs of :func:`statuses`."""
 
     controller: Controller
     parameters: ControllerParameters
@@ -72,7 +72,7 @@ class StatusContext:
     timing: Timing
     assembler: SampleSynchronizer  #: of the measurements
     measured: Array  #: (n_y,) last measured, in the units of the signals
-    complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
+    complaint: str  #: problem on the graph, e.g. a second controller; or empty
     unheard: Sequence[str]  #: topics of the commands without a subscriber
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
@@ -82,12 +82,12 @@ class StatusContext:
 
     @property
     def reason(self) -> str:
-        """Why the level acts, in words, or empty."""
+        """Reason of the present level, or empty."""
         return words_of(self.signals)(self.report.reason)
 
     @property
     def input(self) -> str:
-        """What an operator calls the inputs."""
+        """Names of the inputs for an operator."""
         return ' and '.join(base_name(name, unit) for name, unit in self.signals.inputs.items())
 
     @property
@@ -98,7 +98,7 @@ class StatusContext:
     def commanded(self, command: Array) -> str:
         """Write a command (n_u,) with names and units."""
         return ', '.join(
-            f'{base_name(name, unit)} at {shown(value, unit):.2f} {display_unit(unit)}'
+            f'{base_name(name, unit)} at {quantity_text(value, unit, ".2f")}'
             for (name, unit), value in zip(self.signals.inputs.items(), command.tolist(),
                                            strict=True))
 
@@ -144,7 +144,7 @@ def _in_order(now: StatusContext) -> str:
 
 
 def _control(now: StatusContext) -> tuple[Severity, str]:
-    """Return what keeps the best law from acting, or an empty sentence."""
+    """Return why the preferred law does not act, or an empty message."""
     report, mode = now.report, now.state.mode
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
@@ -185,8 +185,8 @@ def _action(now: StatusContext) -> str:
 
 
 def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
-    """Yield every warning with the name of its condition, the most urgent first."""
-    report, states, tuning = now.report, now.controller.model.states, now.controller.tuning
+    """Yield each warning with its condition, the most urgent first."""
+    report, states = now.report, now.controller.model.states
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         yield CONNECTIONS, now.complaint
@@ -249,7 +249,7 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
 
 
 def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
-    """Say that the inputs do not suffice for the set-point as things are, or return ''."""
+    """Return why the set-point is out of reach of the inputs, or ''."""
     if target.state is None or target.input is None:
         return ''
     states, limits = now.controller.model.states, now.controller.tuning.limits
@@ -259,17 +259,16 @@ def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
         place, unit = states.names.index(name), now.signals.states[name]
         found, width = float(target.state[place]), 2.0 * states.half_widths[place]
         if abs(found - wanted) > _REACHED * width * states.scale[place]:
-            return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
-                    f'cannot be held within the range of the {now.input}: '
-                    f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
+            return (f'the set-point {quantity_text(wanted, unit)} of {name} cannot be held within '
+                    f'the range of the {now.input}: {quantity_text(found, unit)} is the nearest')
     for (name, unit), wanted, low, high in zip(
             now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
             limits.upper.tolist(), strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
             return (f'the set-point would need the {base_name(name, unit)} at '
-                    f'{shown(wanted, unit):.6g} {display_unit(unit)}, its range is '
-                    f'{shown(low, unit):.6g} to {shown(high, unit):.6g}: it is not reached')
+                    f'{quantity_text(wanted, unit)}, its range is {shown(low, unit):.6g} to '
+                    f'{shown(high, unit):.6g}: it is not reached')
     return ''
 
 
@@ -287,7 +286,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
     # a bias of what is not measured is no sensor's
     bias = None if estimate is None or signals.estimated else (
         now.controller.equivalent_bias(state))
-    unit = {name: signals.states[name] for name in signals.controlled}
+    controlled = {name: signals.states[name] for name in signals.controlled}
     return {
         'condition': condition,
         'mode': state.mode.value,
@@ -295,15 +294,13 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'law': law.form or 'none',
         'reason': now.reason or 'none',
         **now.model(),
-        **{f'{name} [{display_unit(own)}]': shown(value, own) for (name, own), value in zip(
-            signals.states.items(), now.measured.tolist(), strict=True)},
-        **by_label(unit, 'set-point [{}]', None if target is None else target.setpoint),
-        **{f'{name} [{display_unit(own)}]': value for (name, own), value in zip(
-            inputs.items(), by_label(inputs, '{}', state.command).values(), strict=True)},
-        **by_label(inputs, f'disturbance [{{}} of {now.input}]' if len(inputs) == 1
-                   else 'disturbance [{}]', None if estimate is None else estimate.disturbance,
-                   True),
-        **by_label(signals.states, 'equivalent sensor bias [{}]', bias, True),
+        **values_by_name(signals.states, now.measured.tolist()),
+        **labelled(controlled, 'set-point', None if target is None else target.setpoint),
+        **values_by_name(inputs, [math.nan] * len(inputs) if state.command is None
+                         else state.command.tolist()),
+        **labelled(inputs, 'disturbance', None if estimate is None else estimate.disturbance,
+                   f' of {now.input}' if len(inputs) == 1 else '', difference=True),
+        **labelled(signals.states, 'equivalent sensor bias', bias, difference=True),
         **_estimated(now),
         'distance outside training box [half-ranges]': float(report.measurement.outside),
         'set-point outside training box [half-ranges]': (
@@ -312,7 +309,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'Riccati residual': float(law.residual),
         'gain norm': float(law.gain),
         'predicted growth per sample': float(law.growth),
-        **by_label(inputs, 'transfer [{}]', transfer, True),
+        **labelled(inputs, 'transfer', transfer, difference=True),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,
@@ -331,7 +328,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
 
 
 def _estimated(now: StatusContext) -> dict[str, object]:
-    """Return what is estimated of states that are not measured, and how well it fits."""
+    """Return the estimates of unmeasured states, and their consistency with the noise."""
     estimate, states = now.report.estimate, now.controller.model.states
     found: dict[str, object] = {}
     if estimate is None or estimate.deviation is None:

@@ -124,10 +124,6 @@ class DiagnosticTask:
             (name, status) for name, status in self.collect().items()
             if last.get(name) != self._last[name]])
 
-    def destroy(self) -> None:
-        """Report no more."""
-        self._diagnostics.tasks.remove(self)
-
 
 def _failed(error: Exception) -> TaskReport:
     return TaskReport(Severity.ERROR, f'the status cannot be collected ({contained(error)})')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Identification experiments of the trainer: its service, and a sentence for each end."""
+"""Service and status of the trainer's identification experiments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.experiment_run import ExperimentRun, other_publishers, stepped
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import NodeEntities
 from koopman_ros.ros.signals import SignalSample, SignalSubscriber
 
 
@@ -41,35 +40,26 @@ class PlantExperiment:
         self._run: ExperimentRun | None = None
         self._outcome = TaskReport(Severity.OK, 'no experiment')
         self._diagnostics = node.diagnostics.add('experiment', self._status)
-        # a group of its own: the service waits for the first measurement
-        self._owned = NodeEntities(node)
         self._commanded = {} if commanded is None else commanded
         # best effort fits every publisher
-        SignalSubscriber(node, lambda topic, callback,
-                         kind: self._owned.keep(node.create_subscription(
-            kind, topic, callback, topics.profile(1, reliable=False))),
-            wiring.commands, wiring.signals.inputs, self._on_command)
-        self._owned.keep(node.create_service(
-            SetBool, '~/experiment', self._on_service,
-            callback_group=MutuallyExclusiveCallbackGroup()))
+        qos = topics.profile(1, reliable=False)
+        SignalSubscriber(node, lambda topic, callback, kind: node.create_subscription(
+            kind, topic, callback, qos), wiring.commands, wiring.signals.inputs, self._on_command)
+        # a group of its own: the service waits for the first measurement
+        node.create_service(SetBool, '~/experiment', self._on_service,
+                            callback_group=MutuallyExclusiveCallbackGroup())
 
     def complete(self) -> None:
-        """Bring the inputs back as far as the rate limit allows in 2 s, and let go."""
+        """Return the inputs as far as the rate limit allows in 2 s, then stop commanding."""
         run = self._run
         if run is not None:
             run.stop(ExperimentPhase.ENDED)
-            run.farewell()
-            self._let_go(self._verdict(run))
+            run.return_before_exit()
+            self._release(self._verdict(run))
 
-    def _on_command(self, heard: SignalSample) -> None:
-        self._commanded |= {name: value for name, value in heard.values.items()
+    def _on_command(self, received: SignalSample) -> None:
+        self._commanded |= {name: value for name, value in received.values.items()
                             if math.isfinite(value)}
-
-    def destroy(self) -> None:
-        """Take the service down, and a run with it: the inputs are left where they are."""
-        self._let_go(self._outcome)
-        self._owned.destroy()
-        self._diagnostics.destroy()
 
     async def _on_service(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
@@ -87,13 +77,13 @@ class PlantExperiment:
             response.message = f'refused: {reason}' if reason else (
                 f'running on {self._run.topics if self._run else ""}')
             if reason:
-                self._let_go(TaskReport(Severity.WARN, response.message))
-        self._say(response.message)
+                self._release(TaskReport(Severity.WARN, response.message))
+        self._report(response.message)
         return response
 
     def _start(self) -> str:
-        """Take the plant in hand, or return why not."""
-        self._let_go(self._outcome)
+        """Start a run; return the reason if it cannot start."""
+        self._release(self._outcome)
         resolve = self._node.resolve_topic_name
         for place in stepped(self.settings, self._wiring).values():
             topic = resolve(place.topic)
@@ -115,28 +105,28 @@ class PlantExperiment:
         return ''
 
     def _stop(self) -> tuple[bool, str]:
-        """End the steps, or let go of the plant when they are over."""
+        """End the steps, or stop commanding if the steps have ended."""
         if self._run is None:
             return False, 'no experiment is running'
         if self._run.running:
             self._run.stop(ExperimentPhase.ENDED)
-            return True, f'ended: {self._run.going_home}; call again to let go'
-        self._let_go(self._verdict(self._run))
+            return True, f'ended: {self._run.return_text}; call again to let go'
+        self._release(self._verdict(self._run))
         return True, 'the trainer does not command any more'
 
     def _on_end(self, why: Reason | None) -> None:
-        """Say that the steps are over, or stop commanding at once for a reason."""
+        """Report the end of the steps, or stop commanding at once for a reason."""
         run = self._run
         assert run is not None
         if why is None:
-            self._say(self._verdict(run).message)
+            self._report(self._verdict(run).message)
             return
         # an experiment that was over is over as it was
         run.stop(ExperimentPhase.ABORTED, why)
-        self._let_go(self._verdict(run))
-        self._say(f'the trainer does not command any more: {self._words(why)}')
+        self._release(self._verdict(run))
+        self._report(f'the trainer does not command any more: {self._words(why)}')
 
-    def _let_go(self, outcome: TaskReport) -> None:
+    def _release(self, outcome: TaskReport) -> None:
         run, self._run = self._run, None
         self._outcome = outcome
         if run is not None:
@@ -144,7 +134,7 @@ class PlantExperiment:
             if not run.started.done():
                 run.started.set_result(reason(StatusCode.ENDED_EARLY))
 
-    def _say(self, sentence: str) -> None:
+    def _report(self, sentence: str) -> None:
         # two lines, because rclpy allows one severity a line
         if self._status().level is Severity.OK:
             self._node.get_logger().info(f'experiment: {sentence}')
@@ -166,7 +156,7 @@ class PlantExperiment:
         verdict = self._verdict(run)
         if run.progress is None:
             return verdict
-        held = '' if run.running else f'; {run.going_home}'
+        held = '' if run.running else f'; {run.return_text}'
         left = max(0.0, run.plan.duration - run.progress.elapsed) if run.running else 0.0
         return TaskReport(verdict.level, verdict.message + held, {
             'topic': run.topics,

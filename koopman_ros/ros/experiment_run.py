@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A run of an identification experiment: from its first measurement until it lets go."""
+"""A run of an identification experiment, from its first measurement to its last command."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -33,22 +33,22 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name, MessageField
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.synchronizer import SampleSynchronizer
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import NANOSECONDS, quantity_text, values_by_name
 from koopman_ros.event_log import records
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.ros import topics
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import NodeEntities
 from koopman_ros.ros.signals import MeasuredInputs, SignalPublisher, SignalSample, SignalSubscriber
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _TICK = 0.1  # s
 _DEVIATIONS = 10  # commands of a controller, and
 _DEVIATION_TIME = 1.0  # s, after which it is said not to follow
-_PATIENCE = 0.5  # s that the first measurement waits for the present inputs
-_FAREWELL = 2.0  # s for the way back at the end of the process
-_ACKNOWLEDGED = 0.2  # s for the last command to arrive
+_INPUT_WAIT = 0.5  # s that the first measurement waits for the present inputs
+_RETURN_TIME = 2.0  # s for the way back at the end of the process
+_ACKNOWLEDGE_TIME = 0.2  # s for the last command to arrive
 
 
 def stepped(settings: TrainerParameters, wiring: SignalTopics) -> dict[str, MessageField]:
@@ -86,18 +86,17 @@ class ExperimentRun:
         # why it cannot start, or None with the first measurement
         self.started = Future()
         self._node = node
-        self._patience, self._on_end = settings.experiment_timeout, on_end
+        self._timeout, self._on_end = settings.experiment_timeout, on_end
         self._commanded = commanded
         self._applied = MeasuredInputs(self._units)
         # the first measurement, while the present inputs are not known, and when it came
         self._first: tuple[int, Array, str] | None = None
         self._first_at = math.inf
-        self._frame_id, self._heard_at = '', time.monotonic()
+        self._frame_id, self._received_at = '', time.monotonic()
         self._sent: Array | None = None
         self._monitors = [TrackingMonitor(span)
                           for span in (self.plan.upper - self.plan.lower).tolist()]
-        self._owned = owned = NodeEntities(node)
-        self.destroy = owned.destroy  #: commands no more
+        self._subscriptions: list[Subscription] = []
         self._assembler = SampleSynchronizer(
             tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
         self._measured = SignalSubscriber(
@@ -109,32 +108,39 @@ class ExperimentRun:
             node, self._subscribe, wiring.applied, signals.inputs, self._on_applied)
         if self._on_setpoints:
             SignalSubscriber(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
-                             signals.states, lambda heard: self._tracked.update(heard.values))
+                             signals.states,
+                             lambda received: self._tracked.update(received.values))
             self._subscribe(topics.EVENT_LOG, self._on_record, String)
-        self._outlet = SignalPublisher(places, self._units, lambda topic, kind: owned.keep(
+        self._publisher = SignalPublisher(places, self._units, lambda topic, kind: (
             node.create_publisher(kind, topic, topics.LOOP_QOS)))
-        owned.timer(_TICK, self._on_tick)
+        self._timer = wall_timer(node, _TICK, self._on_tick)
+
+    def destroy(self) -> None:
+        """Command no more."""
+        self._node.destroy_timer(self._timer)
+        for publisher in self._publisher.publishers:
+            self._node.destroy_publisher(publisher)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
 
     def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
                    latched: bool = False) -> Subscription:
         # a sensor driver may publish best effort
-        offers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
-        reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
-                       for info in offers)
-        latched = latched or (bool(offers) and all(
-            info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for info in offers))
-        return self._owned.keep(self._node.create_subscription(
-            kind, topic, callback, topics.profile(
-                topics.LOOP_QOS.depth, reliable=reliable, latched=latched)))
+        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        qos = topics.matching_profile(topics.LOOP_QOS, publishers, topics.LOOP_QOS.depth)
+        if latched:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        self._subscriptions.append(self._node.create_subscription(kind, topic, callback, qos))
+        return self._subscriptions[-1]
 
     @property
     def topics(self) -> str:
-        """Where it publishes."""
+        """Topics of the stepped signals."""
         return ', '.join(dict.fromkeys(self._topics))
 
     @property
     def running(self) -> bool:
-        """Whether it waits for its first measurement, or steps."""
+        """Whether the run waits for its first measurement, or steps."""
         return self.progress is None or self.progress.phase is ExperimentPhase.RUNNING
 
     @property
@@ -143,20 +149,20 @@ class ExperimentRun:
             not self._automatic or len(self._tracked) < len(self._units))
 
     @property
-    def going_home(self) -> str:
-        """Say where the signals go when the steps are over."""
-        return f'{self._listed("to", self.plan.home)}, held there'
+    def return_text(self) -> str:
+        """Values to which the signals return after the steps."""
+        return f'{self._values_text("to", self.plan.home)}, held there'
 
-    def _listed(self, preposition: str, values: Array) -> str:
+    def _values_text(self, preposition: str, values: Array) -> str:
         """Write values (m,) with their names and units."""
         return ', '.join(
-            f'{self._called(name)} {preposition} {shown(value, unit):.6g} {display_unit(unit)}'
+            f'{self._label(name)} {preposition} {quantity_text(value, unit)}'
             for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True))
 
     @property
     def _inputs_missing(self) -> bool:
-        """Whether the present inputs are likely to be known in a moment."""
-        if self._inputs is None or time.monotonic() - self._first_at > _PATIENCE:
+        """Whether to wait for messages with the present inputs."""
+        if self._inputs is None or time.monotonic() - self._first_at > _INPUT_WAIT:
             return False
         # a controller answers the first measurement, too
         return (self._answers is not None and not self._commanded) or (
@@ -170,7 +176,7 @@ class ExperimentRun:
         command, an older measurement, or the safe value.
         """
         start = self.plan.home.copy()
-        recent = round(self._patience * NANOSECONDS)
+        recent = round(self._timeout * NANOSECONDS)
         for i, (name, unit) in enumerate(self._units.items()):
             stamp, measured = self._applied.get(name)
             found = [measured] if abs(stamp_ns - stamp) <= recent else []
@@ -178,58 +184,58 @@ class ExperimentRun:
             start[i] = next(filter(math.isfinite, found), start[i])
             if not any(map(math.isfinite, found)):
                 self._node.get_logger().warning(
-                    f'experiment: {self._called(name)} is not measured and was not commanded: '
-                    f'the steps begin at its safe value, {shown(start[i], unit):.6g} '
-                    f'{display_unit(unit)}')
+                    f'experiment: {self._label(name)} is not measured and was not commanded: '
+                    f'the steps begin at its safe value, {quantity_text(start[i], unit)}')
         return start
 
-    def _on_applied(self, heard: SignalSample) -> None:
-        self._applied.take(heard)
+    def _on_applied(self, received: SignalSample) -> None:
+        self._applied.take(received)
         self._answer_first()
 
     def _answer_first(self) -> None:
-        """Answer the first measurement when the present inputs are known, or after a moment."""
+        """Answer the first measurement once the present inputs are known, or after 0.5 s."""
         if self._first is not None and not self._inputs_missing:
             first, self._first = self._first, None
             self._answer(*first)
 
-    def _called(self, name: str) -> str:
+    def _label(self, name: str) -> str:
         return name if self._on_setpoints else base_name(name, self._units[name])
 
     def figures(self, what: str, values: Array) -> dict[str, float]:
         """Return values (m,) by name with unit."""
-        return {f'{self._called(name)} {what} [{display_unit(unit)}]': shown(value, unit)
-                for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True)}
+        return values_by_name({self._label(name): unit for name, unit in self._units.items()},
+                              values.tolist(), f'{{}} {what}')
 
     def stop(self, phase: ExperimentPhase, why: Reason | None = None) -> None:
-        """End the steps; the signals then go home."""
+        """End the steps; the signals then return."""
         if self.progress is not None:
             self.progress = end(self.progress, phase, why)
 
-    def farewell(self) -> None:
-        """Answer measurements for a moment with the way back, and leave the signals there."""
+    def return_before_exit(self) -> None:
+        """Return the signals for at most 2 s, and leave them there."""
         if self.progress is None:
             return
-        deadline = time.monotonic() + _FAREWELL
-        while time.monotonic() < deadline and not self._home:
+        deadline = time.monotonic() + _RETURN_TIME
+        while time.monotonic() < deadline and not self._returned:
             for stamp_ns in self._waiting_stamps():
                 self.progress = advance(self.plan, self.progress, None, stamp_ns)
                 self._command(self.progress.command, stamp_ns)
             time.sleep(0.001)
-        for publisher in self._outlet.publishers:
-            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
-        if not self._home:
+        for publisher in self._publisher.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_TIME))
+        if not self._returned:
             self._node.get_logger().warning(
-                f'experiment: ended on the way back: {self._listed("at", self.progress.command)}, '
-                f'held there, in place of {self._listed("at", self.plan.home)}; command them by '
-                'hand or start the controller')
+                'experiment: ended on the way back: '
+                f'{self._values_text("at", self.progress.command)}, held there, in place of '
+                f'{self._values_text("at", self.plan.home)}; command them by hand or start the '
+                'controller')
 
     @property
-    def _home(self) -> bool:
+    def _returned(self) -> bool:
         return self.progress is not None and bool((self.progress.command == self.plan.home).all())
 
     def _waiting_stamps(self) -> list[int]:
-        """Take one measurement from each topic, past the executor; return their stamps."""
+        """Take one measurement from each topic without the executor; return their stamps."""
         found = []
         for subscription in self._measured.subscriptions:
             with (handle := subscription.handle):
@@ -239,9 +245,9 @@ class ExperimentRun:
                         header is None) else stamp_nanoseconds(header.stamp))
         return found
 
-    def _on_measurement(self, heard: SignalSample) -> None:
-        if (whole := self._assembler.take(heard.stamp_ns, heard.values)) is not None:
-            self._answer(*whole, heard.frame_id)
+    def _on_measurement(self, received: SignalSample) -> None:
+        if (whole := self._assembler.take(received.stamp_ns, received.values)) is not None:
+            self._answer(*whole, received.frame_id)
 
     def _answer(self, stamp_ns: int, measured: Array, frame_id: str) -> None:
         if self.progress is None and not self._started(stamp_ns, measured, frame_id):
@@ -249,18 +255,18 @@ class ExperimentRun:
         assert self.progress is not None
         newest_ns, was_running = self.progress.time_ns, self.running
         self._frame_id = frame_id
-        if self._on_setpoints and not self._followed(self._tracked, StatusCode.NOT_TRACKED):
+        if self._on_setpoints and not self._is_followed(self._tracked, StatusCode.NOT_TRACKED):
             return
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         if self.progress.time_ns != newest_ns:
             # a stamp that stands still or lags is no news
-            self._heard_at = time.monotonic()
+            self._received_at = time.monotonic()
         self._command(self.progress.command, stamp_ns)
         if was_running and not self.running:
             self._on_end(None)
 
     def _started(self, stamp_ns: int, measured: Array, frame_id: str) -> bool:
-        """Start with a measurement, if all is known that has to be; tell whether it did."""
+        """Start if set-points and inputs are known; return whether the run has started."""
         if self.started.done() or self._setpoints_missing:
             return False
         self._first_at = min(self._first_at, time.monotonic())
@@ -275,7 +281,7 @@ class ExperimentRun:
             return False
         self.progress = begin(
             self.plan, stamp_ns, None if self._on_setpoints else self._present(stamp_ns))
-        self._heard_at = time.monotonic()
+        self._received_at = time.monotonic()
         return True
 
     def _command(self, values: Array, stamp_ns: int) -> None:
@@ -283,16 +289,16 @@ class ExperimentRun:
             # a set-point stays where it was asked to be
             return
         self._sent = values
-        self._outlet.send(values, stamp_message(stamp_ns), self._frame_id)
+        self._publisher.send(values, stamp_message(stamp_ns), self._frame_id)
 
-    def _on_command(self, heard: SignalSample) -> None:
-        """Watch a controller that should be in manual mode."""
+    def _on_command(self, received: SignalSample) -> None:
+        """Check that the controller follows the manual commands."""
         self._answer_first()
         if self.progress is not None and not self._on_setpoints:
-            self._followed(heard.values, StatusCode.NOT_FOLLOWED)
+            self._is_followed(received.values, StatusCode.NOT_FOLLOWED)
 
     def _on_record(self, message: String) -> None:
-        """Watch a controller that should be in automatic mode."""
+        """Check that the controller stays in automatic mode."""
         with contextlib.suppress(records.RecordError):
             mode = records.parse(message.data).fields.get('mode')
             self._automatic = self._automatic or mode == 'automatic'
@@ -303,8 +309,8 @@ class ExperimentRun:
                 elif not self.started.done():
                     self.started.set_result(why)
 
-    def _followed(self, values: Mapping[str, float], code: StatusCode) -> bool:
-        """Tell whether a controller does as it is asked; where it does not, all is over."""
+    def _is_followed(self, values: Mapping[str, float], code: StatusCode) -> bool:
+        """Return whether the controller follows the requests; end the experiment if not."""
         assert self.progress is not None
         now = time.monotonic()
         for i, name in enumerate(self._units):
@@ -318,7 +324,7 @@ class ExperimentRun:
         return True
 
     def _on_tick(self) -> None:
-        """Look for other commanders, and for measurements that stay away."""
+        """Check for other publishers and for missing measurements."""
         self._answer_first()
         why = None
         for topic in dict.fromkeys(self._topics):
@@ -326,9 +332,9 @@ class ExperimentRun:
                 why = reason(StatusCode.OTHER_PUBLISHER, nodes=others, topic=topic)
         if why is None and self._answers is not None and not self._answers.published():
             why = reason(StatusCode.CONTROLLER_GONE)
-        elif why is None and time.monotonic() - self._heard_at > self._patience:
+        elif why is None and time.monotonic() - self._received_at > self._timeout:
             why = reason(StatusCode.NOTHING_TRACKED if self._setpoints_missing
-                         else StatusCode.SILENCE, timeout=self._patience)
+                         else StatusCode.SILENCE, timeout=self._timeout)
         if self.progress is None:
             if why is not None and not self.started.done():
                 self.started.set_result(why)
@@ -346,7 +352,7 @@ class ExperimentRun:
 
 
 def other_publishers(node: Node, topic: str, own: int = 0) -> str:
-    """Name the nodes that publish on a topic, but for so many publishers of a node's own."""
+    """Return the nodes that publish on a topic, except `own` publishers of this node."""
     # a publisher may be known before its node is
     names = ['another node' if 'UNKNOWN' in info.node_name else topics.node_name(info)
              for info in node.get_publishers_info_by_topic(topic)]

@@ -61,7 +61,7 @@ def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
 
 
 def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
-    """Return the fields of a plant's task, and where it is to be worked."""
+    """Return the fields of a plant's task, and its executor."""
     node = LoopNode('trainer', namespace=namespace, start_parameter_services=False,
                     enable_rosout=False)
     try:
@@ -88,7 +88,7 @@ def _one_scheduler(schedulers: Mapping[str, str]) -> str:
 
 
 def _retrain(task: Mapping[str, object], arrived: Sequence[int]) -> JobState:
-    """Retrain in a process of its own; tell of the plants as they end."""
+    """Retrain in a child process; print the result of each plant as it ends."""
     job = TrainingJob(task)
     told: set[str] = set()
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))

@@ -148,7 +148,7 @@ class Host:
         self.executor.add_node(node)
 
     def _fail(self, namespace: str, error: BaseException) -> None:
-        """Note the exception of a callback; its node gets no further ones."""
+        """Record the exception of a callback; its node gets no further callbacks."""
         if namespace not in self._failed:
             self._note(namespace, error, 'stopped: ')
             self._leaving.append(namespace)
@@ -161,7 +161,7 @@ class Host:
         self._diagnostics.publish_if_changed()
 
     def _part(self, namespace: str) -> None:
-        """Go on without a node that has failed or was shut down."""
+        """Remove a node that has failed or was shut down."""
         # it may have failed while it was shut down
         if (node := self._nodes.pop(namespace, None)) is None:
             return
@@ -237,6 +237,6 @@ def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None
 
 
 def _be_lean(environment: MutableMapping[str, str]) -> None:
-    """Let Fast DDS keep little memory ready, unless it is told otherwise."""
+    """Select the Fast DDS profile with little reserved memory, unless another is set."""
     if not any(environment.get(name) for name in PROFILES):
         environment.update(dict.fromkeys(PROFILES, str(config_directory() / LEAN_PROFILE)))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Managed nodes: nothing acts before it is configured and active, and all can be taken down."""
+"""Managed (lifecycle) nodes: configuration, activation and clean-up."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _EMPTY_TEXT = re.compile(r"parameter override rule: '-p ([^' ]+:=)'")
 
 class ManagedNode(LifecycleNodeMixin, LoopNode):
     """
-    A lifecycle node (design.ros2.org, managed nodes) that says how it is configured.
+    A lifecycle node (design.ros2.org, managed nodes) that reports errors of its transitions.
 
-    What it makes between :meth:`configure` and :meth:`clean_up` is taken down by the latter.
+    The clean-up destroys every entity that was created since :meth:`configure`.
 
-    :ivar active: whether it may act.
+    :ivar active: whether the node is in the active state.
     """
 
     active = False
@@ -66,21 +66,21 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._alone = False
 
     def configure(self) -> None:
-        """Make publishers, subscriptions, services and timers; raise what is in the way."""
+        """Create publishers, subscriptions, services and timers; raise an error to refuse."""
 
     def activate(self) -> None:
-        """Begin to act; raise what is in the way."""
+        """Begin to act; raise an error to refuse."""
 
     @property
     def refusal(self) -> str:
-        """Why a service cannot begin anything now, or an empty string."""
+        """Reason to refuse a request of a service, or an empty string."""
         return '' if self.active else f'{self.get_name()} is not active: activate it first'
 
     def deactivate(self) -> None:
-        """Act no more, and leave behind what is safe."""
+        """Stop acting, and leave the plant safe."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; what was made until an error is taken down again."""
+        """Configure; destroy what was created if that fails."""
         done = self._attempt(self.configure)
         if done != TransitionCallbackReturn.SUCCESS:
             self._clean_up()
@@ -94,21 +94,21 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Act no more, whatever goes wrong with what is left behind."""
+        """Stop acting, also if :meth:`deactivate` fails."""
         self.active = False
         self._attempt(self.deactivate)
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take down what was configured."""
+        """Destroy what was configured."""
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Act no more, and end the process."""
+        """Stop acting, and end the process."""
         if self.active:
             self.on_deactivate(state)
-        # whoever asked for it hears the answer first, which would be lost with its sender
+        # the response goes out first: it would be lost with the service
         wall_timer(self, _FAREWELL, self._end)
         return TransitionCallbackReturn.SUCCESS
 
@@ -116,7 +116,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self.exit_code = 0
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Go back to the unconfigured state."""
+        """Return to the unconfigured state."""
         self.active = False
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
@@ -127,7 +127,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         try:
             return change(request, response)
         except RuntimeError as error:
-            # rclpy lets a transition that there is not in this state end the process
+            # in rclpy an invalid transition would end the process
             self.get_logger().error(f'no such transition now: {one_line(error)}')
             response.success = False
             return response
@@ -139,7 +139,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
             # code of one's own may raise SystemExit, which would end all nodes of the process
             text = contained(caught)
             error = caught if isinstance(caught, Exception) else RuntimeError(text)
-            # rclpy would not tell of it
+            # rclpy does not report the exception
             self._failure = error
             expected = isinstance(error, START_ERRORS)
             if not self._alone:
@@ -164,7 +164,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                     destroy(entity)
 
     def _refuse_requests(self) -> None:
-        """Answer the requests that wait at the services that are taken down."""
+        """Answer the requests that wait at the services to be destroyed."""
         for service in self.services:
             if any(service is kept for kept in self._kept[1]):
                 continue
@@ -187,7 +187,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
 
 def one_line(error: BaseException) -> str:
-    """Return the words of an error, which rcl repeats over several lines."""
+    """Return the message of an error, which rcl repeats over several lines."""
     text = str(error).split(', at ./')[0].split(', at /')[0]
     text = ' '.join(text.split()) or type(error).__name__
     if empty := _EMPTY_TEXT.search(text):

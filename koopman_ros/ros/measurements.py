@@ -31,18 +31,18 @@ class Sample(NamedTuple):
 
 class Measurements:
     """
-    Hand over measurements when they are whole.
+    Hand over measurements when they are complete.
 
     :param exclusive: topics on which only one node may publish.
     :param tolerance: s by which stamps of one measurement may differ.
     :param answer: called with each measurement.
     """
 
-    def __init__(self, node: HostedNode, matching: topics.EndpointMonitor, wiring: SignalTopics,
+    def __init__(self, node: HostedNode, endpoints: topics.EndpointMonitor, wiring: SignalTopics,
                  exclusive: Mapping[str, str], tolerance: float,
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals
-        self._node, self._matching, self._answer = node, matching, answer
+        self._node, self._endpoints, self._answer = node, endpoints, answer
         self.assembler = SampleSynchronizer(tuple(signals.states), round(tolerance * NANOSECONDS))
         self.applied = MeasuredInputs(signals.inputs)
         self.frame_id, self._frame_length = '', 0
@@ -52,9 +52,9 @@ class Measurements:
         self._waiting: list[Sample] = []  # that came before the measured inputs
         self._patience: Timer | None = None
         self._inputs = SignalSubscriber(
-            node, matching.subscribe, wiring.applied, signals.inputs, self._on_applied)
+            node, endpoints.subscribe, wiring.applied, signals.inputs, self._on_applied)
         measured = SignalSubscriber(
-            node, matching.subscribe, wiring.measured, signals.states, self._on_measurement)
+            node, endpoints.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:
             node.get_logger().warning(
                 f'messages of {", ".join(measured.unstamped)} have no stamp: they are stamped at '
@@ -85,22 +85,22 @@ class Measurements:
             f'the frame_id of the measurement has {self._frame_length} characters, of which '
             f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
 
-    def _on_measurement(self, heard: SignalSample) -> None:
-        self.frame_id = heard.frame_id[:LONGEST_FRAME_ID]
-        self._frame_length = len(heard.frame_id)
+    def _on_measurement(self, received: SignalSample) -> None:
+        self.frame_id = received.frame_id[:LONGEST_FRAME_ID]
+        self._frame_length = len(received.frame_id)
         late = self.assembler.late.total()
-        whole = self.assembler.take(heard.stamp_ns, heard.values)
+        complete = self.assembler.take(received.stamp_ns, received.values)
         if not self._active:
             return
-        source, at = self._sources.get(heard.topic), self._timing.now()
-        if source is not None and heard.number is not None:
-            source.take(heard.number, at[0], self._window())
+        source, at = self._sources.get(received.topic), self._timing.now()
+        if source is not None and received.number is not None:
+            source.take(received.number, at[0], self._window())
         if self.assembler.late.total() > late:
             self._timing.ignore(at)
-        if whole is None:
+        if complete is None:
             return
-        sample = Sample(*whole, two_sources=any(
-            one.conflict or (one.newest is None and self._matching.shared(topic))
+        sample = Sample(*complete, two_sources=any(
+            one.conflict or (one.newest is None and self._endpoints.shared(topic))
             for topic, one in self._sources.items()))
         # whether the measured inputs will be known in a moment
         if self._waiting or (not self._begun() and not self.applied.complete
@@ -111,8 +111,8 @@ class Measurements:
             return
         self._answer(sample)
 
-    def _on_applied(self, heard: SignalSample) -> None:
-        self.applied.take(heard)
+    def _on_applied(self, received: SignalSample) -> None:
+        self.applied.take(received)
         if self._waiting and self.applied.complete:
             self._answer_waiting()
 

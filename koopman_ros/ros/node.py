@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes with the parameters of a table; what their parts create and take down."""
+"""Nodes whose parameters are declared by a table."""
 
 from __future__ import annotations
 
@@ -14,51 +14,20 @@ from typing import Any, TypeVar
 
 from rcl_interfaces import msg
 from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
-from rclpy.service import Service
 from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros.core.plugins import own_code
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
 from koopman_ros.ros.diagnostics import Diagnostics
-from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
+from koopman_ros.ros.hosted import HostContext, HostedNode
 
 T = TypeVar('T')
-Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)
 
 # Parameters that rclpy itself declares or reads.
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
-
-_DESTROY: dict[type, Callable[[Node, Any], object]] = {
-    Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
-    Service: Node.destroy_service, Timer: Node.destroy_timer}
-
-class NodeEntities:
-    """Publishers, subscriptions, services and timers of one part of a node."""
-
-    def __init__(self, node: HostedNode) -> None:
-        self._node = node
-        self._entities: list[Any] = []
-
-    def keep(self, entity: Entity) -> Entity:
-        """Note an entity, and return it."""
-        self._entities.append(entity)
-        return entity
-
-    def timer(self, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
-        """Create a :func:`wall_timer`."""
-        return self.keep(wall_timer(self._node, seconds, callback, **options))
-
-    def destroy(self) -> None:
-        """Take all of them down, the last one first."""
-        while self._entities:
-            entity = self._entities.pop()
-            _DESTROY[type(entity)](self._node, entity)
 
 
 class LoopNode(HostedNode):

@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool
 from koopman_ros.control import events, Mode
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import NANOSECONDS, quantity_text
 from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.ros import topics
 from koopman_ros.ros.control_loop import ControlLoop
@@ -32,7 +32,7 @@ class OperatorRequests:
     :ivar setpoint_received: whether a set-point was accepted.
     """
 
-    def __init__(self, node: Node, matching: topics.EndpointMonitor, wiring: SignalTopics,
+    def __init__(self, node: Node, endpoints: topics.EndpointMonitor, wiring: SignalTopics,
                  loop: ControlLoop, applied: MeasuredInputs, changed: Callable[[], None]) -> None:
         self._log, self._loop, self._applied = node.get_logger(), loop, applied
         self._signals, self._changed = wiring.signals, changed
@@ -41,10 +41,10 @@ class OperatorRequests:
         self.setpoint_received = False
         # volatile, so that `ros2 topic pub` matches
         for name, place in wiring.setpoints.items():
-            SignalSubscriber(node, matching.subscribe, {name: place}, wiring.signals.states,
+            SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.states,
                              self._on_setpoint)
         for name, place in wiring.manual.items():
-            SignalSubscriber(node, matching.subscribe, {name: place}, wiring.signals.inputs,
+            SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.inputs,
                              self._on_manual)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
 
@@ -53,26 +53,26 @@ class OperatorRequests:
         """Why the last request was refused or limited, for a minute; or an empty string."""
         return self._note if time.monotonic() - self._noted < _SHOWN else ''
 
-    def _on_setpoint(self, heard: SignalSample) -> None:
-        (name, value), = heard.values.items()
+    def _on_setpoint(self, received: SignalSample) -> None:
+        (name, value), = received.values.items()
         several = len(self._signals.controlled) > 1
         if self._change(events.SetpointRequest(
-                heard.stamp_ns, np.array([value]), (name,) if several else None)):
+                received.stamp_ns, np.array([value]), (name,) if several else None)):
             self.setpoint_received = True
-            scheduled = any(entry[0] == heard.stamp_ns
+            scheduled = any(entry[0] == received.stamp_ns
                             for entry in self._loop.state.setpoint.scheduled)
-            when = f', holds from {heard.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
+            when = f', holds from {received.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
             unit = self._signals.states[name]
             self._log.info(
-                f'set-point {shown(value, unit):.6g} {display_unit(unit)} of {name} accepted'
-                f'{when}', throttle_duration_sec=1.0)
+                f'set-point {quantity_text(value, unit)} of {name} accepted{when}',
+                throttle_duration_sec=1.0)
         self._changed()
 
-    def _on_manual(self, heard: SignalSample) -> None:
+    def _on_manual(self, received: SignalSample) -> None:
         state = self._loop.state
         held = state.command if state.manual_input is None else state.manual_input
         # the others stay
-        requested = np.array([heard.values.get(name, math.nan if held is None else held[i])
+        requested = np.array([received.values.get(name, math.nan if held is None else held[i])
                               for i, name in enumerate(self._signals.inputs)])
         if state.command is None and (known := self._applied.latest) is not None:
             self._change(events.Initialisation(known))
@@ -106,8 +106,8 @@ class OperatorRequests:
         """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
         within = self._loop.controller.tuning.limits.within(requested)
         return ', '.join(
-            f'manual {base_name(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
-            f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
+            f'manual {base_name(name, unit)} {quantity_text(wanted, unit, ".2f")} is limited to '
+            f'{quantity_text(limit, unit, ".2f")}'
             for (name, unit), wanted, limit in zip(
                 self._signals.inputs.items(), requested.tolist(), within.tolist(), strict=True)
             if wanted != limit)

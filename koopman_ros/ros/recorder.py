@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -51,12 +50,6 @@ class _OutsideTheExecutor(CallbackGroup):
 
     def can_execute(self, entity: object) -> bool:
         return False
-
-    def beginning_execution(self, entity: object) -> bool:
-        return False
-
-    def ending_execution(self, entity: object) -> None:
-        pass
 
 
 class Recorder:
@@ -111,7 +104,7 @@ class Recorder:
             if (message_type := self._types[topic]) is None:
                 continue
             _, usual = self._known.get(self._names[topic], (None, topics.LOOP_QOS))
-            wanted = _matching_qos(usual, publishers)
+            wanted = topics.matching_profile(usual, publishers, _QUEUE_DEPTH)
             existing = self._subscriptions.get(topic)
             if existing is not None:
                 present = existing.qos_profile
@@ -128,7 +121,7 @@ class Recorder:
             message_type, topic, lambda _: None, qos, callback_group=self._group, raw=True)
 
     def _look_for_the_clock(self) -> None:
-        """Complain where receipts tell another time than that of the plant."""
+        """Warn if times of receipt are not the plant's time."""
         unstamped = [topic for topic, name in self._names.items() if name in self._known
                      and name not in topics.TYPES and not hasattr(self._known[name][0], 'header')]
         if self.simulated:
@@ -154,7 +147,7 @@ class Recorder:
         self._record_in_order(self._subscriptions)
 
     def flush(self) -> None:
-        """Hand what is recorded to the operating system."""
+        """Pass the recorded messages to the operating system."""
         self._writer.flush()
 
     def close(self) -> None:
@@ -193,7 +186,7 @@ class Recorder:
         return waiting
 
     def _record_in_order(self, subscriptions: Mapping[str, Subscription]) -> None:
-        """Record in the order of receipt; the order within a topic stays whatever the clock."""
+        """Record in the order of receipt; the order within a topic is always kept."""
         waiting = [self._waiting(topic, each) for topic, each in subscriptions.items()]
         if self._clock is not None:
             # last, so that no /clock received before a message is missing; first of one instant
@@ -218,7 +211,7 @@ class Recorder:
             self.counts[taken.topic] += 1
 
     def _hear(self, data: bytes) -> None:
-        """Take the node's time from a message on /clock, but for one that is no time."""
+        """Set the node's time from a message on /clock; ignore an invalid time."""
         now = deserialize_message(data, Clock).clock
         if now.sec >= 0 and now.nanosec < NANOSECONDS:
             self._now_ns = stamp_nanoseconds(now)
@@ -248,14 +241,6 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
         return latest_ns
     return source_ns if empty_ns - _LONGEST_WAY_NS <= source_ns <= latest_ns else min(
         max(source_ns, empty_ns), latest_ns)
-
-
-def _matching_qos(usual: QoSProfile, publishers: list[TopicEndpointInfo]) -> QoSProfile:
-    """Ask for reliability and history only where every publisher offers them."""
-    offers = [info.qos_profile for info in publishers] or [usual]
-    reliable = all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers)
-    latched = all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
-    return topics.profile(_QUEUE_DEPTH, reliable=reliable, latched=latched)
 
 
 def _offered(profile: QoSProfile) -> Qos:

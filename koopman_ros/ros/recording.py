@@ -18,8 +18,8 @@ from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.records import BagWriter
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import NodeEntities
 from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages
@@ -38,10 +38,9 @@ class Recording:
         self._recorder: Recorder | None = None
         self._problem = self._path = ''
         self._diagnostics = node.diagnostics.add('recording', self._status)
-        self._owned = NodeEntities(node)
-        self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
+        node.create_service(SetBool, '~/record', self._on_record)
         self._timers = [
-            self._owned.timer(period, partial(self._attempt, work), autostart=False)
+            wall_timer(node, period, partial(self._attempt, work), autostart=False)
             for period, work in ((_TAKE_PERIOD, Recorder.take), (_FLUSH_PERIOD, self._flush),
                                  (_LOOK_PERIOD, Recorder.look_for_publishers))]
 
@@ -89,12 +88,6 @@ class Recording:
         if self._recorder is not None:
             with contextlib.suppress(OSError):
                 self.stop()
-
-    def destroy(self) -> None:
-        """Complete the bag, if there is one, and take the service down."""
-        self.complete()
-        self._owned.destroy()
-        self._diagnostics.destroy()
 
     def _end(self) -> Recorder:
         assert self._recorder is not None

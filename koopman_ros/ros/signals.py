@@ -140,9 +140,9 @@ class MeasuredInputs:
         self._names = tuple(names)
         self._last: dict[str, tuple[int, float]] = {}  # stamp in ns and value
 
-    def take(self, heard: SignalSample) -> None:
+    def take(self, received: SignalSample) -> None:
         """Take what a message says."""
-        self._last |= {name: (heard.stamp_ns, value) for name, value in heard.values.items()}
+        self._last |= {name: (received.stamp_ns, value) for name, value in received.values.items()}
 
     def get(self, name: str) -> tuple[float, float]:
         """Return stamp in ns and value of an input; -infinity and NaN for none."""
@@ -193,7 +193,7 @@ class SignalPublisher:
         """All publishers."""
         return [publisher for publisher, *_ in self._parts]
 
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Tell whether anybody subscribes to one of the topics."""
         return any(map(topics.has_subscribers, self.publishers))
 

@@ -10,7 +10,7 @@ import numpy as np
 from koopman_ros import plants
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
-from koopman_ros.core.units import display_unit, shown
+from koopman_ros.core.units import values_by_name
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
 
 
@@ -101,7 +101,5 @@ class SimulatedPlant:
     def figures(self) -> dict[str, float]:
         """Return states and inputs with their names and units."""
         inputs = {base_name(name, unit): unit for name, unit in self.signals.inputs.items()}
-        signals = [*self.signals.states.items(), *inputs.items()]
-        values = [*self._process.x.tolist(), *self._process.u.tolist()]
-        return {f'{name} [{display_unit(unit)}]': shown(value, unit)
-                for (name, unit), value in zip(signals, values, strict=True)}
+        return {**values_by_name(self.signals.states, self._process.x.tolist()),
+                **values_by_name(inputs, self._process.u.tolist())}

@@ -39,9 +39,8 @@ from koopman_ros.parameters.signal_topics import (
     PREDICTED_TRAJECTORY,
     SignalTopics,
 )
-from koopman_ros.ros.hosted import HostedNode
+from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.managed import one_line
-from koopman_ros.ros.node import NodeEntities
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
 # JointTrajectory the one with their course in time.
@@ -57,11 +56,7 @@ LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 _LOOK_PERIOD = 0.5  # s
-_POLICIES = ('reliability', 'durability', 'deadline', 'liveliness', 'liveliness_lease_duration')
 _LOOK_SHARE = 0.05  # of a processor, for the looks of all loops of a process
-# What does not pass: policy, offered, asked for.
-_CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
-              ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
 
 
 def overridable() -> QoSOverridingOptions:
@@ -100,6 +95,16 @@ def profile(depth: int, *, reliable: bool, latched: bool = False) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
+def matching_profile(usual: QoSProfile, publishers: Collection[TopicEndpointInfo], depth: int
+                     ) -> QoSProfile:
+    """Ask for reliability and history only where every publisher offers them."""
+    offers = [info.qos_profile for info in publishers] or [usual]
+    return profile(
+        depth,
+        reliable=all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers),
+        latched=all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers))
+
+
 def message_class(type_name: str) -> Any:
     """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
@@ -119,25 +124,23 @@ class EndpointMonitor:
     message.
 
     :param on_change: called when the complaint is another.
-    :param single: what is done on topics on which only one node may publish, in words.
+    :param exclusive: what is done on topics on which only one node may publish, in words.
     """
 
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
-                 single: Mapping[str, str] | None = None) -> None:
-        self._node, self._on_change, self._single = node, on_change, single or {}
-        self._owned = NodeEntities(node)
+                 exclusive: Mapping[str, str] | None = None) -> None:
+        self._node, self._on_change, self._exclusive = node, on_change, exclusive or {}
         self._own: list[Publisher | Subscription] = []
-        self._said: tuple[str, ...] = ('', '')
+        self._last_complaints: tuple[str, ...] = ('', '')
         self._shared: dict[str, bool] = {}
         self._next_look = 0.0  # by the steady clock
         self._loops = 1 if node.hosting is None else node.hosting.loops
-        self._owned.timer(_LOOK_PERIOD, self._look_in_turn)
-        self.destroy = self._owned.destroy  #: with what was made here
+        wall_timer(node, _LOOK_PERIOD, self._look_in_turn)
 
     @property
     def complaint(self) -> str:
         """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
-        return next(filter(None, self._said), '')
+        return next(filter(None, self._last_complaints), '')
 
     def shared(self, topic: str) -> bool:
         """Tell whether several nodes publish on a topic on which only one may."""
@@ -147,21 +150,21 @@ class EndpointMonitor:
                   qos: QoSProfile = LOOP_QOS) -> Subscription:
         """Subscribe to a topic, by default of its type in `TYPES`."""
         # overriding parameters change the profile itself
-        made = self._owned.keep(self._node.create_subscription(
+        made = self._node.create_subscription(
             kind or TYPES[topic], topic, callback, copy.copy(qos),
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            qos_overriding_options=overridable()))
+            qos_overriding_options=overridable())
         self._own.append(made)
         return made
 
     def publish(self, topic: str, kind: Any = None, qos: QoSProfile = LOOP_QOS,
                 matched: Callable[[Any], None] | None = None) -> Publisher:
         """Publish a topic, by default of its type in `TYPES`; matched is an event of rclpy."""
-        made = self._owned.keep(self._node.create_publisher(
+        made = self._node.create_publisher(
             kind or TYPES[topic], topic, copy.copy(qos),
             event_callbacks=PublisherEventCallbacks(
                 matched=matched, use_default_callbacks=False),
-            qos_overriding_options=overridable()))
+            qos_overriding_options=overridable())
         self._own.append(made)
         return made
 
@@ -173,12 +176,12 @@ class EndpointMonitor:
         self._next_look = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
 
     def _look(self) -> None:
-        conflicts = {topic: self._conflict(topic) for topic in self._single}
+        conflicts = {topic: self._conflict(topic) for topic in self._exclusive}
         self._shared = {topic: bool(conflict) for topic, conflict in conflicts.items()}
         complaints = dict.fromkeys(
             complaint for own in self._own for complaint in self._complaints(own))
         said = '; '.join(filter(None, conflicts.values())), '; '.join(complaints)
-        before, self._said = self._said, said
+        before, self._last_complaints = self._last_complaints, said
         for complaint in said:
             if complaint and complaint not in before:
                 self._node.get_logger().warning(complaint)
@@ -192,7 +195,7 @@ class EndpointMonitor:
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
                        if info.topic_type in kinds)
         return '' if len(names) < 2 else (
-            f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
+            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; end all but one')
 
     def _complaints(self, own: Publisher | Subscription) -> list[str]:
         topic, kind = own.topic_name, type_name(own.msg_type)
@@ -203,44 +206,21 @@ class EndpointMonitor:
                 f'{kind}: end that node, or remap its topic'
                 for other in (*publishers, *subscriptions) if other.topic_type != kind]
         for other in publishers if subscribes else subscriptions:
-            compatible, _ = rclpy_qos.qos_check_compatible(*_in_order(own, other))
-            if other.topic_type == kind and compatible == rclpy_qos.QoSCompatibility.ERROR:
-                said.append(self._qos_complaint(own, other))
+            offered, requested = _explicit(own.qos_profile), _explicit(other.qos_profile)
+            if subscribes:
+                offered, requested = requested, offered
+            compatible, reason = rclpy_qos.qos_check_compatible(offered, requested)
+            if other.topic_type != kind or compatible != rclpy_qos.QoSCompatibility.ERROR:
+                continue
+            remedy = 'use the quality of service of this node there'
+            if subscribes and offered.reliability is ReliabilityPolicy.BEST_EFFORT:
+                remedy += (f', or start this node with -p qos_overrides.{topic}.subscription.'
+                           'reliability:=best_effort')
+            said.append(
+                f'{topic}: {node_name(other)} {"publishes" if subscribes else "subscribes"} with '
+                'an incompatible quality of service, so that no message passes: '
+                f'{reason.replace("ERROR: ", "").strip(";")}; {remedy}')
         return said
-
-    def _qos_complaint(self, own: Publisher | Subscription, other: TopicEndpointInfo) -> str:
-        topic, subscribes = own.topic_name, isinstance(own, Subscription)
-        offered, asked = _in_order(own, other)
-        policy, wanted = _incompatible(offered, asked), 'the default'
-        does = 'publishes' if subscribes else 'subscribes'
-        for name, too_little, too_much in _CONFLICTS:
-            if (getattr(offered, name), getattr(asked, name)) == (too_little, too_much):
-                policy, wanted = name, (too_much if subscribes else too_little).short_key
-                does += f' with {(too_little if subscribes else too_much).short_key}'
-                break
-        remedy = f'use {wanted} there'
-        if subscribes and policy == 'reliability':
-            remedy += (f', or start this node with -p qos_overrides.{topic}.subscription.'
-                       'reliability:=best_effort')
-        return (f'{topic}: {node_name(other)} {does}, which is incompatible in {policy}, so '
-                f'that no message passes: {remedy}')
-
-
-def _in_order(own: Publisher | Subscription, other: TopicEndpointInfo
-              ) -> tuple[QoSProfile, QoSProfile]:
-    ours, theirs = _explicit(own.qos_profile), _explicit(other.qos_profile)
-    return (theirs, ours) if isinstance(own, Subscription) else (ours, theirs)
-
-
-def _incompatible(offered: QoSProfile, asked: QoSProfile) -> str:
-    """Return the policy in which less is offered than asked for."""
-    for name in _POLICIES:
-        as_asked = copy.copy(offered)
-        setattr(as_asked, name, getattr(asked, name))
-        if rclpy_qos.qos_check_compatible(offered, as_asked)[0] == (
-                rclpy_qos.QoSCompatibility.ERROR):
-            return name
-    return 'quality of service'
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:

@@ -26,8 +26,9 @@ from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.signal_topics import plant_defaults, SignalTopics, system_of
 from koopman_ros.parameters.trainer import FIRST, TrainerParameters
 from koopman_ros.ros.diagnostics import Severity, TaskReport
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import LoopNode, NodeEntities
+from koopman_ros.ros.node import LoopNode
 
 POLL_PERIOD = 0.1  # s between two looks at a training
 _LINE_PERIOD = 5.0  # s between plain lines of progress
@@ -109,10 +110,9 @@ class Training:
         self._state: JobState | None = None
         self._progress = TrainingProgress(node.get_logger().info)
         self._diagnostics = node.diagnostics.add('training', self._status)
-        self._owned = owned = NodeEntities(node)
-        owned.keep(node.create_service(Trigger, '~/train', self._on_train))
-        owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
-        self._timer = owned.timer(POLL_PERIOD, self._on_poll, autostart=False)
+        node.create_service(Trigger, '~/train', self._on_train)
+        node.create_service(Trigger, '~/cancel_training', self._on_cancel)
+        self._timer = wall_timer(node, POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
         """Start a training and say from what; ValueError without a bag, OSError of the system."""
@@ -138,12 +138,6 @@ class Training:
             self._job = None
             print(f'training: {state.text}', file=sys.stderr, flush=True)
             self._on_end(state)
-
-    def destroy(self) -> None:
-        """End a training that is under way, and take the services down."""
-        self.complete()
-        self._owned.destroy()
-        self._diagnostics.destroy()
 
     def _on_train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._job is not None or self._node.refusal:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rclpy.node import Node
-from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 import yaml
 
 from koopman_ros.core.paths import config_directory, model_path
@@ -144,26 +143,6 @@ def test_every_number_has_a_range_that_a_slider_can_show(node: str) -> None:
         assert limits is not None
         assert (limits.from_value, limits.to_value) == (item.minimum, item.maximum)
         assert limits.step == 0
-
-
-@pytest.mark.parametrize('node', TABLES)
-def test_what_is_dumped_can_be_loaded_again(ros: Harness, tmp_path: Path, node: str) -> None:
-    """As `ros2 param dump` writes it, and as `ros2 param load` and a node at its start read."""
-    defaults = {name: list(item.default) if isinstance(item.default, tuple) else item.default
-                for name, item in TABLES[node].rows.items()}
-    file = tmp_path / 'dumped.yaml'
-    file.write_text(yaml.dump({f'/{node}': {'ros__parameters': defaults}},
-                              default_flow_style=False))
-    loaded = {name: parameter_value_to_python(message.value)
-              for name, message in parameter_dict_from_yaml_file(str(file)).items()}
-    reader = LoopNode(node, context=ros.node.context,
-                      cli_args=['--ros-args', '--params-file', str(file)])
-    started = {name: reader.get_parameter(name).value for name in defaults}
-    reader.destroy_node()
-    for read in (loaded, started):
-        assert read == defaults
-        assert {name: type(value) for name, value in read.items()} == {
-            name: type(value) for name, value in defaults.items()}
 
 
 def declared(ros: Harness, *arguments: str, name: str = 'odd',
@@ -343,31 +322,31 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
                     table=PlantTable({'system': system}))[0].system == system
 
 
-def test_a_topic_is_not_commanded_and_measured_at_once() -> None:
-    table = TABLES['controller']
-    said = table.check(table.snapshot({'coolant_temperature.command_topic': 'temperature'}))
-    assert said == ("coolant_temperature is commanded on 'temperature', where temperature is "
-                    'measured: name another topic for one of them')
-
-
-@pytest.mark.parametrize(('given', 'words'), [
-    ({'physical_model': 'two_thanks'}, "there is no plant 'two_thanks'"),
-    ({'physical_model': 'two_state', 'estimated_constants': ['volumes']},
-     'volumes is no constant of TwoStateReactor: it has flow_rate, volume'),
-    ({'physical_model': 'two_state', 'estimated_constants': ['volume [2, 1]']},
-     r'the range of volume is \[2, 1\] m\^3, must rise and lie in \[0.001, 100\] m\^3'),
-    ({'physical_model': 'two_state', 'estimated_constants': ['volume 2 1']},
-     'must be a name, or one'),
-    ({'physical_model': 'two_state', 'estimated_constants': ['volume', 'volume']},
-     'each name once'),
-    ({'physical_model': 'quadruple_tank'},
-     'does not say which of its constants are to be estimated'),
-    ({'estimated_constants': ['volume']}, 'estimated_constants names volume, must be empty'),
-    ({'physical_model': 'two_state', 'unmeasured_states': 1}, 'unmeasured_states is 1, must be 0'),
-    ({'physical_model': 'two_state', 'input_matrix': [2.0]}, 'input_matrix must be a single 0')])
-def test_equations_that_a_trainer_cannot_fit_are_refused(given: dict[str, Any], words: str
-                                                         ) -> None:
-    table = trainer_table(load(model_path(reactor.MODEL)))
+@pytest.mark.parametrize(('node', 'given', 'words'), [
+    ('controller', {'coolant_temperature.command_topic': 'temperature'},
+     "coolant_temperature is commanded on 'temperature', where temperature is measured"),
+    ('controller', {'temperature.sensor_min': -300.0},
+     r'temperature.sensor_min = -300.0 degC must be in \[-273.15, '),
+    *(('trainer', given, words) for given, words in (
+        ({'physical_model': 'two_thanks'}, "there is no plant 'two_thanks'"),
+        ({'physical_model': 'two_state', 'estimated_constants': ['volumes']},
+         'volumes is no constant of TwoStateReactor: it has flow_rate, volume'),
+        ({'physical_model': 'two_state', 'estimated_constants': ['volume [2, 1]']},
+         r'the range of volume is \[2, 1\] m\^3, must rise and lie in \[0.001, 100\] m\^3'),
+        ({'physical_model': 'two_state', 'estimated_constants': ['volume 2 1']},
+         'must be a name, or one'),
+        ({'physical_model': 'two_state', 'estimated_constants': ['volume', 'volume']},
+         'each name once'),
+        ({'physical_model': 'quadruple_tank'},
+         'does not say which of its constants are to be estimated'),
+        ({'estimated_constants': ['volume']}, 'estimated_constants names volume, must be empty'),
+        ({'physical_model': 'two_state', 'unmeasured_states': 1},
+         'unmeasured_states is 1, must be 0'),
+        ({'physical_model': 'two_state', 'input_matrix': [2.0]},
+         'input_matrix must be a single 0')))])
+def test_values_that_do_not_fit_together_are_refused(
+        node: str, given: dict[str, Any], words: str) -> None:
+    table = TABLES[node]
     assert re.search(words, table.check(table.snapshot(given)))
 
 
@@ -378,12 +357,6 @@ def test_equations_of_a_trainer_are_those_of_its_task() -> None:
     assert fields['physical_model'] == 'two_state'
     assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
                                    'reaction_enthalpy': None}
-
-
-def test_nothing_is_below_absolute_zero() -> None:
-    table = TABLES['controller']
-    said = table.check(table.snapshot({'temperature.sensor_min': -300.0}))
-    assert said.startswith('temperature.sensor_min = -300.0 degC must be in [-273.15, ')
 
 
 @pytest.mark.parametrize(('name', 'levels'), [

@@ -3,7 +3,6 @@
 
 """Parts of nodes: what goes with them; what a recorder and a plan write; models refused."""
 
-from collections.abc import Callable
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -15,7 +14,9 @@ from typing import Any
 from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
+from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.control import Mode, State
@@ -33,9 +34,9 @@ from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.controller_messages import active_constraints, planned
 from koopman_ros.ros.controller_status import statuses
-from koopman_ros.ros.diagnostics import Severity, TaskReport
+from koopman_ros.ros.diagnostics import Severity
 from koopman_ros.ros.experiment import PlantExperiment
-from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
@@ -47,62 +48,61 @@ SIGNALS = signals_of(load(model_path(reactor.MODEL)))
 NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
 
 
-class Part(LoopNode):
-    """A node as the parts of one know it, active."""
+class PartNode(ManagedNode):
+    """A managed node of one part."""
 
-    refusal = ''
+    def __init__(self, part: str, folder: Path, context: Context) -> None:
+        super().__init__('part', context=context)
+        self._part, self._folder = part, folder
+
+    def configure(self) -> None:
+        table = trainer_table(load(model_path(reactor.MODEL)))
+        settings = table.snapshot({'output': str(self._folder / 'bag')})
+        wiring = SignalTopics(SIGNALS, settings.states, settings.inputs)
+        match self._part:
+            case 'endpoint monitor':
+                monitor = topics.EndpointMonitor(self, lambda: None)
+                monitor.publish('mine', Temperature)
+                monitor.subscribe('other', lambda _: None, Temperature)
+                self.complete = lambda: None
+            case 'recorder':
+                self.complete = Recorder(self, BagWriter(self._folder / 'bag'), NAMES,
+                                         topics.expected_topics(wiring)).close
+            case 'recording':
+                recording = Recording(self, settings, wiring)
+                recording.start()
+                self.complete = recording.complete
+            case 'experiment':
+                experiment = PlantExperiment(self, settings, wiring)
+                assert experiment._start() == ''
+                self.complete = experiment.complete
+            case 'training':
+                training = Training(self, settings, wiring, lambda: str(self._folder / 'missing'))
+                training.start()
+                self.complete = training.complete
+            case 'watchdog':
+                watchdog = Watchdog(lambda _: None)
+                watchdog.start()
+                self.complete = watchdog.end
 
 
-def made(part: str, node: Part, folder: Path) -> Callable[[], object]:
-    """Make a part of a node, and return what takes it down."""
-    table = trainer_table(load(model_path(reactor.MODEL)))
-    settings = table.snapshot({'output': str(folder / 'bag')})
-    wiring = SignalTopics(SIGNALS, settings.states, settings.inputs)
-    match part:
-        case 'diagnostics':
-            made = node.diagnostics.add('task', lambda: TaskReport(Severity.OK, 'well'))
-        case 'matching':
-            made = topics.EndpointMonitor(node, lambda: None)
-            made.publish('mine', Temperature)
-            made.subscribe('other', lambda _: None, Temperature)
-        case 'recorder':
-            return Recorder(node, BagWriter(folder / 'bag'), NAMES,
-                            topics.expected_topics(wiring)).close
-        case 'recording':
-            made = Recording(node, settings, wiring)
-            made.start()
-        case 'experiment':
-            made = PlantExperiment(node, settings, wiring)
-            assert made._start() == ''
-        case 'training':
-            made = Training(node, settings, wiring, lambda: str(folder / 'missing'))
-            made.start()
-        case 'watchdog':
-            made = Watchdog(lambda _: None)
-            made.start()
-            return made.end
-    return made.destroy
-
-
-@pytest.mark.parametrize('part', ['diagnostics', 'matching', 'recorder', 'recording',
-                                  'experiment', 'training', 'watchdog'])
-def test_what_a_part_has_created_goes_with_it(
+@pytest.mark.parametrize('part', ['endpoint monitor', 'recorder', 'recording', 'experiment',
+                                  'training', 'watchdog'])
+def test_clean_up_removes_everything_that_a_part_created(
         shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
     # a training that loads no library, and ends when it is asked to
     monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
         'sh', '-c', 'cat > /dev/null'))
-    node = Part('part', context=shared_ros.node.context)
-    # which outlive the parts that report
-    diagnostics = node.diagnostics
+    node = PartNode(part, tmp_path, shared_ros.node.context)
 
     def created() -> tuple[object, ...]:
         return (*map(set, (node.publishers, node.subscriptions, node.services, node.timers)),
-                set(threading.enumerate()), tuple(diagnostics.tasks))
+                set(threading.enumerate()), tuple(node.diagnostics.tasks))
 
     before = created()
-    destroy = made(part, node, tmp_path)
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     assert created() != before
-    destroy()
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     assert created() == before
     node.destroy_node()
 
