@@ -172,7 +172,7 @@ def test_killed_at_any_message_it_loses_the_open_chunk_only(
             write_numbers(writer, (k,), PERIOD)
             if k % 5 == 4:
                 writer.flush()
-            # the metadata is renamed from a .tmp, which may vanish while it is copied
+            # the metadata is written in a folder *.tmp, which may vanish while it is copied
             shutil.copytree(path, left := tmp_path / f'left_{k}',
                             ignore=shutil.ignore_patterns('*.tmp'))
             found = numbers(left, recover=True)
@@ -207,12 +207,12 @@ def test_failure_in_the_background_is_raised(tmp_path: Path) -> None:
     writer = BagWriter(tmp_path / 'run', max_file_duration_s=1.0)
     write_numbers(writer, range(5), PERIOD)
     # the metadata that the first file goes into cannot be written
-    (writer.path / 'metadata.yaml.tmp').mkdir()
+    (writer.path / 'metadata.yaml').mkdir()
     with pytest.raises(IsADirectoryError):
         write_numbers(writer, range(5, 30), PERIOD)
     with pytest.raises(IsADirectoryError):
         writer.close()
-    (writer.path / 'metadata.yaml.tmp').rmdir()
+    (writer.path / 'metadata.yaml').rmdir()
     assert numbers(writer.path, recover=True) == list(range(20))
 
 
