@@ -43,10 +43,21 @@ def model_path(model: str) -> Path:
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Replace a file; a reader sees the old content or the new, after a loss of power as well."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'{path.name}.') as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'{path.name}.',
+                                     suffix='.tmp') as folder:
         temporary = Path(folder) / path.name
         with open(temporary, 'wb') as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write the entries of a directory through to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -71,7 +71,7 @@ def write_page(path: Path, title: str, sections: Iterable[str], packages: Sequen
     """
     parts = [f'# {title}', f'*{_headline(*packages)}*', *filter(None, map(str, sections))]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
+    write_atomically(path, ('\n\n'.join(parts) + '\n').encode())
     return path
 
 

@@ -3,7 +3,7 @@
 
 """Recorded and replayed commands side by side, in numbers and as a report."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,38 +44,23 @@ class CommandComparison:
         return int(np.nanargmax(np.abs(self.difference))) // self.difference.shape[1]
 
 
-@dataclass
+@dataclass(frozen=True)
 class ReplayedBag:
-    """A bag with what was made of it."""
+    """A bag with its replay."""
 
     path: str  #: of the bag
     complete: bool  #: whether its recorder closed it
-    found: Replay  #: what came of the replay
+    found: Replay  #: result of the replay
     tolerance: float  #: difference in input units from which on a command is counted
-    new_range: Coordinates | None = None  #: of the new model's training, or None without one
-
-    stamps_ns: NDArray[np.int64] = field(init=False)  #: (n,) stamps of the commands
-    measured: Array = field(init=False)  #: (n, n_y) measured; NaN in silence
-    setpoint: Array = field(init=False)  #: (n, n_c) tracked; NaN for none
-    recorded: Array = field(init=False)  #: (n, n_u) commanded then
-    #: (n, n_u) commanded by the replay; NaN where it knows no state
-    commands: Array = field(init=False)
-    #: (n, n_u) commanded by the new model; NaN where it knows no state
-    new_commands: Array = field(init=False)
-    check: CommandComparison = field(init=False)  #: the replay beside the record
-    #: the new model beside the record, or None without one
-    new: CommandComparison | None = field(init=False)
-
-    def __post_init__(self) -> None:
-        samples = self.found.samples
-        self.stamps_ns = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
-        self.measured = _rows([sample.measured for sample in samples])
-        self.setpoint = _rows([sample.setpoint for sample in samples])
-        self.recorded = _rows([sample.recorded for sample in samples])
-        self.commands = _rows([sample.replayed for sample in samples], self.recorded)
-        self.new_commands = _rows([sample.alternative for sample in samples], self.recorded)
-        self.check = self._compared(self.commands)
-        self.new = None if self.new_range is None else self._compared(self.new_commands)
+    new_range: Coordinates | None  #: of the new model's training, or None without one
+    stamps_ns: NDArray[np.int64]  #: (n,) stamps of the commands
+    measured: Array  #: (n, n_y) measured; NaN in silence
+    setpoint: Array  #: (n, n_c) tracked; NaN for none
+    recorded: Array  #: (n, n_u) recorded commands
+    commands: Array  #: (n, n_u) commands of the replay; NaN where it has no state
+    new_commands: Array  #: (n, n_u) commands of the new model; NaN where it has no state
+    check: CommandComparison  #: the replay beside the record
+    new: CommandComparison | None  #: the new model beside the record, or None without one
 
     @property
     def seconds(self) -> Array:
@@ -99,11 +84,24 @@ class ReplayedBag:
         return int(np.count_nonzero(((self.setpoint < self.new_range.lower[kept])
                                      | (self.setpoint > self.new_range.upper[kept])).any(axis=1)))
 
-    def _compared(self, commands: Array) -> CommandComparison:
-        """Compare commands (n, n_u) with those recorded."""
-        same = (commands.view(np.uint64) == self.recorded.view(np.uint64)).all(axis=1)
-        return CommandComparison(commands - self.recorded, int(np.count_nonzero(same)),
-                                 self.tolerance)
+
+def compared_bag(path: str, complete: bool, found: Replay, tolerance: float,
+                 new_range: Coordinates | None = None) -> ReplayedBag:
+    """Compare the commands of a replay with those that a bag holds."""
+    def compared(commands: Array) -> CommandComparison:
+        same = (commands.view(np.uint64) == recorded.view(np.uint64)).all(axis=1)
+        return CommandComparison(commands - recorded, int(np.count_nonzero(same)), tolerance)
+
+    samples = found.samples
+    recorded = _rows([sample.recorded for sample in samples])
+    commands = _rows([sample.replayed for sample in samples], recorded)
+    new_commands = _rows([sample.alternative for sample in samples], recorded)
+    return ReplayedBag(
+        path, complete, found, tolerance, new_range,
+        np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
+        _rows([sample.measured for sample in samples]),
+        _rows([sample.setpoint for sample in samples]), recorded, commands, new_commands,
+        compared(commands), None if new_range is None else compared(new_commands))
 
 
 def _rows(values: list[Array | None], like: Array | None = None) -> Array:

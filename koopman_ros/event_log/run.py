@@ -15,7 +15,13 @@ from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.event_log.loop import Alternative, Replay, replay
 from koopman_ros.event_log.records import EventRecord, RecordError
-from koopman_ros.event_log.report import ReplayedBag, reproduced, verdict, write_report
+from koopman_ros.event_log.report import (
+    compared_bag,
+    ReplayedBag,
+    reproduced,
+    verdict,
+    write_report,
+)
 from koopman_ros.event_log.sources import lately, Models, read_records
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.controller import built, ReplayParameters, table_of
@@ -86,8 +92,8 @@ def replayed_bag(path: str, parameters: ReplayParameters, topic: str = RECORDS,
             if parameters.model else [], alternative)
     except RecordError as error:
         raise BagReadError(f'bag {path!r}: {error}') from error
-    return ReplayedBag(path, summary(path).complete, found, parameters.tolerance,
-                       None if alternative is None else alternative.model.states)
+    return compared_bag(path, summary(path).complete, found, parameters.tolerance,
+                        None if alternative is None else alternative.model.states)
 
 
 def replay_records(records: Iterable[EventRecord], models: Sequence[Path] = (),

@@ -175,6 +175,21 @@ def words_of(signals: Signals,
     return StatusFormatter(Displays(signals.units, {'K': Display('K', 'degC', '.2f'), **shown}))
 
 
+def _role(signals: str, topic: str, *, commanded: bool = False
+          ) -> cached_property[dict[str, MessageField]]:
+    """Return a property of SignalTopics: the places of some signals, by name."""
+    def found(self: SignalTopics) -> dict[str, MessageField]:
+        of_inputs = signals == 'inputs'
+        given, units = ((self.inputs, self.signals.inputs) if of_inputs
+                        else (self.states, self.signals.states))
+        names = self.signals.controlled if signals == 'controlled' else given
+        field_of = _command_field if commanded else _measured_field
+        return {name: _place(getattr(given[name], topic), name, units[name], field_of(given[name]))
+                for name in names}
+
+    return cached_property(found)
+
+
 @dataclass(frozen=True)
 class SignalTopics:
     """
@@ -188,45 +203,16 @@ class SignalTopics:
     inputs: Mapping[str, Any]  #: places of its inputs, by name
     kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
 
-    @cached_property
-    def measured(self) -> dict[str, MessageField]:
-        """Where the states are measured."""
-        return {name: self._state(name, said.topic) for name, said in self.states.items()}
-
-    @cached_property
-    def predicted(self) -> dict[str, MessageField]:
-        """Where it is said what was expected of them."""
-        return {name: self._state(name, said.predicted_topic)
-                for name, said in self.states.items()}
-
-    @cached_property
-    def setpoints(self) -> dict[str, MessageField]:
-        """Where the set-points of the controlled states are asked for."""
-        return {name: self._state(name, self.states[name].setpoint_topic)
-                for name in self.signals.controlled}
-
-    @cached_property
-    def active_setpoints(self) -> dict[str, MessageField]:
-        """Where it is said what is tracked."""
-        return {name: self._state(name, self.states[name].active_setpoint_topic)
-                for name in self.signals.controlled}
-
-    @cached_property
-    def commands(self) -> dict[str, MessageField]:
-        """Where the inputs are commanded."""
-        return {name: self._command(name, said.command_topic)
-                for name, said in self.inputs.items()}
-
-    @cached_property
-    def manual(self) -> dict[str, MessageField]:
-        """Where an operator commands them."""
-        return {name: self._command(name, said.manual_topic) for name, said in self.inputs.items()}
-
-    @cached_property
-    def applied(self) -> dict[str, MessageField]:
-        """Where it is measured what acts."""
-        return {name: _at(name, said.topic, self.signals.inputs[name], said)
-                for name, said in self.inputs.items()}
+    #: measurements of the states, and their predictions
+    measured = _role('states', 'topic')
+    predicted = _role('states', 'predicted_topic')
+    #: requested and active set-points of the controlled states
+    setpoints = _role('controlled', 'setpoint_topic')
+    active_setpoints = _role('controlled', 'active_setpoint_topic')
+    #: commands of the inputs, those of an operator, and measurements of the applied inputs
+    commands = _role('inputs', 'command_topic', commanded=True)
+    manual = _role('inputs', 'manual_topic', commanded=True)
+    applied = _role('inputs', 'topic')
 
     def check(self) -> str:
         """Say what is wrong with them, or return an empty string."""
@@ -250,21 +236,16 @@ class SignalTopics:
         return tuple(dict.fromkeys(
             found.topic for kind in self.kinds for found in getattr(self, kind).values()))
 
-    def _state(self, name: str, topic: str) -> MessageField:
-        return _at(name, topic, self.signals.states[name], self.states[name])
 
-    def _command(self, name: str, topic: str) -> MessageField:
-        said = self.inputs[name]
-        same = not said.command_type or said.command_type == said.type
-        return _place(topic, name, self.signals.inputs[name], {
-            'type': said.command_type or said.type,
-            'field': said.command_field or (said.field if same else ''),
-            'unit': said.command_unit or (said.unit if same else '')})
+def _measured_field(given: MeasuredPlace) -> dict[str, str]:
+    return {'type': given.type, 'field': given.field, 'unit': given.unit}
 
 
-def _at(name: str, topic: str, unit: str, said: MeasuredPlace) -> MessageField:
-    return _place(topic, name, unit, {
-        'type': said.type, 'field': said.field, 'unit': said.unit})
+def _command_field(given: CommandedPlaces) -> dict[str, str]:
+    same = given.command_type in ('', given.type)
+    return {'type': given.command_type or given.type,
+            'field': given.command_field or (given.field if same else ''),
+            'unit': given.command_unit or (given.unit if same else '')}
 
 
 def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> MessageField:

@@ -10,8 +10,10 @@ plug-in, ``pi.temperature.gain``. See :mod:`koopman_ros.core.declaration`.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, Field, fields, replace
+from functools import partial, reduce
 import json
 import math
+from operator import attrgetter, itemgetter
 import re
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
@@ -34,6 +36,7 @@ __all__ = ['UNBOUNDED', 'ConfigurationError', 'ParameterTable', 'Specification',
            'group', 'in_own_units', 'lowest', 'parameter', 'per_signal', 'signal_value']
 
 T = TypeVar('T')
+_Path = tuple[Callable[[Any], Any], ...]
 
 _TYPE_WORDS = {
     bool: ('a boolean', 'true'),
@@ -137,10 +140,11 @@ class ParameterTable(Generic[T]):
         self.signals = signals
         self._groups = groups
         self._plugins = plugins
-        rows = dict(self._declared(kind, '', defaults))
+        declared = list(self._declared(kind, '', defaults))
+        self._paths: dict[str, _Path] = {row.name: path for row, path in declared}
         # a file begins with what is not of a signal or a plug-in
-        self.rows: dict[str, Specification] = dict(sorted(
-            rows.items(), key=lambda row: (row[0].count('.'), self._first(row[0]))))
+        self.rows: dict[str, Specification] = {row.name: row for row, _ in sorted(
+            declared, key=lambda one: (one[0].name.count('.'), self._first(one[0].name)))}
 
     def _first(self, name: str) -> int:
         """Return the place of a row's signal or plug-in."""
@@ -148,30 +152,32 @@ class ParameterTable(Generic[T]):
         prefix = name.partition('.')[0]
         return prefixes.index(prefix) if prefix in prefixes else len(prefixes)
 
-    def _declared(self, kind: type[Any], prefix: str, defaults: Mapping[str, Any]
-                  ) -> Iterator[tuple[str, Specification]]:
+    def _declared(self, kind: type[Any], prefix: str, defaults: Mapping[str, Any],
+                  path: _Path = ()) -> Iterator[tuple[Specification, _Path]]:
+        """Yield the rows, each with the way to its value in a snapshot."""
         for item in fields(kind):
             how = item.metadata
+            here: _Path = (*path, attrgetter(item.name))
             if 'nested' in how:
-                yield from self._declared(how['nested'], prefix, defaults)
+                yield from self._declared(how['nested'], prefix, defaults, here)
             elif 'plugins' in how:
                 for name, own in self._plugins.items():
-                    yield from self._declared(own, f'{name}.', defaults)
+                    yield from self._declared(own, f'{name}.', defaults, (*here, itemgetter(name)))
             elif 'group' in how:
-                for given in self._groups[item.name]:
-                    name = f'{item.name}.{given.name}'
-                    yield name, replace(given, name=name)
+                for row in self._groups[item.name]:
+                    yield (replace(row, name=f'{item.name}.{row.name}'),
+                           (*here, itemgetter(row.name)))
             elif 'per_signal' in how:
                 for signal, unit in self._of(item).items():
-                    for row in fields(how['per_signal']):
-                        name = f'{prefix}{signal}.{row.name}'
-                        yield name, _row(name, row, unit, defaults)
+                    for field in fields(how['per_signal']):
+                        yield (_row(f'{prefix}{signal}.{field.name}', field, unit, defaults),
+                               (*here, itemgetter(signal), attrgetter(field.name)))
             elif 'column' in how:
-                for signal, unit in self._of(item).items():
-                    name = f'{prefix}{signal}.{_name(item)}'
-                    yield name, _row(name, item, unit, defaults)
+                for i, (signal, unit) in enumerate(self._of(item).items()):
+                    yield (_row(f'{prefix}{signal}.{_name(item)}', item, unit, defaults),
+                           (*here, itemgetter(i), float, partial(_as_shown, item, unit=unit)))
             else:
-                yield prefix + item.name, _row(prefix + item.name, item, '', defaults)
+                yield _row(prefix + item.name, item, '', defaults), here
 
     def _of(self, item: Field[Any]) -> Mapping[str, str]:
         """Return names and units of the signals of a field."""
@@ -213,29 +219,8 @@ class ParameterTable(Generic[T]):
 
     def values(self, snapshot: T) -> dict[str, Any]:
         """Return the values of a snapshot by name."""
-        found = dict(self._flat(snapshot, ''))
-        return {name: found[name] for name in self.rows}
-
-    def _flat(self, part: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-        for item in fields(part):
-            how, name, value = item.metadata, item.name, getattr(part, item.name)
-            if 'nested' in how:
-                yield from self._flat(value, prefix)
-            elif 'plugins' in how:
-                for plugin, own in value.items():
-                    yield from self._flat(own, f'{plugin}.')
-            elif 'group' in how:
-                yield from ((f'{name}.{row}', number) for row, number in value.items())
-            elif 'per_signal' in how:
-                for signal, of in value.items():
-                    yield from ((f'{prefix}{signal}.{row.name}', getattr(of, row.name))
-                                for row in fields(of))
-            elif 'column' in how:
-                for (signal, unit), number in zip(
-                        self._of(item).items(), value.tolist(), strict=True):
-                    yield f'{prefix}{signal}.{_name(item)}', _as_shown(item, number, unit)
-            else:
-                yield prefix + name, value
+        return {name: reduce(lambda part, step: step(part), self._paths[name], snapshot)
+                for name in self.rows}
 
     def amended(self, snapshot: T, **values: Any) -> T:
         """Return a snapshot with other values of some names."""

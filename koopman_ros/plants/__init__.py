@@ -4,8 +4,13 @@
 """Control-affine systems, their steady states, actuators and simulation; imports plant data."""
 
 from koopman_ros.plants.catalogue import build, plant_class, PLANTS
-from koopman_ros.plants.constants import Constant, constant, Constants, constants_of
-from koopman_ros.plants.estimated_parameters import estimated_parameters_of, EstimatedParameter
+from koopman_ros.plants.constants import (
+    Constant,
+    constant,
+    Constants,
+    constants_of,
+    estimated_parameters_of,
+)
 from koopman_ros.plants.excitation import (
     box_episodes,
     ExcitationError,
@@ -43,7 +48,6 @@ __all__ = [
     'Constants',
     'ControlAffineSystem',
     'EquilibriumError',
-    'EstimatedParameter',
     'ExcitationError',
     'IntegrationError',
     'IntegrationFailure',

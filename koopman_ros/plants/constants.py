@@ -4,10 +4,16 @@
 """Physical constants of a plant: fields of a dataclass with unit, range and how SI has them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from koopman_ros.core.units import to_celsius, to_kelvin
+
+# A range of positive numbers whose ends differ by such a factor is gone through in powers.
+_WIDE = 10.0
+_ON_EDGE = 1.0 - 1e-9  # of a range from -1 to 1: no search begins where nothing moves
 
 
 def constant(default: float, unit: str, lower: float, upper: float, description: str, *,
@@ -59,6 +65,39 @@ class Constant:
     #: the range in which it is estimated from a record, None where it is taken as known
     estimated: tuple[float, float] | None = None
 
+    @property
+    def in_powers(self) -> bool:
+        """Whether its logarithm is estimated."""
+        return self.unit != 'degC' and self.lower > 0.0 and self.upper >= _WIDE * self.lower
+
+    def value(self, share: float) -> float:
+        """Return the value at a share of the range, from -1 at its lower end to 1."""
+        middle, half = self._span()
+        found = middle + half * share
+        # the ends themselves, whatever rounding makes of them
+        return min(max(float(np.exp(found)) if self.in_powers else found, self.lower), self.upper)
+
+    def share(self, value: float) -> float:
+        """Return where in the range a value is, from -1 at the lower end to 1."""
+        middle, half = self._span()
+        return float((np.log(value) if self.in_powers else value) - middle) / half
+
+    def slope(self, share: float) -> float:
+        """Return how much the value changes with the share."""
+        half = self._span()[1]
+        return half * self.value(share) if self.in_powers else half
+
+    @property
+    def start(self) -> float:
+        """The share to begin with: the class's own value, the middle where that is outside."""
+        outside = not self.lower < self.default < self.upper
+        return 0.0 if outside else float(np.clip(self.share(self.default), -_ON_EDGE, _ON_EDGE))
+
+    def _span(self) -> tuple[float, float]:
+        low, high = (np.log([self.lower, self.upper]) if self.in_powers
+                     else (self.lower, self.upper))
+        return float(0.5 * (low + high)), float(0.5 * (high - low))
+
 
 def constants_of(plant: Any) -> tuple[Constant, ...]:
     """Return the constants of a plant's class in SI; none where it declares none."""
@@ -68,6 +107,35 @@ def constants_of(plant: Any) -> tuple[Constant, ...]:
         row.metadata['description'],
         None if (ends := row.metadata['estimated']) is None else (
             _shown(row, ends[0]), _shown(row, ends[1]))) for row in _rows(plant))
+
+
+def estimated_parameters_of(plant: Any, ranges: Mapping[str, tuple[float, float] | None]
+                            ) -> tuple[Constant, ...]:
+    """
+    Return the constants of a plant's class to be estimated, each with the range of its search.
+
+    :param ranges: lowest and highest value by name, in SI, None for the range that the class
+        gives; nothing at all for the constants of which the class says that they are estimated.
+    :raises ValueError: for a constant that there is not, and a range outside that of the class.
+    """
+    known = {constant.name: constant for constant in constants_of(plant)}
+    own = {name: constant.estimated for name, constant in known.items() if constant.estimated}
+    if not (ranges or own):
+        raise ValueError(f'{plant.__name__} does not say which of its constants are to be '
+                         f'estimated: name some of {", ".join(known) or "none"}, with ranges')
+    found = []
+    for name, given in (ranges or dict.fromkeys(own)).items():
+        if name not in known:
+            raise ValueError(f'{name} is no constant of {plant.__name__}: it has '
+                             f'{", ".join(known) or "none"}')
+        one = known[name]
+        low, high = given or own.get(name) or (one.lower, one.upper)
+        if not one.lower <= low < high <= one.upper:
+            raise ValueError(
+                f'the range of {name} is [{low:.10g}, {high:.10g}] {one.unit}, must rise and lie '
+                f'in [{one.lower:.10g}, {one.upper:.10g}] {one.unit}')
+        found.append(replace(one, lower=low, upper=high))
+    return tuple(found)
 
 
 def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:

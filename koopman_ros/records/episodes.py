@@ -94,7 +94,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
             for episode in loop.episodes(segment):
                 account.used += len(states) * len(episode)
                 yield episode
-        account.notes += [*loop.breaks.notes(loop.bag), *loop.notes]
+        account.notes += loop.breaks.notes(loop.bag)
     account.dropped = +account.dropped
 
 
@@ -104,7 +104,7 @@ def distinct(bags: Sequence[str | os.PathLike[str]], account: ImportReport
     read: set[str] = set()
     for bag in bags:
         if (path := os.path.realpath(bag)) in read:
-            account.notes.append(f'{os.fspath(bag)} is named twice: read once')
+            account.note(f'{os.fspath(bag)} is named twice: read once')
             continue
         read.add(path)
         yield bag
@@ -121,7 +121,6 @@ class _Loop:
     tolerance_ns: int
     least_jumps: Sequence[float]
     breaks: EpisodeBreaks = field(default_factory=EpisodeBreaks)
-    notes: dict[str, None] = field(default_factory=dict)  #: each once, in their order
 
     def __post_init__(self) -> None:
         self.content: BagSummary = summary(self.bag)
@@ -144,15 +143,15 @@ class _Loop:
         """Return an input without the measured one if the bag lacks that."""
         if signal.measured is None or signal.measured.topic in self.content.types:
             return signal
-        self.account.notes.append(f'{self.bag} has no topic {signal.measured.topic!r}: '
-                                  f'{signal.name} is taken from its command')
+        self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: {signal.name} is '
+                          'taken from its command')
         return replace(signal, measured=None)
 
     def segments(self) -> Iterator[Segment]:
         """Yield the numbers between resets of time, long ones in portions."""
         if not self.content.complete:
-            self.account.notes.append(f'{self.bag} was not closed or is damaged: read up to its '
-                                      'last complete record')
+            self.account.note(f'{self.bag} was not closed or is damaged: read up to its last '
+                              'complete record')
         counts, n_x = self.content.counts, len({signal.place for signal in self.states})
         places = list(self.scales)
         topics: dict[str, list[tuple[int, MessageField, tuple[float, float]]]] = {}
@@ -170,16 +169,16 @@ class _Loop:
                 if back_ns := segment.set_back(number, stamp_ns):
                     back = back_ns / NANOSECONDS
                     self.breaks.add('set back', f'{back:.3f} s', back)
-                    yield self._checked(segment)
+                    yield segment
                     segment = Segment(places, n_x)
                 segment.add(number, stamp_ns, message.log_time_ns, value)
             while read % _CHECKED == 0 and segment.is_complete(size):
-                yield self._checked(segment)
+                yield segment
                 segment = segment.following()
         if left := sum(counts[topic] for topic in topics) - read:
-            self.account.notes.append(f'{self.bag} is damaged: {left} messages that it counts '
-                                      'could not be read')
-        yield self._checked(segment)
+            self.account.note(f'{self.bag} is damaged: {left} messages that it counts could not '
+                              'be read')
+        yield segment
 
     def _accepted(self, message: BagMessage, place: MessageField, lowest: float, highest: float
                   ) -> tuple[int, float] | None:
@@ -192,15 +191,15 @@ class _Loop:
             self.account.dropped[f'outside {lowest:g} to {highest:g} {place.unit}'] += 1
             return None
         if stamp_ns is None:
-            self.notes[f'{self.bag}: messages of {place.topic} ({place.type}) have no stamp: '
-                       'their receipt counts'] = None
+            self.account.note(f'{self.bag}: messages of {place.topic} ({place.type}) have no '
+                              'stamp: their receipt counts')
             return NO_STAMP, value
         return stamp_ns, value
 
-    def _checked(self, segment: Segment) -> Segment:
+    def _check_pace(self, segment: Segment) -> None:
         """Raise BagReadError where receipts count that run differently from /clock in the bag."""
         if self.content.types.get(_CLOCK) != _CLOCK_TYPE or not segment.without_stamps():
-            return segment
+            return
         times = np.fromiter((
             (message.message.clock.sec + message.message.clock.nanosec / NANOSECONDS,
              message.log_time_ns / NANOSECONDS)
@@ -214,10 +213,10 @@ class _Loop:
                 f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
                 "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
                 "--use-sim-time'), or use a type with a header")
-        return segment
 
     def episodes(self, segment: Segment) -> Iterator[Episode]:
         """Align one segment and cut it at its gaps and jumps."""
+        self._check_pace(segment)
         dropped, n_x = self.account.dropped, len(self.states)
         clock = segment.clock()
         samples = align_by_timestamp(segment, clock, self.states, self.tolerance_ns, dropped)
@@ -229,8 +228,8 @@ class _Loop:
             return
         spike = self._leaps(x)[0]
         odd = spike.any(axis=1)
-        for j in range(n_x):
-            dropped[self._named(j, 'spike of a single sample')] += int(np.sum(spike[:, j]))
+        for state, count in zip(self.states, spike.sum(axis=0).tolist(), strict=True):
+            dropped[named(self.states, state, 'spike of a single sample')] += count
         dropped['beside a spike'] += n_x * int(np.sum(odd)) - int(np.sum(spike))
         stamps, x = stamps[~odd], x[~odd]
         period = float(np.median(np.diff(stamps)))
@@ -263,7 +262,8 @@ class _Loop:
                 self.breaks.add('gap', f'{seconds:.3f} s {at}', seconds)
             else:
                 j = int(np.argmax(jump[end]))
-                level = self._named(j, f'{x[end, j]:.6g} {self.states[j].place.unit}')
+                state = self.states[j]
+                level = named(self.states, state, f'{x[end, j]:.6g} {state.place.unit}')
                 self.breaks.add('jump', f'{level} {at}', float(x[end, j]))
         return ends
 
@@ -281,9 +281,6 @@ class _Loop:
         return Episode((stamps - origin) / NANOSECONDS, np.column_stack(scaled),
                        (changes - origin) / NANOSECONDS, u,
                        linear if any(linear) else ()).part(0, len(stamps))
-
-    def _named(self, j: int, what: str) -> str:
-        return named(self.states, self.states[j], what)
 
     def _leaps(self, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return where each state (N, n_x) has a spike, and where it jumps."""
@@ -329,14 +326,11 @@ class _Loop:
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
                 or np.max(np.diff(times)) > reach):
             if len(measured[0]):
-                self._note(f'{name} was not measured throughout, and is taken from its command '
-                           'there')
+                self.account.note(f'{self.bag}: {name} was not measured throughout, and is taken '
+                                  'from its command there')
             return *applied_inputs.around(*commands, stamps), False
         for held in (commands[1], np.clip(commands[1], values.min(), values.max())):
             if applied_inputs.follows_command(commands[0], held, times, values):
                 return *applied_inputs.around(commands[0], held, stamps), False
-        self._note(f'{name} is taken as it was measured')
+        self.account.note(f'{self.bag}: {name} is taken as it was measured')
         return times, values, True
-
-    def _note(self, words: str) -> None:
-        self.notes[f'{self.bag}: {words}'] = None

@@ -44,6 +44,11 @@ class ImportReport:
     dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
     notes: list[str] = field(default_factory=list)  #: anything else, in sentences
 
+    def note(self, text: str) -> None:
+        """Add a note, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
     def add(self, other: 'ImportReport') -> None:
         """Take in that of other bags."""
         self.measurements += other.measurements

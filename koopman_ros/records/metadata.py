@@ -14,6 +14,7 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 import yaml
 
+from koopman_ros.core.paths import write_atomically
 from koopman_ros.records.message_definitions import MessageDefinition
 
 METADATA_FILE = 'metadata.yaml'
@@ -113,22 +114,8 @@ def dump_metadata(metadata: Mapping[str, Any]) -> str:
 
 def write_metadata_file(folder: Path, metadata: Mapping[str, Any]) -> None:
     """Write metadata.yaml of a bag directory; it appears complete or not at all."""
-    temporary = folder / f'{METADATA_FILE}.tmp'
-    with temporary.open('w', encoding='utf-8') as stream:
-        stream.write(dump_metadata({METADATA_KEY: dict(metadata)}) + '\n')
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, folder / METADATA_FILE)
-    sync_folder(folder)
-
-
-def sync_folder(folder: Path) -> None:
-    """Write the entries of a directory through to the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    text = dump_metadata({METADATA_KEY: dict(metadata)}) + '\n'
+    write_atomically(folder / METADATA_FILE, text.encode())
 
 
 def _time_range(range_ns: tuple[int, int] | None) -> dict[str, Any]:

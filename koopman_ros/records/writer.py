@@ -17,6 +17,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
 from koopman_ros import __version__
+from koopman_ros.core.paths import sync_folder
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records import metadata
 from koopman_ros.records.message_definitions import MessageDefinition
@@ -180,7 +181,7 @@ class BagWriter:
         if self._is_directory:
             metadata.write_metadata_file(self.path, metadata.bag_metadata(self._completed))
         else:
-            metadata.sync_folder(self.path.parent)
+            sync_folder(self.path.parent)
 
     def _raise_background_error(self) -> None:
         if self._completion is not None and self._completion.done():

@@ -3,7 +3,7 @@
 
 """Serialized messages of four types, made by ROS itself, and bags of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 import importlib
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,17 @@ import warnings
 import pytest
 
 from koopman_ros.records import BagWriter, message_definition
-from support.bag_samples import OFFERED_QOS, Sample, TOPICS
+from support.bag_samples import (
+    FLOAT,
+    JOINTS,
+    OFFERED_QOS,
+    PRESSURE,
+    Sample,
+    Sent,
+    TEMPERATURE,
+    TOPICS,
+    WALL,
+)
 
 _START_NS = 1_700_000_000_123_456_789
 
@@ -78,5 +88,47 @@ def write_bag(samples: list[Sample]) -> Callable[..., Path]:
                 writer.write(
                     sample.topic, sample.data, sample.log_time_ns, sample.publish_time_ns)
         return path
+
+    return write
+
+
+@pytest.fixture
+def write_sent(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that writes messages of types that fit their values; it may not close."""
+    serialize = importlib.import_module('rclpy.serialization').serialize_message
+    sensor, std = (importlib.import_module(f'{name}_msgs.msg') for name in ('sensor', 'std'))
+
+    def made(one: Sent, kind: str, start_ns: int) -> tuple[str, Any]:
+        if one.stamp is None:
+            return FLOAT, std.Float64(data=one.value)
+        if isinstance(one.value, dict):
+            kind, message = JOINTS, sensor.JointState(
+                name=list(one.value), position=list(one.value.values()))
+        elif kind == PRESSURE:
+            message = sensor.FluidPressure(fluid_pressure=float(one.value))
+        else:
+            message = sensor.Temperature(temperature=float(one.value))
+        stamp_ns = round(one.stamp * 10**9) + (start_ns if one.stamp else 0)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        return kind, message
+
+    def write(messages: Iterable[Sent], name: str = 'run.mcap', *, kind: str = TEMPERATURE,
+              topics: Sequence[str] = (), log_start_ns: int = 0, wall: bool = False,
+              closed: bool = True) -> Path:
+        writer = BagWriter(tmp_path / name)
+        for topic in topics:
+            writer.add_topic(topic, message_definition(kind))
+        for number, one in enumerate(messages):
+            own_kind, message = made(one, kind, WALL if wall else 0)
+            writer.add_topic(one.topic, message_definition(own_kind))
+            received = one.stamp if one.received is None else one.received
+            writer.write(one.topic, serialize(message), log_start_ns + round(received * 10**9))
+            if number % 20 == 19:
+                writer.flush()
+        before = None if closed else writer.path.read_bytes()
+        writer.close()
+        if before is not None:
+            writer.path.write_bytes(before)
+        return writer.path
 
     return write

@@ -4,8 +4,8 @@
 """Signals as arrays, their jumps, and what acted on which measurement, as read from bags."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-import importlib
+from dataclasses import replace
+from functools import partial
 import math
 from pathlib import Path
 
@@ -15,29 +15,15 @@ import pytest
 from koopman_ros import records
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import MessageField
-from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 from koopman_ros.records.series import outliers_and_steps
-from support.bag_samples import Sample
+from support.bag_samples import noted, PRESSURE, Sample, Sent, WALL
 
 MEASURED, COMMAND = '/level', '/valve'
-PRESSURE = 'sensor_msgs/msg/FluidPressure'
 STATE = records.RecordedState('level', 'Pa',
                               MessageField(MEASURED, PRESSURE, 'fluid_pressure', 'Pa'))
 INPUT = records.RecordedInput('valve', 'Pa',
                               MessageField(COMMAND, PRESSURE, 'fluid_pressure', 'Pa'))
-# what the wall clock says where stamps are simulated
-WALL = 1_700_000_000 * SECOND
-
-
-@dataclass(frozen=True)
-class Sent:
-    """A message: topic, stamp [s], value, receipt [s after WALL; the stamp's if None]."""
-
-    topic: str
-    stamp: float
-    value: float
-    received: float | None = None
 
 
 def measured(*seconds: float) -> list[Sent]:
@@ -52,33 +38,9 @@ def loop(count: int, first: int = 1, late: float = 0.0, answer: float = 0.01) ->
 
 
 @pytest.fixture
-def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
-    """Return a function that writes messages to a bag; it can be left unclosed."""
-    serialize = importlib.import_module('rclpy.serialization').serialize_message
-    message = importlib.import_module('sensor_msgs.msg').FluidPressure
-    time = importlib.import_module('builtin_interfaces.msg').Time
-
-    def write(messages: Iterable[Sent], name: str = 'run.mcap', *, wall: bool = False,
-              closed: bool = True) -> Path:
-        writer = records.BagWriter(tmp_path / name)
-        definition = records.message_definition(PRESSURE)
-        writer.add_topic(MEASURED, definition)
-        writer.add_topic(COMMAND, definition)
-        for number, one in enumerate(messages):
-            stamp_ns = round(one.stamp * SECOND) + (WALL if wall and one.stamp else 0)
-            written = message(fluid_pressure=float(one.value))
-            written.header.stamp = time(sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
-            received = one.stamp if one.received is None else one.received
-            writer.write(one.topic, serialize(written), WALL + round(received * SECOND))
-            if number % 20 == 19:
-                writer.flush()
-        before = None if closed else writer.path.read_bytes()
-        writer.close()
-        if before is not None:
-            writer.path.write_bytes(before)
-        return writer.path
-
-    return write
+def write(write_sent: Callable[..., Path]) -> Callable[..., Path]:
+    """Return a function that writes pressures to a bag, which the wall clock received."""
+    return partial(write_sent, kind=PRESSURE, topics=(MEASURED, COMMAND), log_start_ns=WALL)
 
 
 def read(*paths: Path) -> tuple[list[Episode], records.ImportReport]:
@@ -100,85 +62,76 @@ def answers(first: int, last: int, later: float = 0.0) -> list[tuple[float, floa
 
 SPIKE_AND_JUMP = {k: 5000.0 if k == 40 else 3000.0 * (k > 70) for k in range(1, 121)}
 NO_INPUT = 'too short, or without any input'
-NEW = 'a new episode begins'
 
 
-@pytest.mark.parametrize(('messages', 'values', 'acting', 'lines'), [
-    pytest.param(loop(20), [range(1, 21)], [answers(1, 20)], ['20 of 20 measurements used'],
+@pytest.mark.parametrize(('messages', 'values', 'acting', 'dropped', 'note'), [
+    pytest.param(loop(20), [range(1, 21)], [answers(1, 20)], {}, (),
                  id='answers act from their stamp on'),
     pytest.param([s for k in range(1, 21)
                   for s in (*measured(k), Sent(COMMAND, k, 25.0 if 8 <= k < 15 else 20.0))],
                  [range(1, 21)], [[(1.0, 20.0), (8.0, 25.0), (15.0, 20.0)]],
-                 ['20 of 20 measurements used'], id='an input that stays is one'),
+                 {}, (), id='an input that stays is one'),
     pytest.param([Sent(COMMAND, 0.5, 20.0), *measured(*range(1, 12)), Sent(COMMAND, 5.25, 30.0),
                   Sent(COMMAND, 5.75, 10.0)],
                  [range(1, 12)], [[(0.5, 20.0), (5.25, 30.0), (5.75, 10.0)]],
-                 ['11 of 11 measurements used'], id='commands between measurements'),
+                 {}, (), id='commands between measurements'),
     pytest.param([*loop(5), Sent(COMMAND, 5.0, 77.0, 5.2), *loop(7, 6)], [range(1, 13)],
                  [[*answers(1, 5), (5.0, 77.0), *answers(6, 12)]],
-                 ['12 of 12 measurements used'], id='the last word for a measurement counts'),
+                 {}, (), id='the last word for a measurement counts'),
     pytest.param([*loop(15), *loop(12, 40)], [range(1, 16), range(40, 52)],
                  [answers(1, 15), answers(40, 51)],
-                 ['27 of 27 measurements used', f'{{bag}}: gap of 25.000 s at 15.000 s, {NEW}'],
-                 id='gap'),
+                 {}, ('gap', '25.000 s', '15.000 s'), id='gap'),
     pytest.param([*loop(15), *loop(9, 40)], [range(1, 16)], [answers(1, 15)],
-                 ['15 of 24 measurements used', '9 dropped: in a segment of fewer than 10',
-                  f'{{bag}}: gap of 25.000 s at 15.000 s, {NEW}'], id='short segment'),
+                 {'in a segment of fewer than 10': 9}, ('gap', '25.000 s', '15.000 s'),
+                 id='short segment'),
     pytest.param([s for s in loop(20) if (s.topic, s.stamp) not in [(MEASURED, 7), (MEASURED, 8)]],
                  [[*range(1, 7), *range(9, 21)]], [answers(1, 20)],
-                 ['18 of 18 measurements used'], id='a few lost samples are no gap'),
+                 {}, (), id='a few lost samples are no gap'),
     pytest.param([Sent(COMMAND, 0.5, 20.0), *measured(*range(1, 13)), *measured(*range(60, 72))],
                  [range(1, 13), range(60, 72)], [[(0.5, 20.0)]] * 2,
-                 ['24 of 24 measurements used', f'{{bag}}: gap of 48.000 s at 12.000 s, {NEW}'],
-                 id='a command is held over a gap'),
+                 {}, ('gap', '48.000 s', '12.000 s'), id='a command is held over a gap'),
     pytest.param([replace(s, value=s.value + SPIKE_AND_JUMP[s.stamp]) if s.topic == MEASURED else s
                   for s in loop(120)],
                  [[*range(1, 40), *range(41, 71)], range(3071, 3121)],
                  [answers(1, 70), answers(71, 120, 3000.0)],
-                 ['119 of 120 measurements used', '1 dropped: spike of a single sample',
-                  f'{{bag}}: jump to 3071 Pa at 70.000 s, {NEW}'], id='spike and jump'),
+                 {'spike of a single sample': 1}, ('jump', '3071 Pa', '70.000 s'),
+                 id='spike and jump'),
     pytest.param([*loop(30), *(Sent(s.topic, s.stamp, s.value + 500.0, s.received + 100.0)
                                for s in loop(12))],
                  # what acted before is not what acts now
                  [range(1, 31), range(501, 513)],
                  [answers(1, 30), [(500.0 + k, 600.0 + k) for k in range(1, 12)]],
-                 ['42 of 42 measurements used',
-                  f'{{bag}}: time was set back by 29.000 s, {NEW}'], id='time set back'),
+                 {}, ('time was set back', '29.000 s'), id='time set back'),
     # 5.5 s arrives after 6 s; 9 s comes twice, with another value
     pytest.param([*loop(6), Sent(MEASURED, 5.5, 5.5, 6.2), *loop(3, 7),
                   Sent(MEASURED, 9.0, 999.0, 9.9), *loop(11, 10)],
                  [[*range(1, 6), 5.5, *range(6, 21)]], [answers(1, 20)],
-                 ['21 of 22 measurements used', '1 dropped: measurement with a repeated stamp'],
-                 id='late and repeated stamps'),
+                 {'measurement with a repeated stamp': 1}, (), id='late and repeated stamps'),
     pytest.param([*measured(*range(1, 16)), *loop(14, 16)], [range(16, 30)], [answers(16, 29)],
-                 ['14 of 29 measurements used', '15 dropped: before the first input'],
-                 id='measurements before the first command'),
-    pytest.param([], [], [], ['0 of 0 measurements used'], id='nothing'),
+                 {'before the first input': 15}, (), id='measurements before the first command'),
+    pytest.param([], [], [], {}, (), id='nothing'),
     pytest.param(measured(*range(1, 21)), [], [],
-                 ['0 of 20 measurements used', f'20 dropped: {NO_INPUT}'], id='no command'),
-    pytest.param(loop(9), [], [], ['0 of 9 measurements used', f'9 dropped: {NO_INPUT}'],
-                 id='too short'),
+                 {NO_INPUT: 20}, (), id='no command'),
+    pytest.param(loop(9), [], [], {NO_INPUT: 9}, (), id='too short'),
     pytest.param([s for s in loop(20) if s.topic == COMMAND], [], [],
-                 ['0 of 0 measurements used'], id='no measurement'),
+                 {}, (), id='no measurement'),
     pytest.param([Sent(s.topic, 0.0, s.value, s.stamp) for s in loop(20)], [], [],
-                 ['0 of 20 measurements used', f'1 dropped: {NO_INPUT}',
-                  '19 dropped: measurement with a repeated stamp'],
+                 {NO_INPUT: 1, 'measurement with a repeated stamp': 19}, (),
                  id='a sensor that does not stamp'),
 ])
 def test_episodes_of_a_bag(
     write: Callable[..., Path], messages: list[Sent], values: list[Iterable[float]],
-    acting: list[list[tuple[float, float]]], lines: list[str]
+    acting: list[list[tuple[float, float]]], dropped: dict[str, int], note: tuple[str, ...]
 ) -> None:
-    bag = write(messages)
-    episodes, account = read(bag)
+    episodes, account = read(write(messages))
     # values tell the stamps
     assert [episode.x[:, 0].tolist() for episode in episodes] == [list(one) for one in values]
     for episode in episodes:
         np.testing.assert_allclose(episode.time, episode.x[:, 0] - episode.x[0, 0], atol=1e-12)
     assert [inputs(episode) for episode in episodes] == acting
-    first, *others = [line.replace('{bag}', str(bag)) for line in lines]
-    assert account.lines()[0] == first
-    assert sorted(account.lines()[1:]) == sorted(others)
+    assert account.dropped == dropped
+    assert account.measurements == account.used + sum(dropped.values())
+    assert noted(account, *note) if note else not account.notes
 
 
 def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> None:
@@ -219,7 +172,7 @@ def test_commands_without_a_stamp_act_when_received(write: Callable[..., Path], 
     (episode,), account = read(write(messages, wall=wall))
     # the clocks' nanoseconds since 1970 are told apart to some hundred
     assert [t for t, _ in inputs(episode)] == pytest.approx([1.5, 12.25], abs=1e-5)
-    assert account.lines() == ['29 of 30 measurements used', '1 dropped: before the first input']
+    assert (account.used, account.dropped) == (29, {'before the first input': 1})
 
 
 def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
@@ -228,14 +181,11 @@ def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
         Sent(MEASURED, 5.0, 50.0, k + 0.5))]
     gaps = [Sent(topic, 100.0 + 40.0 * k + (k > 6) + t, 20.0, 5000.0 + 40.0 * k + t)
             for k in range(9) for t in range(12) for topic in (COMMAND, MEASURED)]
-    bag = write([*set_back, *gaps])
-    episodes, account = read(bag)
+    episodes, account = read(write([*set_back, *gaps]))
     assert len(episodes) == 9
-    assert account.notes == [
-        f'{bag}: time was set back by 5.000 s, the first of 500, at most by 9.990 s; a new '
-        'episode begins at each',
-        f'{bag}: gap of 95.000 s at 5.000 s, the first of 9, the longest of 95.000 s at 5.000 s; '
-        'a new episode begins at each']
+    back, gap = account.notes
+    assert all(words in back for words in ('set back', '5.000 s', '500', '9.990 s'))
+    assert all(words in gap for words in ('gap', '95.000 s at 5.000 s', 'of 9'))
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, -1e13])
@@ -266,7 +216,7 @@ def test_bag_that_is_named_twice_is_read_once(write: Callable[..., Path], tmp_pa
     (tmp_path / 'link.mcap').symlink_to(bag)
     episodes, account = read(bag, tmp_path / 'link.mcap')
     assert len(episodes) == 1
-    assert account.notes == [f'{tmp_path}/link.mcap is named twice: read once']
+    assert noted(account, 'link.mcap', 'twice')
 
 
 @pytest.mark.parametrize(('cut', 'left'), [(0, 30), (600, 20)])
@@ -277,8 +227,7 @@ def test_bag_that_was_not_closed(write: Callable[..., Path], cut: int, left: int
     bag.write_bytes(content[:len(content) - cut])
     (episode,), account = read(bag)
     assert len(episode) == left
-    assert account.notes == [
-        f'{bag} was not closed or is damaged: read up to its last complete record']
+    assert noted(account, 'not closed or is damaged')
 
 
 def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
@@ -289,7 +238,7 @@ def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
     bag.write_bytes(content)
     (episode,), account = read(bag)
     assert len(episode) == 10
-    assert account.notes == [f'{bag} is damaged: 40 messages that it counts could not be read']
+    assert noted(account, 'damaged', '40 messages')
 
 
 def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -> None:

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 import importlib
 from pathlib import Path
+import re
 import shutil
 from typing import Any
 
@@ -180,6 +181,12 @@ def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
         source.write_text(whole.replace(written, other), encoding='utf-8')
         with pytest.raises(records.BagReadError, match=f"holds {kind}.* with 'ros2 bag convert'"):
             records.read_messages(path)
+    (path / 'run_0.db3').touch()
+    source.write_text(whole, encoding='utf-8')
+    change(path, lambda found: found.update(
+        storage_identifier='', relative_file_paths=['run_0.db3']))
+    with pytest.raises(records.BagReadError, match=r'sqlite3 files.*ros2 bag convert'):
+        records.read_messages(path)
     source.write_text(whole, encoding='utf-8')
     (path / 'run_0.mcap').unlink()
     with pytest.raises(records.BagReadError, match=r"lists 'run_0\.mcap', which is not there"):
@@ -330,51 +337,31 @@ def test_metadata_without_an_identifier_of_the_storage(
     assert records.summary(path).complete
 
 
-def test_other_storage_without_an_identifier_is_refused_by_its_name(tmp_path: Path) -> None:
-    path = record(tmp_path / 'run', range(5))
-    (path / 'run_0.db3').write_bytes(b'SQLite format 3\0')
-    change(path, lambda information: information.update(
-        storage_identifier='', relative_file_paths=['run_0.db3']))
-    with pytest.raises(records.BagReadError, match=r'sqlite3 files.*ros2 bag convert'):
-        records.read_messages(path)
-
-
-NAMES = pytest.mark.parametrize('name', [
+@pytest.mark.parametrize('name', [
     'run_{}.mcap', '{}_run_2025_12_17-10_{:02}_00.mcap',
     '{}_run_2025_12_17-10_{:02}_00.mcap.zstd'])
-
-
-def split(path: Path, name: str, count: int) -> list[str]:
-    """Write files of one number each, numbered as rosbag2 names them, and return their names."""
-    path.mkdir()
-    names = [name.format(k, k) for k in range(count)]
-    for k, own in enumerate(names):
-        content = record(path.parent / f'{k}.mcap', [k]).read_bytes()
-        (path / own).write_bytes(zstandard.compress(content) if own.endswith('.zstd') else content)
-    return names
-
-
-@NAMES
-def test_files_without_metadata_are_read_by_their_numbers(tmp_path: Path, name: str) -> None:
-    split(tmp_path / 'run', name, 12)
-    assert [m.message.data for m in records.read_messages(tmp_path / 'run', recover=True)] == [
-        float(k) for k in range(12)]
-
-
-@NAMES
-def test_numbered_file_that_is_not_listed_is_no_secret(tmp_path: Path, name: str) -> None:
+def test_files_that_no_metadata_lists_are_read_by_their_numbers(tmp_path: Path, name: str) -> None:
     path = tmp_path / 'run'
-    names = split(path, name, 3)
+    path.mkdir()
+    names = [name.format(k, k) for k in range(13)]
+    for k, own in enumerate(names[:12]):
+        content = record(tmp_path / f'{k}.mcap', [k]).read_bytes()
+        (path / own).write_bytes(zstandard.compress(content) if own.endswith('.zstd') else content)
+    (path / names[12]).touch()
+    numbers = [float(k) for k in range(12)]
+    assert [m.message.data for m in records.read_messages(path, recover=True)] == numbers
     # of another recording, and of none
-    (path / 'other_3.mcap').write_bytes((path / names[0]).read_bytes())
-    (path / 'notes.mcap').write_bytes((path / names[0]).read_bytes())
+    for other in ('other_3.mcap', 'notes.mcap'):
+        shutil.copy(path / names[0], path / other)
+    # as left by a recorder whose disk was full when it completed the second file
     (path / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': {
-        'storage_identifier': 'mcap', 'relative_file_paths': names[:2],
+        'storage_identifier': 'mcap', 'relative_file_paths': [names[0], *names[2:10]],
         'compression_format': 'zstd' if name.endswith('.zstd') else ''}}))
-    with pytest.raises(records.BagReadError, match=r'is not listed in metadata\.yaml'):
+    with pytest.raises(records.BagReadError, match=(
+            rf"{re.escape(names[1])}' is not listed in metadata\.yaml, .*: set recover to true")):
         records.read_messages(path)
     assert not records.summary(path).complete
-    assert [m.message.data for m in records.read_messages(path, recover=True)] == [0.0, 1.0, 2.0]
+    assert [m.message.data for m in records.read_messages(path, recover=True)] == numbers
 
 
 @pytest.mark.parametrize('schema', ['std_msgs/Float64', 'std_msgs/msg/Float64'])

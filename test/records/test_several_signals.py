@@ -3,11 +3,9 @@
 
 """Episodes of several states and inputs: put together by stamp, in units, inputs as measured."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-import importlib
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,58 +14,22 @@ from koopman_ros import records
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import RecordedInput, RecordedState
-from support.bag_samples import Sample
+from support.bag_samples import FLOAT, JOINTS, noted, Sent, TEMPERATURE
 
-TEMPERATURE, JOINTS, NUMBER = (
-    'sensor_msgs/msg/Temperature', 'sensor_msgs/msg/JointState', 'std_msgs/msg/Float64')
 WARM = RecordedState('warm', 'K', MessageField('/warm', TEMPERATURE, 'temperature', 'degC'))
 COLD = RecordedState('cold', 'K', MessageField('/cold', TEMPERATURE, 'temperature', 'degC'))
 TANKS = [RecordedState(name, 'm', MessageField('/tanks', JOINTS, f'position[{name}]', 'mm'))
          for name in ('low', 'high')]
-PUMP = RecordedInput('pump', 'm^3/s', MessageField('/pump_setpoint', NUMBER, 'data', 'L/s'))
+PUMP = RecordedInput('pump', 'm^3/s', MessageField('/pump_setpoint', FLOAT, 'data', 'L/s'))
 JACKET = RecordedInput(
     'jacket', 'K', MessageField('/jacket_setpoint', TEMPERATURE, 'temperature', 'degC'),
     MessageField('/jacket', TEMPERATURE, 'temperature', 'degC'))
 COMMANDED = replace(JACKET, measured=None)
 
 
-@dataclass(frozen=True)
-class Sent:
-    """A message: topic, stamp [s] or None, what it carries, receipt [s] if not the stamp."""
-
-    topic: str
-    stamp: float | None
-    value: float | dict[str, float]
-    received: float | None = None
-
-
 @pytest.fixture
-def write(samples: list[Sample], tmp_path: Path) -> Callable[[Iterable[Sent]], Path]:
-    """Return a function that writes messages to a bag, of a type that fits what they carry."""
-    serialize = importlib.import_module('rclpy.serialization').serialize_message
-    sensor, std = (importlib.import_module(f'{name}_msgs.msg') for name in ('sensor', 'std'))
-
-    def made(one: Sent) -> tuple[str, Any]:
-        if one.stamp is None:
-            return NUMBER, std.Float64(data=one.value)
-        kind, message = (
-            (JOINTS, sensor.JointState(name=list(one.value), position=list(one.value.values())))
-            if isinstance(one.value, dict)
-            else (TEMPERATURE, sensor.Temperature(temperature=one.value)))
-        stamp_ns = round(one.stamp * SECOND)
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND)
-        return kind, message
-
-    def write(messages: Iterable[Sent]) -> Path:
-        with records.BagWriter(tmp_path / 'run.mcap') as writer:
-            for one in messages:
-                kind, message = made(one)
-                writer.add_topic(one.topic, records.message_definition(kind))
-                time = one.stamp if one.received is None else one.received
-                writer.write(one.topic, serialize(message), round(time * SECOND))
-        return writer.path
-
-    return write
+def write(write_sent: Callable[..., Path]) -> Callable[..., Path]:
+    return write_sent
 
 
 def jacket(*values: float) -> list[Sent]:
@@ -85,9 +47,8 @@ def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., 
         [0.01 * np.arange(1, 16), 0.5 + 0.001 * np.arange(1, 16)]), rel=1e-12)
     assert episode.u[:, 0] == pytest.approx([0.002, 0.003])
     assert episode.input_time.tolist() == [0.0, 5.0]
-    assert account.lines() == [
-        '30 of 30 measurements used',
-        f'{path}: messages of /pump_setpoint ({NUMBER}) have no stamp: their receipt counts']
+    assert (account.measurements, account.used) == (30, 30)
+    assert noted(account, '/pump_setpoint', 'no stamp')
 
 
 def test_message_without_an_element_is_counted(write: Callable[..., Path]) -> None:
@@ -146,14 +107,14 @@ def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
     episodes, account = records.loop_episodes(*recorded)
     assert [len(episode) for episode in episodes] == [69, 50]
     assert account.dropped == {'spike of a single sample (warm)': 1, 'beside a spike': 1}
-    assert account.notes == [f'{path}: jump to 42.1 degC (cold) at 70.000 s, a new episode begins']
+    assert noted(account, 'jump', '42.1 degC', 'cold', '70.000 s')
     # a change of 25 K may not be one
     (episode,), _ = records.loop_episodes(*recorded, least_jumps=[1.0, 26.0])
     assert len(episode) == 119
 
 
 def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path]) -> None:
-    level = RecordedState('level', 'm', MessageField('/level', NUMBER, 'data', 'm'))
+    level = RecordedState('level', 'm', MessageField('/level', FLOAT, 'data', 'm'))
     # the stamps are simulated, ten times as fast as the recorder's clock
     path = write([Sent('/jacket_setpoint', 1, 1.0, 100.05), *(s for k in range(1, 21) for s in (
         Sent('/warm', k, 50.0 + k, 100.0 + 0.1 * k),
@@ -162,8 +123,7 @@ def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path
         [path], [WARM, level], [COMMANDED], tolerance_ns=SECOND // 50)
     assert episode.x[:, 1].tolist() == list(range(1, 21))
     assert episode.time.tolist() == list(range(20))
-    assert account.notes == [
-        f'{path}: messages of /level ({NUMBER}) have no stamp: their receipt counts']
+    assert noted(account, '/level', 'no stamp')
 
 
 # Inputs as they were measured.
@@ -195,7 +155,7 @@ def test_input_behind_a_lag_is_linear_between_its_measurements(write: Callable[.
     assert episode.input_time.tolist() == episode.time.tolist()
     area = np.concatenate(([0.0], np.cumsum(0.5 * (u[1:] + u[:-1] + 2 * 273.15))))
     assert episode.input_integral(episode.time)[:, 0] == pytest.approx(area)
-    assert account.notes == [f'{path}: jacket is taken as it was measured']
+    assert noted(account, 'jacket', 'measured')
 
 
 @pytest.mark.parametrize(('lag', 'ceiling', 'noise', 'values'), [
@@ -226,13 +186,12 @@ def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callab
     (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
     assert episode.linear == ()
     assert episode.u[:, 0] == pytest.approx(np.array([293.15, 303.15, 283.15]))
-    assert account.notes == [
-        f'{path}: jacket was not measured throughout, and is taken from its command there']
+    assert noted(account, 'jacket', 'not measured throughout')
     path.unlink()
     write([s for s in run if s.topic != '/jacket'])
     (again,), account = records.loop_episodes([path], [WARM], [JACKET])
     assert np.array_equal(again.u, episode.u)
-    assert account.notes == [f"{path} has no topic '/jacket': jacket is taken from its command"]
+    assert noted(account, "no topic '/jacket'")
 
 
 def test_one_input_measured_and_one_commanded(write: Callable[..., Path]) -> None:

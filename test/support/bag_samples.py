@@ -20,7 +20,7 @@ from rosbags.interfaces import (
 import yaml
 import zstandard
 
-from koopman_ros.records import BagWriter, MessageDefinition
+from koopman_ros.records import BagWriter, ImportReport, MessageDefinition
 
 TOPICS = {
     '/temperature': 'sensor_msgs/msg/Temperature',
@@ -28,6 +28,10 @@ TOPICS = {
     '/joint_states': 'sensor_msgs/msg/JointState',
     '/clock': 'rosgraph_msgs/msg/Clock',
 }
+TEMPERATURE, PRESSURE, JOINTS, FLOAT = (
+    'sensor_msgs/msg/Temperature', 'sensor_msgs/msg/FluidPressure', 'sensor_msgs/msg/JointState',
+    'std_msgs/msg/Float64')
+WALL = 1_700_000_000 * 10**9  # time of the wall clock [ns] at which bags with stamps of it begin
 # RMW_DURATION_INFINITE
 NEVER = QosTime(9223372036, 854775807)
 DEFAULT_QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, NEVER,
@@ -81,6 +85,21 @@ class Sample:
     data: bytes
     log_time_ns: int
     publish_time_ns: int
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A message: topic, stamp [s] or None, value, time of receipt [s], by default the stamp."""
+
+    topic: str
+    stamp: float | None
+    value: float | dict[str, float]
+    received: float | None = None
+
+
+def noted(account: ImportReport, *words: str) -> bool:
+    """Tell whether an import has one note, which holds some words."""
+    return len(account.notes) == 1 and all(word in account.notes[0] for word in words)
 
 
 def compressed_files(files: dict[str, bytes]) -> dict[str, bytes]:

@@ -18,7 +18,7 @@ from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.learning.identification.drift import Drift
 from koopman_ros.model import Box
-from koopman_ros.plants import build, ControlAffineSystem, EstimatedParameter
+from koopman_ros.plants import build, Constant, ControlAffineSystem
 
 # Of an angle, by which the equations are differentiated by a constant: rounding and curvature both
 # leave about ten digits.
@@ -35,7 +35,7 @@ class Equations(Drift):
     """
 
     plant: Any  #: the class, see :func:`koopman_ros.plants.plant_class`
-    sought: tuple[EstimatedParameter, ...]
+    sought: tuple[Constant, ...]
     theta: Array  #: (p,) the angles
     #: (n_x,) that a class is given which takes one, for what it stands still at does not matter
     #: here and may not exist; None for another
@@ -44,7 +44,7 @@ class Equations(Drift):
     __repr__ = short_repr
 
     @classmethod
-    def of(cls, plant: Any, sought: Sequence[EstimatedParameter], known: PlantDescription,
+    def of(cls, plant: Any, sought: Sequence[Constant], known: PlantDescription,
            x: Array, u: Array
            ) -> Equations:
         """
@@ -179,7 +179,7 @@ def _rate(system: ControlAffineSystem, x: Array, u: Array) -> Array:
     return system.drift(x) + system.forcing(x, u)
 
 
-def _built(plant: Any, sought: Sequence[EstimatedParameter], theta: Array, nominal: Array | None
+def _built(plant: Any, sought: Sequence[Constant], theta: Array, nominal: Array | None
            ) -> ControlAffineSystem:
     return build(plant, {one.name: one.value(share) for one, share in zip(
         sought, np.sin(theta).tolist(), strict=True)}, nominal)

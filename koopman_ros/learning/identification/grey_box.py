@@ -29,7 +29,7 @@ from koopman_ros.learning.identification.identify import (
 from koopman_ros.learning.identification.innovations_form import Predictor
 from koopman_ros.learning.identification.output_error import innovations_form, Refined
 from koopman_ros.model import Coordinates
-from koopman_ros.plants import estimated_parameters_of, EstimatedParameter
+from koopman_ros.plants import Constant, estimated_parameters_of
 
 # How far disturbances, as filters assume them, move a state from sample to sample, over the noise
 # of the measurements, in deviations.
@@ -166,7 +166,7 @@ def _within(record: SplitRecord, predictor: Predictor[Equations]) -> Predictor[E
     return Predictor(replace(drift, box=replace(drift.box, states=new)), gain)
 
 
-def _estimates(sought: Sequence[EstimatedParameter], refined: Refined[Equations]
+def _estimates(sought: Sequence[Constant], refined: Refined[Equations]
                ) -> tuple[EstimatedConstant, ...]:
     """Return values, standard errors and how they are to be taken."""
     shares, p = refined.model.shares, len(sought)
