@@ -82,8 +82,8 @@ def study(backend: Backend | None = None) -> Found:
     reactors = {'unchanged': REACTOR, **disturbances.CHANGED}
     back = spread('back from the safe coolant', lambda key: stability.back_from_safe(
         reactors[key[0]], key[1]), product(reactors, narrow.LINEAR_MARGINS))
-    courses = spread('lifts of narrow data', lambda name: getattr(narrow, f'{name}_courses')(),
-                     ('reactor', 'two_state'))
+    plants = {'reactor': narrow.reactor_courses, 'two_state': narrow.two_state_courses}
+    courses = spread('lifts of narrow data', lambda name: plants[name](), plants)
     far = spread('far from the model', lambda key: narrow.far_from_the_model(*key),
                  product(narrow.LINEAR_MARGINS, narrow.MARGIN_BANDWIDTHS))
     figures = {
