@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
@@ -20,7 +20,7 @@ import queue
 import signal
 import tempfile
 import time
-from typing import Any, Protocol
+from typing import Any
 import uuid
 
 import cloudpickle
@@ -46,14 +46,26 @@ _JOIN = 30.0  # s for its first worker
 _STOP = 'stop'
 
 
-class _Channel(Protocol):
-    """Messages between a task and the process that waits for it; sent to the workers."""
+class _Channel(ABC):
+    """Progress messages of a task to the calling process; a copy goes to the worker."""
 
-    def begin(self, number: int) -> bool:
-        """Note that a task begins; return whether it should end."""
+    _last = -PERIOD
+
+    @abstractmethod
+    def send(self, number: int, value: Any) -> bool:
+        """Send the progress of a task, None at its start; return whether it should end."""
 
     def tell(self, number: int, value: Any) -> bool:
-        """Send the progress of a task; return whether it should end."""
+        """Send the progress at most once a period; return whether the task should end."""
+        if time.monotonic() - self._last < PERIOD:
+            return False
+        self._last = time.monotonic()
+        return self.send(number, value)
+
+
+# the channel, the source of the call for workers, and functions that return new messages and
+# request the end of all tasks
+_Messages = tuple[_Channel, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]
 
 
 class _Pool(Backend):
@@ -110,7 +122,7 @@ class _Pool(Backend):
                         if time.monotonic() > abandoned:
                             return
                     if lost:
-                        self._restart()
+                        self._abandon(futures)
                     for number in lost & begun if lost & begun else lost:
                         losses[number] += 1
                         if losses[number] == _ATTEMPTS:
@@ -122,9 +134,8 @@ class _Pool(Backend):
                     self._abandon(futures)
 
     @abstractmethod
-    def _messages(self, call: bytes) -> contextlib.AbstractContextManager[tuple[
-            _Channel, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]]:
-        """Return channel, source of the call for workers, and functions: news, and stop."""
+    def _messages(self, call: bytes) -> contextlib.AbstractContextManager[_Messages]:
+        """Open the channel of a run."""
 
     @abstractmethod
     def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -134,11 +145,9 @@ class _Pool(Backend):
         """Return the result or the exception of a task."""
         return future.exception() or future.result()
 
-    def _restart(self) -> None:
-        """Replace workers that died."""
-
-    def _abandon(self, futures: Mapping[Future[Any], int]) -> None:
-        """Leave tasks that do not end."""
+    @abstractmethod
+    def _abandon(self, futures: Iterable[Future[Any]]) -> None:
+        """Give up tasks that do not end, and workers that died."""
 
 
 class Processes(_Pool):
@@ -167,15 +176,11 @@ class Processes(_Pool):
         future: Future[Any] = self._executor.submit(function, *arguments)
         return future
 
-    def _restart(self) -> None:
-        self.close()
-
     def _abandon(self, _: object) -> None:
         self.close()
 
     @contextlib.contextmanager
-    def _messages(self, call: bytes) -> Generator[tuple[
-            _Channel, Path, Callable[[], list[tuple[int, Any]]], Callable[[], None]]]:
+    def _messages(self, call: bytes) -> Generator[_Messages]:
         with tempfile.TemporaryDirectory(prefix='koopman_ros_') as name:
             folder, seen = Path(name), dict[str, bytes]()
             source = folder / 'call'
@@ -192,22 +197,13 @@ class Processes(_Pool):
             yield _Folder(folder), source, news, (folder / _STOP).touch
 
 
-class _Folder:
+class _Folder(_Channel):
     """Messages by files of a folder."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._last = folder, -PERIOD
+        self._folder = folder
 
-    def begin(self, number: int) -> bool:
-        return self._write(number, None)
-
-    def tell(self, number: int, value: Any) -> bool:
-        if time.monotonic() - self._last >= PERIOD:
-            self._last = time.monotonic()
-            return self._write(number, value)
-        return (self._folder / _STOP).exists()
-
-    def _write(self, number: int, value: Any) -> bool:
+    def send(self, number: int, value: Any) -> bool:
         # a rename, so that no half is read
         draft = self._folder / f'{number}.draft'
         draft.write_bytes(pickle.dumps(value))
@@ -258,7 +254,7 @@ class Cluster(_Pool):
         error = future.exception()
         return _worker_lost(name) if isinstance(error, KilledWorker) else error or future.result()
 
-    def _abandon(self, futures: Mapping[Future[Any], int]) -> None:
+    def _abandon(self, futures: Iterable[Future[Any]]) -> None:
         for future in futures:
             future.cancel()
 
@@ -267,8 +263,7 @@ class Cluster(_Pool):
                              'again, and repeat the work')
 
     @contextlib.contextmanager
-    def _messages(self, call: bytes) -> Generator[tuple[
-            _Channel, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]]:
+    def _messages(self, call: bytes) -> Generator[_Messages]:
         import distributed
         token, told = uuid.uuid4().hex, queue.SimpleQueue[tuple[int, Any]]()
         event = distributed.Event(token, client=self._client)
@@ -291,20 +286,14 @@ class Cluster(_Pool):
                 self._client.unsubscribe_topic(token)
 
 
-class _Topic:
+class _Topic(_Channel):
     """Messages by a topic and an event of the Dask scheduler."""
 
     def __init__(self, token: str) -> None:
-        self._token, self._last = token, -PERIOD
+        self._token = token
 
-    def begin(self, number: int) -> bool:
-        return self.tell(number, None)
-
-    def tell(self, number: int, value: Any) -> bool:
+    def send(self, number: int, value: Any) -> bool:
         import distributed
-        if time.monotonic() - self._last < PERIOD:
-            return False
-        self._last = time.monotonic()
         worker = distributed.get_worker()
         worker.log_event(self._token, (number, value))
         stopped: bool = distributed.Event(self._token).is_set()
@@ -322,7 +311,7 @@ def _unpacked(source: Path | bytes) -> Any:
 
 def _call(channel: _Channel, source: Path | bytes, number: int, item: bytes) -> Any:
     """Run a task on a worker."""
-    if channel.begin(number):
+    if channel.send(number, None):
         return _NotBegun()
     function, shared = _unpacked(source)
     return function(shared, pickle.loads(item), partial(channel.tell, number))

@@ -145,7 +145,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
 
     :param learned: what was trained, or compared by :func:`compare_classes`, of which the chosen
         model is judged, and whose closed loops are not run again.
-    :param loops: see :func:`~koopman_ros.evaluation.closed_loop_test.check_law`, as for `watch`.
+    :param loops: see :func:`evaluate_closed_loops`, as for `watch`.
     :raises Stopped: when `watch` ended it.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)

@@ -56,7 +56,7 @@ class TrainingTask:
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
     #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.
     physical_model: str = ''
-    #: constants of it that are looked for, see :func:`koopman_ros.plants.sought_of`
+    #: constants of it that are looked for, see :func:`koopman_ros.plants.estimated_parameters_of`
     constants: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
     #: units

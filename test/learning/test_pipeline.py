@@ -165,7 +165,7 @@ def test_report(accepted):
 @pytest.mark.usefixtures('learned')
 def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
     original = task_module.evaluate_model
-    monkeypatch.setattr(task_module, 'decide', lambda *arguments, **named: replace(
+    monkeypatch.setattr(task_module, 'evaluate_model', lambda *arguments, **named: replace(
         original(*arguments, **named), rmse=np.array([np.inf]), reasons=('it diverges',)))
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
     metrics = load(retrained.model_file).provenance.metrics

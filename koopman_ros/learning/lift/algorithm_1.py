@@ -26,7 +26,7 @@ class Algorithm1:
     Levenberg-Marquardt where the paper takes IPOPT.
 
     The objective falls when z shrinks and the decoder grows, so that it does not tell a good lift
-    from a useless one; see :class:`~koopman_ros.learning.lift.incremental.Growth` for what does.
+    from a useless one; see :class:`IncrementalTraining` for what does.
     """
 
     n_z: int  #: number of lifted coordinates
@@ -56,7 +56,7 @@ class Algorithm1:
 
     def start(self, data: ScaledSamples, n_z: int, parent: TrainedLift | None, seed: int,
               monitor: Monitor | None = None) -> TrainedLift:
-        """Run the algorithm once, as :meth:`Growth.start`; `parent` has no part in it."""
+        """Run the algorithm once; `parent` is not used."""
         layout = Layout(data.x.shape[1], n_z, self.hidden, self.identity,
                         0 if data.u is None else data.u.shape[1], self.decoder)
         generator = torch.Generator().manual_seed(seed)

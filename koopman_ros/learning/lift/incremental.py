@@ -34,7 +34,7 @@ class TrainedLift:
     layout: Layout  #: its sizes
     theta: Tensor  #: (p,) parameters
     status: MinimumStatus  #: how the last minimisation ended
-    decrease: float = math.nan  #: see :class:`Minimum`
+    decrease: float = math.nan  #: see :class:`LeastSquaresResult`
     drift_alone: bool = False  #: whether it is the lift z = x, for a read-out of hidden units
     iterations: int = 0  #: steps of the minimisations together
 

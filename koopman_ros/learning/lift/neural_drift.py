@@ -72,7 +72,7 @@ class NeuralDrift:
 
     hidden: int = 16  #: units of the hidden layer
     max_iterations: int = 500  #: limit of Levenberg-Marquardt steps
-    tolerance: float = 1e-3  #: as in :class:`~koopman_ros.learning.lift.incremental.Growth`
+    tolerance: float = 1e-3  #: as in :class:`IncrementalTraining`
 
     def __post_init__(self) -> None:
         if self.hidden < 1:
@@ -84,7 +84,7 @@ class NeuralDrift:
 
     def start(self, data: ScaledSamples, n_z: int, parent: TrainedLift | None, seed: int,
               monitor: Monitor | None = None) -> TrainedLift:
-        """Train from random hidden units, as :meth:`Growth.start`; `parent` has no part in it."""
+        """Train from random hidden units; `parent` is not used."""
         # a free lift of this size has the very parameters of the drift: V, A (n_x, n_x) and B
         layout = Layout(n_z, n_z, self.hidden, False, 0 if data.u is None else data.u.shape[1])
         generator = torch.Generator().manual_seed(seed)

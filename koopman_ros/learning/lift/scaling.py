@@ -35,7 +35,7 @@ class Scaling:
         """
         Choose it by some samples.
 
-        :param pre_feedback: weight of the input, where there is to be one, see :class:`Growth`.
+        :param pre_feedback: as in :class:`IncrementalTraining`.
         """
         inputs = InputModel.of(plant, box, samples.x)
         plain = _plain(box, inputs, samples)

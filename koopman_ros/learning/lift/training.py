@@ -101,7 +101,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
         refused.
     :param loops: closed loops in which the law is tried before, see
-        :func:`~koopman_ros.evaluation.closed_loop_test.check_law`; 0 for none.
+        :func:`~koopman_ros.evaluation.closed_loop_test.evaluate_closed_loops`; 0 for none.
     :param device: that evaluates the residuals, as torch names it, on every worker.
     :param threads: torch's threads for each start, for a number of which the bits are the same.
     :param backend: of starts and closed loops, see :func:`~koopman_ros.execution.backend_of`; this
@@ -109,7 +109,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param begin: a lift of a plant of the same kind that the training begins from: its coordinates
         are fitted to the samples in one start, further ones are added as usual. None to begin from
         nothing.
-    :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
+    :raises TrainingFailed: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes, or when its law fails in closed loop.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe or a lift
         to begin from that does not fit, times that contradict the derivatives, a nominal point
