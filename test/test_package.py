@@ -4,6 +4,7 @@
 """Tests of the package as a whole: manifest, versions, licence headers, import directions."""
 
 import ast
+from collections import Counter
 import functools
 import importlib.metadata
 import os
@@ -216,6 +217,13 @@ def test_imports_run_one_way(package: str) -> None:
         if package not in ('ros', 'nodes', 'demo', 'testing'):
             assert not [name for name in used if re.match(
                 r'(rclpy|rcl_|\w+_(msgs|interfaces)(\.|$))', name)], path
+
+
+def test_no_class_name_has_two_meanings() -> None:
+    found = [node.name for folder in ('koopman_ros', 'studies', 'benchmarks')
+             for path in ROOT.glob(f'{folder}/**/*.py')
+             for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
+    assert sorted(name for name, count in Counter(found).items() if count > 1) == []
 
 
 def test_nothing_installed_imports_what_is_not_and_few_packages_torch() -> None:
