@@ -113,8 +113,8 @@ def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
     # a plotting tool that does not match hides it no more than it hides that
     latched = bench.ros.node.create_subscription(
         Temperature, reactor.PREDICTED_TEMPERATURE, lambda _: None, topics.LATCHED_QOS)
-    bench.ros.wait_for_status('controller: connections', lambda s: 'durability' in s.message)
-    bench.status(lambda s: 'set-point 80.00' in s.message and 'durability' in s.message)
+    bench.ros.wait_for_status('controller: connections', lambda s: 'transient local' in s.message)
+    bench.status(lambda s: 'set-point 80.00' in s.message and 'transient local' in s.message)
     bench.ros.wait_for_status('controller: requests', lambda s: 'set-point 80.00' in s.message)
     bench.ros.node.destroy_subscription(latched)
     bench.ros.wait_for_status('controller: connections', lambda s: s.level == DiagnosticStatus.OK)
