@@ -46,9 +46,9 @@ ROW = """
     TABLE = ParameterTable(Wider, groups={'constants': ()})
     """
 TYPE = """
-    from koopman_ros.core.message_fields import Carrier, CARRIERS
+    from koopman_ros.core.message_fields import FieldDefaults, KNOWN_TYPES
 
-    CARRIERS['sensor_msgs/msg/BatteryState'] = Carrier('voltage', 'V', 0.0, 1e3)
+    KNOWN_TYPES['sensor_msgs/msg/BatteryState'] = FieldDefaults('voltage', 'V', 0.0, 1e3)
     """
 
 

@@ -24,7 +24,7 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
         patch.setattr(task_module, 'identify', lambda *given, **others: original(
             *given, **{**others, 'degrees': degrees, 'methods': methods(*windows)}))
         patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
-        patch.setattr(task_module, 'decide', partial(evaluate_model, loops=loops))
+        patch.setattr(task_module, 'evaluate_model', partial(evaluate_model, loops=loops))
         yield
 
 
