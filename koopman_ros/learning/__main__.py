@@ -21,7 +21,7 @@ import time
 from typing import Any
 
 from koopman_ros.learning import retrain, retrain_fleet, TrainingTask
-from koopman_ros.learning.fleet import EXPECTED, one_line
+from koopman_ros.learning.fleet import error_text, EXPECTED
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.pipeline import OnProgress
 from koopman_ros.learning.report import reported
@@ -60,7 +60,7 @@ def main() -> int:
         _print(stopped=True)
         return 1
     except EXPECTED as error:
-        _print(error=one_line(error))
+        _print(error=error_text(error))
         return 1
     summary, files = reported(retrained)
     _print(summary=summary, files=files)

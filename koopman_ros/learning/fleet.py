@@ -11,17 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from koopman_ros.execution import (
-    Backend,
-    backend_of,
-    SchedulerLost,
-    Serial,
-    Tell,
-    WorkerLost,
-)
+from koopman_ros.execution import Backend, backend_of, SchedulerLost, Tell, WorkerLost
 from koopman_ros.learning.identification import Stopped
-from koopman_ros.learning.lift.scaling import checked_device
-from koopman_ros.learning.pipeline import retrain_by
+from koopman_ros.learning.pipeline import retrain
 from koopman_ros.learning.report import reported
 from koopman_ros.learning.task import FIRST, TrainingTask
 
@@ -116,19 +108,18 @@ def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnP
 
 
 def _retrained(_: None, task: TrainingTask, tell: Tell) -> TrainingOutcome:
-    """Retrain one plant, wherever that is."""
-    checked_device(task.device)
-    retrained = retrain_by(Serial(), task, lambda share, text: tell((share, text)))
-    return TrainingOutcome(*reported(retrained))
+    # serially, as the plants are what runs side by side
+    return TrainingOutcome(*reported(retrain(
+        replace(task, executor=''), lambda share, text: tell((share, text)))))
 
 
 def _failed(error: BaseException) -> TrainingOutcome:
     if isinstance(error, Stopped):
         return TrainingOutcome(None, stopped=True)
-    return TrainingOutcome(None, error=one_line(error))
+    return TrainingOutcome(None, error=error_text(error))
 
 
-def one_line(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return the text of an error in a line; of an unexpected one with its class."""
     said = ' '.join(str(error).split())
     expected = isinstance(error, EXPECTED)

@@ -169,31 +169,24 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
-    It is worked where the task says, and gives the same lift wherever that is; arguments, what it
-    writes and raises as for :func:`retrain_by`.
-
-    :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
-    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
-    """
-    checked_device(task.device)
-    with backend_of(task.executor) as backend:
-        return retrain_by(backend, task, on_progress)
-
-
-def retrain_by(backend: Backend, task: TrainingTask, on_progress: OnProgress = lambda *_: False
-               ) -> Retrained:
-    """
-    Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
-
-    An accepted lift goes to the output file, and what was there before is kept beside it as
-    ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``. Where what a
-    sibling's lift has become would be refused, the lift is learned from nothing after all.
+    An accepted lift goes to the output file; the file that it replaces is kept as
+    ``.previous.safetensors``. A refused lift goes to ``.refused.safetensors``. If the lift that
+    training makes of a sibling's would be refused, training starts again without the sibling.
+    The result does not depend on the executor of the task.
 
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` asked for it; nothing is written then.
+    :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
+    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
     """
+    checked_device(task.device)
+    with backend_of(task.executor) as backend:
+        return _retrain(backend, task, on_progress)
+
+
+def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> Retrained:
     thresholds = _checked(task)
     current, sibling = (load(path) if path else None
                         for path in (task.model, task.warm_start_model))

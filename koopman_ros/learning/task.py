@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-import json
 import math
 from typing import Any, TypeVar
 
@@ -75,13 +74,8 @@ class TrainingTask:
     device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
-    def from_json(cls, text: str) -> TrainingTask:
-        """Read a task; unknown or missing fields are a TypeError."""
-        return cls.of(json.loads(text))
-
-    @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrainingTask:
-        """Return the task of its fields as JSON has them; as :meth:`from_json`."""
+        """Return a task from JSON fields; TypeError if one is unknown or missing."""
         states = tuple(RecordedState(**{**signal, 'place': MessageField(**signal['place'])})
                        for signal in values['states'])
         inputs = tuple(RecordedInput(**{

@@ -230,12 +230,11 @@ def test_a_task_survives_json():
     task = TrainingTask(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
                         (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)),
                         seed=3, input_gain={'temperature': {'other': 2.1}})
-    assert TrainingTask.from_json(json.dumps(asdict(task))) == task
+    assert TrainingTask.of(json.loads(json.dumps(asdict(task)))) == task
     with pytest.raises(TypeError, match='nonsense'):
-        TrainingTask.from_json(json.dumps({**asdict(task), 'nonsense': 1}))
+        TrainingTask.of({**asdict(task), 'nonsense': 1})
     with pytest.raises(TypeError, match='nonsense'):
-        TrainingTask.from_json(json.dumps({**asdict(task), 'states': [
-            {**asdict(STATES[0]), 'nonsense': 1}]}))
+        TrainingTask.of({**asdict(task), 'states': [{**asdict(STATES[0]), 'nonsense': 1}]})
 
 
 @pytest.mark.parametrize(('values', 'error', 'words'), [

@@ -200,7 +200,7 @@ def by_equations(tmp_path_factory):
                         model_class='polynomial', physical_model='two_tanks',
                         constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
     # as the process that retrains is given it
-    return retrain(TrainingTask.from_json(json.dumps(asdict(task))))
+    return retrain(TrainingTask.of(json.loads(json.dumps(asdict(task)))))
 
 
 def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):

@@ -3,7 +3,7 @@
 
 """Algorithm 1 of the paper, to which incremental training is compared."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -65,7 +65,7 @@ class Algorithm1:
         status, iterations = MinimumStatus.MAX_ITERATIONS, 0
         for number in range(self.max_rounds):
             weight = self.lambda_initial / self.gamma ** number
-            weighted = problem.with_weights(ResidualWeights(decoder=weight))
+            weighted = replace(problem, weights=ResidualWeights(decoder=weight))
             minimum = minimise(weighted.add_residuals, theta, max_iterations=self.max_iterations,
                                monitor=monitor)
             iterations += minimum.iterations

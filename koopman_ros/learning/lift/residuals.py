@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -86,10 +86,6 @@ class LiftProblem:
             floats = max(feature_count(self.layout),
                          self.layout.n_x * self.layout.size * bool(self.layout.decoder))
             object.__setattr__(self, 'chunk', max(64, CHUNK // floats))
-
-    def with_weights(self, weights: ResidualWeights) -> LiftProblem:
-        """Return the same problem with other weights."""
-        return replace(self, weights=weights)
 
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
         """Add the residuals at parameters (p,) over all samples."""
