@@ -157,7 +157,7 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
         excess[:failing.get(model.n_z, 0)] = np.inf
         return replace(evaluate_closed_loops(model, rate, loops=loops), excess=excess)
 
-    monkeypatch.setattr(model_selection, 'check_law', fails)
+    monkeypatch.setattr(model_selection, 'evaluate_closed_loops', fails)
     found = compare(BENT, bent_samples(), {}, loops=16)
     assert found.chosen.name == chosen
     refusal = f'no controller: the law fails in {failing[2]} of 16'
@@ -171,7 +171,7 @@ def test_all_laws_are_tried_where_the_data_are(monkeypatch):
     def noted(model, *_, **__):
         tried.append(model.training_states)
 
-    monkeypatch.setattr(model_selection, 'check_law', noted)
+    monkeypatch.setattr(model_selection, 'evaluate_closed_loops', noted)
     found = compare(TWO_STATE, two_state_samples(), {'drift': NeuralDrift(3, max_iterations=5)},
                     degrees=(2,), starts=1)
     assert len(tried) == 3
