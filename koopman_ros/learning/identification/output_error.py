@@ -17,12 +17,7 @@ from torch import Tensor
 
 from koopman_ros.core.datasets import Array
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.learning.identification.drift import (
-    Drift,
-    DriftModel,
-    first_measured,
-    Segments,
-)
+from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.lift.levenberg_marquardt import (
     minimise,
     normal_equations,
@@ -114,7 +109,7 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
     # without a gain a predictor never corrects its state: its prediction is a simulation
     return innovations_form(
         PolynomialCoefficients(model, learn_input_matrix), np.zeros((n_x, n_x)), segments,
-        model.box.states.to_deviation(first_measured(segments)), np.ones(n_x), smooth=True,
+        model.box.states.to_deviation(segments.x[0]), np.ones(n_x), smooth=True,
         tolerance=1e-6, monitor=monitor).model.drift
 
 
