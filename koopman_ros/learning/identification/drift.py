@@ -229,7 +229,10 @@ class Segments:
         path[0] = x = x0
         with np.errstate(all='ignore'):
             for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
-                path[k + 1] = x = runge_kutta_step(lambda x, u=u: rate(x, u), x, h)
+                def held(x: Array, u: Array = u) -> Array:
+                    return rate(x, u)
+
+                path[k + 1] = x = runge_kutta_step(held, x, h)
         return path
 
     def errors(self, rate: Rate, x0: Array) -> Array:

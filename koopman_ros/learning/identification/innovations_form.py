@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -61,7 +62,7 @@ class Predictor(Generic[_Drift]):
                 errors[k] = np.where(data.measured[k][:, None], target[k] - x[:, :n_y], 0.0)
                 estimates[k] = x = x + errors[k] @ self.gain.T
                 if k < len(v):
-                    x = runge_kutta_step(lambda x, v=v[k]: drift.scaled_rate(x, v), x,
+                    x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x,
                                          data.steps[k][:, None])
         return foreseen, estimates, errors
 
