@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 import itertools
 import math
 
@@ -104,11 +104,6 @@ class DriftModel(Drift):
     B: Array
 
     __repr__ = short_repr
-
-    @property
-    def monomials(self) -> PolynomialObservables:
-        """The monomials from degree 1 on."""
-        return PolynomialObservables.total_degree(len(self.box.states), self.degree)
 
     def features(self, xi: Array) -> Array:
         """Evaluate 1 and the monomials: (..., n_x) -> (..., 1 + m)."""
@@ -234,16 +229,15 @@ class Segments:
         path[0] = x = x0
         with np.errstate(all='ignore'):
             for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
-                path[k + 1] = x = runge_kutta_step(partial(_held, rate, u), x, h)
+                def held(x: Array, u: Array = u) -> Array:
+                    return rate(x, u)
+
+                path[k + 1] = x = runge_kutta_step(held, x, h)
         return path
 
     def errors(self, rate: Rate, x0: Array) -> Array:
         """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""
         return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
-
-
-def _held(rate: Rate, u: Array, x: Array) -> Array:
-    return rate(x, u)
 
 
 def longest_step(episodes: Sequence[Episode]) -> float:
@@ -262,7 +256,7 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     :return: the starts (M, n_x), and the mean squared errors from there (M, n_x), in state units
         squared, infinite on divergence.
     """
-    x0 = first_measured(segments)
+    x0 = segments.x[0]
     n_x = x0.shape[1]
     count = np.sum(segments.measured, axis=0)[:, None]
     best, least = x0, np.full_like(x0, np.inf)
@@ -285,13 +279,27 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
                 break
             # (K + 1, M, n_x, n_x): change of every state with each start
             slopes = np.moveaxis(found[:, 1:] - found[:, :1], 1, -1) / _STEP
-            normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
-            right = np.einsum('kmij,kmi->mj', slopes, errors)
-            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+            step = gauss_newton_step(slopes, errors)
+            if step is None:
                 break
-            inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-            x0 = x0 - scale * (inverse @ right[..., None])[..., 0]
+            x0 = x0 + scale * step
     return best, least * scale ** 2
+
+
+def gauss_newton_step(slopes: Array, errors: Array) -> Array | None:
+    """
+    Return the steps (M, p) that reduce the squared errors of M segments, None if not finite.
+
+    :param slopes: (K, M, n, p) derivatives of the errors.
+    :param errors: (K, M, n) errors of n signals at K samples.
+    """
+    normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
+    right = np.einsum('kmij,kmi->mj', slopes, errors)
+    if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+        return None
+    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+    step: Array = -(inverse @ right[..., None])[..., 0]
+    return step
 
 
 def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
@@ -328,11 +336,6 @@ def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:
     squares = fitted_starts(rate, segments, scale)[1]
     weights = np.sum(segments.measured, axis=0)
     return np.sqrt(np.average(squares, axis=0, weights=weights))
-
-
-def first_measured(segments: Segments) -> Array:
-    """Return the first measurement of each segment (M, n_x)."""
-    return segments.x[0].copy()
 
 
 def _grid(episode: Episode, longest: float) -> Array:

@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -14,7 +15,12 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
+from koopman_ros.learning.identification.drift import (
+    Drift,
+    DriftModel,
+    gauss_newton_step,
+    Segments,
+)
 from koopman_ros.learning.identification.weak_form import regress
 
 SETTLING = 40  # samples after which a filter has found the state
@@ -56,7 +62,8 @@ class Predictor(Generic[_Drift]):
                 errors[k] = np.where(data.measured[k][:, None], target[k] - x[:, :n_y], 0.0)
                 estimates[k] = x = x + errors[k] @ self.gain.T
                 if k < len(v):
-                    x = runge_kutta_step(_held(drift, v[k]), x, data.steps[k][:, None])
+                    x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x,
+                                         data.steps[k][:, None])
         return foreseen, estimates, errors
 
     def _target(self, data: Segments) -> Array:
@@ -94,13 +101,10 @@ class Predictor(Generic[_Drift]):
         for _ in range(_SEARCHES):
             here, *beside = errors(best + steps[:, None])
             slopes = np.stack([other - here for other in beside], axis=-1) / _STEP
-            normal = np.einsum('kmyi,kmyj->mij', slopes, slopes)
-            right = np.einsum('kmyi,kmy->mi', slopes, here)
-            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+            change = gauss_newton_step(slopes, here)
+            if change is None:
                 break
-            offered = best - (np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-                              @ right[..., None])[..., 0]
-            offer, own = best_of(offered[None])
+            offer, own = best_of((best + change)[None])
             best, least = (np.where((own < least)[:, None], offer, best), np.minimum(own, least))
         return best
 
@@ -124,7 +128,7 @@ def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:
     drift = predictor.drift
     higher = DriftModel(drift.box, drift.degree + 1, np.empty(0), drift.B)
     n_x = len(drift.B)
-    coefficients = np.zeros((1 + higher.monomials.n_z, n_x))
+    coefficients = np.zeros((len(higher.features(np.zeros(n_x))), n_x))
     # those of a degree come before those of the next
     coefficients[:len(drift.coefficients)] = drift.coefficients
     return replace(predictor, drift=replace(higher, coefficients=coefficients))
@@ -163,7 +167,3 @@ def standardised(predictor: Predictor[DriftModel], xi: Array) -> Predictor[Drift
     B = S @ drift.B
     return Predictor(regress(drift.box, drift.degree, drift.features(points), none, rates, B),
                      S @ predictor.gain)
-
-
-def _held(drift: Drift, v: Array) -> Callable[[Array], Array]:
-    return lambda x: drift.scaled_rate(x, v)

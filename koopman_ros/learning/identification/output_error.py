@@ -50,7 +50,7 @@ class Refinable(Protocol):
 
 
 @dataclass(frozen=True)
-class ResidualScales:
+class PolynomialCoefficients:
     """A polynomial drift whose coefficients are refined, and B where it is learned."""
 
     drift: DriftModel
@@ -61,7 +61,7 @@ class ResidualScales:
         """Coefficients, then B where it is learned."""
         return np.concatenate((self.drift.coefficients.ravel(), self.drift.B.ravel()[:self._n_B]))
 
-    def at(self, theta: Array) -> ResidualScales:
+    def at(self, theta: Array) -> PolynomialCoefficients:
         """Return the same with other weights."""
         drift = self.drift
         n = drift.coefficients.size
@@ -105,8 +105,12 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
     :param learn_input_matrix: whether B is refined, too.
     :param monitor: called with the step and the cost after each step; True ends it.
     """
-    problem = _Problem(ResidualScales(model, learn_input_matrix), segments)
-    return problem.split(problem.solution(monitor))[0].drift
+    n_x = len(model.box.states)
+    # without a gain a predictor never corrects its state: its prediction is a simulation
+    return innovations_form(
+        PolynomialCoefficients(model, learn_input_matrix), np.zeros((n_x, n_x)), segments,
+        model.box.states.to_deviation(segments.x[0]), np.ones(n_x), smooth=True,
+        tolerance=1e-6, monitor=monitor).model.drift
 
 
 @dataclass(frozen=True)
@@ -158,69 +162,44 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
         be found that is not stable and fits its starts to the noise.
     :param tolerance: relative decrease of the cost that ends it.
     """
-    problem = _Problem(model, segments,
-                       _Filter(gain, starts, deviation, settling, smooth, tolerance))
-    theta = problem.solution(monitor)
+    problem = _Problem(model, segments, gain, starts, deviation, settling, smooth)
+    theta: Array = minimise(
+        problem.add_residuals, problem.start(), max_iterations=_MAX_ITERATIONS,
+        tolerance=tolerance, patience=3, monitor=monitor).theta.numpy()
     refined, K, starts = problem.split(theta)
     cost = normal_equations(problem.add_residuals, torch.from_numpy(theta), derivatives=False).cost
     return Refined(refined, K, starts, cost, problem, theta)
 
 
 @dataclass(frozen=True)
-class _Filter:
-    """How measurements correct the state on the way."""
-
-    gain: Array
-    starts: Array
-    deviation: Array
-    settling: int
-    smooth: bool
-    tolerance: float
-
-
-@dataclass(frozen=True)
 class _Problem(Generic[_Model]):
-    """The parameters are those of the model, then K, or the starts without one or smoothed."""
+    """The parameters are those of the model, then the gain, or the starts where smoothed."""
 
     model: _Model
     segments: Segments
-    filtered: _Filter | None = None
+    gain: Array
+    starts: Array
+    deviation: Array
+    settling: int = 0
+    smooth: bool = True
 
     def start(self) -> Tensor:
         """Return the parameters to begin with."""
-        last = self._target[0] if self.filtered is None else (
-            self.filtered.starts if self._starts else self.filtered.gain)
+        last = self.starts if self.smooth else self.gain
         return torch.from_numpy(np.concatenate((self.model.theta, last.ravel())))
 
-    def solution(self, monitor: Callable[[int, float], bool] | None) -> Array:
-        """Return the parameters of the least cost."""
-        # less tells nothing beside the noise that a filter leaves
-        tolerance = 1e-6 if self.filtered is None else self.filtered.tolerance
-        found: Array = minimise(
-            self.add_residuals, self.start(), max_iterations=_MAX_ITERATIONS, tolerance=tolerance,
-            patience=3, monitor=monitor).theta.numpy()
-        return found
-
     def split(self, theta: Array) -> tuple[_Model, Array, Array]:
-        """Return the model, K (n_x, n_y), which is 0 without, and the scaled starts (M, n_x)."""
-        n_x, p = len(self.model.drift.box.states), len(self.model.theta)
+        """Return the model, the gain (n_x, n_y) and the scaled starts (M, n_x)."""
+        p = len(self.model.theta)
         model = self.model.at(theta[:p])
-        if self.filtered is None:
-            return model, np.zeros((n_x, n_x)), theta[p:].reshape(-1, n_x)
-        gain, starts = self.filtered.gain, self.filtered.starts
-        if self._starts:
-            return model, gain, theta[p:].reshape(-1, n_x)
-        return model, theta[p:].reshape(gain.shape), starts
+        if self.smooth:
+            return model, self.gain, theta[p:].reshape(self.starts.shape)
+        return model, theta[p:].reshape(self.gain.shape), self.starts
 
     @cached_property
     def count(self) -> int:
         """Samples whose errors count."""
         return int(np.sum(self._counted))
-
-    @property
-    def _starts(self) -> bool:
-        """Whether the starts are parameters, and not the gain."""
-        return self.filtered is None or self.filtered.smooth
 
     @cached_property
     def _inputs(self) -> Array:
@@ -234,9 +213,8 @@ class _Problem(Generic[_Model]):
     @cached_property
     def _counted(self) -> NDArray[np.bool_]:
         """(K + 1, M, 1) where an error counts."""
-        measured, settling = self.segments.measured, (
-            0 if self.filtered is None else self.filtered.settling)
-        counted: NDArray[np.bool_] = measured & (np.cumsum(measured, axis=0) > settling)
+        measured = self.segments.measured
+        counted: NDArray[np.bool_] = measured & (np.cumsum(measured, axis=0) > self.settling)
         return counted[..., None]
 
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
@@ -245,12 +223,13 @@ class _Problem(Generic[_Model]):
         data, target = self.segments, self._target
         M, n_x = x.shape
         n_y = target.shape[2]
-        filtered = self.filtered is not None
-        p = len(self.model.theta) + (0 if self._starts else K.size)
-        weight = np.ones(n_y) if self.filtered is None else 1.0 / self.filtered.deviation
+        # starts of a simulation are refined without a gain
+        corrected = not self.smooth or bool(np.any(K))
+        p = len(self.model.theta) + (0 if self.smooth else K.size)
+        weight = 1.0 / self.deviation
         y, sums = x[..., None], None
         if equations.derivatives:
-            starts = n_x if self._starts else 0
+            starts = n_x if self.smooth else 0
             sums = _Sums(M, p, starts)
             # beside the state its change with the model's parameters and with the start
             y = np.concatenate((y, np.zeros((M, n_x, p)),
@@ -269,10 +248,10 @@ class _Problem(Generic[_Model]):
                 if sums is not None:
                     sums.add(np.where(counted[..., None], weight[:, None] * seen[..., 1:], 0.0),
                              weighed)
-                if filtered:
+                if corrected:
                     measured = data.measured[k][:, None]
                     correction = K @ np.concatenate((error[..., None], seen[..., 1:]), axis=-1)
-                    if sums is not None and not self._starts:
+                    if sums is not None and not self.smooth:
                         for i in range(n_x):
                             first = 1 + p - K.size + i * n_y
                             correction[:, i, first:first + n_y] += error

@@ -30,7 +30,10 @@ from koopman_ros.learning.identification.innovations_form import (
     SETTLING,
     standardised,
 )
-from koopman_ros.learning.identification.output_error import innovations_form, ResidualScales
+from koopman_ros.learning.identification.output_error import (
+    innovations_form,
+    PolynomialCoefficients,
+)
 from koopman_ros.model import Box
 
 HIGHEST_DEGREE = 3
@@ -191,8 +194,8 @@ class _Search:
         record = self.record
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
-            ResidualScales(start.drift, self._plant.B is None), start.gain, record.segments(parts),
-            record.foreseen(start, parts), self.deviation,
+            PolynomialCoefficients(start.drift, self._plant.B is None), start.gain,
+            record.segments(parts), record.foreseen(start, parts), self.deviation,
             settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost
 

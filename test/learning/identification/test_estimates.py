@@ -27,7 +27,7 @@ from koopman_ros.learning.identification import (
     total_variation,
     weak_form,
 )
-from koopman_ros.learning.identification.output_error import _Filter, _Problem, ResidualScales
+from koopman_ros.learning.identification.output_error import _Problem, PolynomialCoefficients
 from koopman_ros.learning.identification.total_variation import smoothed
 from koopman_ros.learning.identification.weak_form import _input_integral
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
@@ -44,70 +44,43 @@ def start_of(plant, records, degree, B=None):
     return model, Segments.of(records, longest_step(records))
 
 
-@pytest.mark.parametrize('learn', [True, False])
-def test_normal_equations_against_differences(learn):
-    records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (60, 45)]
-    model, segments = start_of(PAIR, records, 2)
-    problem = _Problem(ResidualScales(model, learn), segments)
-    theta = problem.start()
-    theta = theta + 0.03 * torch.from_numpy(np.random.default_rng(0).standard_normal(len(theta)))
-    box, count = model.box, np.sum(segments.measured)
-    assert count == 105
-
-    def residuals(values):
-        # by the path in units, which shares no line with the derivatives
-        model, _, starts = problem.split(values)
-        middle = box.states.center
-        errors = segments.errors(model.drift.rate, middle + starts * box.states.scale)
-        return (errors / box.states.scale).ravel() / np.sqrt(count)
-
-    base = residuals(theta.numpy())
-    steps = 1e-5 * np.eye(len(theta))
-    J = np.stack([(residuals(theta.numpy() + h) - residuals(theta.numpy() - h)) / 2e-5
-                  for h in steps], axis=-1)
-    found = normal_equations(problem.add_residuals, theta)
-    assert len(theta) == 12 + (4 if learn else 0) + 4
-    assert found.cost == pytest.approx(0.5 * base @ base, rel=1e-12)
-    # central differences: 1e-10 of the third derivative, 1e-16 / 1e-5 of rounding
-    assert found.gradient.numpy() == pytest.approx(J.T @ base, abs=1e-8)
-    assert found.matrix.numpy() == pytest.approx(J.T @ J, abs=1e-7)
-    only = normal_equations(problem.add_residuals, theta, derivatives=False)
-    assert only.cost == found.cost
-
-
-@pytest.mark.parametrize(('learn', 'smooth'), [(True, False), (False, False), (True, True)])
-def test_normal_equations_of_a_filter_against_differences(learn, smooth):
+@pytest.mark.parametrize(('learn', 'smooth', 'corrected'), [
+    (True, True, False), (False, True, False), (True, False, True), (False, False, True),
+    (True, True, True)])
+def test_normal_equations_against_differences(learn, smooth, corrected):
+    """Of a simulation, and of a filter that measures the first state alone."""
     records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (30, 25)]
     model, whole = start_of(PAIR, records, 2)
-    # the second state is not measured
-    segments = replace(whole, x=whole.x[..., :1])
+    n_y = 1 if corrected else 2
+    segments = replace(whole, x=whole.x[..., :n_y])
     rng = np.random.default_rng(0)
-    gain, starts = rng.uniform(0.1, 0.4, (2, 1)), rng.uniform(-0.5, 0.5, (2, 2))
-    deviation, settling = np.array([0.3]), 5
-    problem = _Problem(ResidualScales(model, learn), segments, _Filter(
-        gain, starts, deviation, settling, smooth, 1e-4))
+    gain, starts = corrected * rng.uniform(0.1, 0.4, (2, n_y)), rng.uniform(-0.5, 0.5, (2, 2))
+    deviation, settling = np.array([0.3, 0.2])[:n_y], 5 * corrected
+    problem = _Problem(PolynomialCoefficients(model, learn), segments, gain, starts, deviation,
+                       settling, smooth)
     theta = problem.start()
     theta = theta + 0.03 * torch.from_numpy(rng.standard_normal(len(theta)))
     box = model.box
+    scale = box.states.scale
 
     def residuals(values):
+        # sample by sample and in units, which shares no line with the derivatives
         model, K, starts = problem.split(values)
         drift, found = model.drift, []
         for j, record in enumerate(records):
-            # sample by sample and in units, with the solver's steps over each interval
             x, taken = box.states.to_physical(starts[j]), 0
             for k in range(len(segments.measured)):
                 if segments.measured[k, j]:
-                    error = segments.x[k, j, 0] - x[0]
+                    error = (segments.x[k, j] - x[:n_y]) / scale[:n_y]
                     if taken >= settling:
-                        found.append(error / box.states.scale[0] / deviation[0])
-                    x = x + box.states.scale * (K[:, 0] * error / box.states.scale[0])
+                        found.append(error / deviation)
+                    x = x + scale * (K @ error)
                     taken += 1
                 if k < len(segments.steps):
                     x = runge_kutta_step(lambda x, u=segments.u[k, j]: drift.rate(x, u), x,
                                          segments.steps[k, j])
             assert taken == len(record)
-        return np.array(found) / np.sqrt(len(found))
+        return np.concatenate(found) / np.sqrt(len(found))
 
     base = residuals(theta.numpy())
     J = np.stack([(residuals(theta.numpy() + h) - residuals(theta.numpy() - h)) / 2e-5
@@ -115,16 +88,14 @@ def test_normal_equations_of_a_filter_against_differences(learn, smooth):
     found = normal_equations(problem.add_residuals, theta)
     assert len(theta) == 12 + (4 if learn else 0) + (4 if smooth else 2)
     assert found.cost == pytest.approx(0.5 * base @ base, rel=1e-12)
+    # central differences: 1e-10 of the third derivative, 1e-16 / 1e-5 of rounding
     assert found.gradient.numpy() == pytest.approx(J.T @ base, abs=1e-7)
     assert found.matrix.numpy() == pytest.approx(J.T @ J, abs=1e-6)
-
-
-def test_a_model_that_diverges_has_infinite_cost():
-    model, segments = start_of(CUBIC, [CUBIC.excited(100, 0.1)], 3)
-    problem = _Problem(ResidualScales(model, True), segments)
-    theta = problem.start() + 1e8
-    assert normal_equations(problem.add_residuals, theta).cost == np.inf
-    assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == np.inf
+    assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == found.cost
+    theta = theta + 1e8
+    for derivatives in (True, False):
+        diverging = normal_equations(problem.add_residuals, theta, derivatives=derivatives)
+        assert diverging.cost == np.inf
 
 
 @pytest.mark.parametrize('known', [True, False])

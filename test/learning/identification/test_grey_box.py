@@ -43,9 +43,15 @@ class Vessel(Constants):
 
 
 TRUE = Vessel(gain=1.2, leak=0.4)
-VESSEL = PlantDescription('vessel', ('level',), ('m',), ('pump',), ('V',), 's', np.zeros(1),
-                          np.zeros(1),
-                          None)
+
+
+def description(states, inputs, *, state_units=('m',), input_units=('V',)):
+    """Return a plant whose steady state and B are not known."""
+    return PlantDescription('recorded', states, state_units, inputs, input_units, 's',
+                            np.full(len(states), np.nan), np.full(len(inputs), np.nan), None)
+
+
+VESSEL = description(('level',), ('pump',))
 
 
 def vessel(seed, samples=170, noise=0.02, disturbed=0.0):
@@ -97,9 +103,8 @@ def test_of_a_disturbed_plant_a_filter_is_found_too():
 def test_two_tanks_all_of_which_is_measured():
     truth = TwoTanks(orifice_1=0.2e-4, orifice_2=0.16e-4, pump_gain=3e-6)
     system = truth.system()
-    plant = PlantDescription('tanks', system.state_names[::-1], ('m', 'm'),
-                             system.input_names[::-1],
-                             ('V', 'V'), 's', np.full(2, np.nan), np.full(2, np.nan), None)
+    plant = description(system.state_names[::-1], system.input_names[::-1],
+                        state_units=('m', 'm'), input_units=('V', 'V'))
     design = RandomStepDesign([3.0, 0.0], [9.0, 4.0], 0.4 * system.nominal_state,
                               1.8 * system.nominal_state, (15.0, 45.0), 4.0, rtol=1e-9)
     run = random_steps(system, design, 800.0, 0)
@@ -144,9 +149,8 @@ def saddle(truth, seed, minutes=16.0, period=3.0):
 
 def test_reactor_at_its_saddle_from_its_temperature_alone():
     truth = TwoStateReactor(heat_transfer_coefficient=4.6e4, reaction_enthalpy=-4.8e4)
-    plant = PlantDescription('saddle', ('temperature',), ('K',), ('coolant_temperature',), ('K',),
-                             's',
-                             np.full(1, np.nan), np.full(1, np.nan), None)
+    plant = description(('temperature',), ('coolant_temperature',), state_units=('K',),
+                        input_units=('K',))
     said = []
     found = estimate_parameters(
         plant, [saddle(truth, 0)], TwoStateReactor,
@@ -221,9 +225,9 @@ def test_derivatives_by_constants_and_states_against_those_by_hand():
 def test_where_inputs_act_by_the_state_and_signals_have_another_order_and_time(turned):
     system = FedReactor().system()
     order = slice(None, None, -1 if turned else None)
-    plant = PlantDescription('fed', system.state_names[order], system.state_units[order],
-                             system.input_names[order], system.input_units[order], 's',
-                             np.full(2, np.nan), np.full(2, np.nan), None)
+    plant = description(system.state_names[order], system.input_names[order],
+                        state_units=system.state_units[order],
+                        input_units=system.input_units[order])
     rng = np.random.default_rng(0)
     x, u = ((nominal * rng.uniform(0.9, 1.1, (20, 2)))[:, order]
             for nominal in (system.nominal_state, system.nominal_input))
@@ -257,12 +261,10 @@ class Silent(Constants):
     (VESSEL, Vessel, {'leak': (0.5, 0.1)},
      r'the range of leak is \[0.5, 0.1\] 1/s, must rise and lie in \[0, 10\] 1/s'),
     (VESSEL, Vessel, {'leak': (0.5, 11.0)}, r'lie in \[0, 10\] 1/s'),
-    (PlantDescription('vessel', ('depth',), ('m',), ('pump',), ('V',), 's', np.zeros(1),
-                      np.zeros(1), None),
-     Vessel, {}, r'the record has the states depth \[m\], Vessel has level \[m\]'),
-    (PlantDescription('vessel', ('level',), ('m',), ('tap',), ('V',), 's', np.zeros(1),
-                      np.zeros(1), None),
-     Vessel, {}, r'the record has the inputs tap \[V\], Vessel has pump \[V\]')])
+    (description(('depth',), ('pump',)), Vessel, {},
+     r'the record has the states depth \[m\], Vessel has level \[m\]'),
+    (description(('level',), ('tap',)), Vessel, {},
+     r'the record has the inputs tap \[V\], Vessel has pump \[V\]')])
 def test_what_does_not_fit_is_refused(plant, equations, ranges, words):
     with pytest.raises(ValueError, match=words):
         estimate_parameters(plant, [vessel(0)], equations, ranges)

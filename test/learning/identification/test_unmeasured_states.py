@@ -108,16 +108,12 @@ def test_it_says_what_it_does_and_ends_when_asked():
     assert said[0] == 'drift of degree 1 with 1 state not measured'
 
 
-@pytest.mark.parametrize(('plant', 'samples', 'words'), [
-    (PLANT, 100, 'record at least 160'),
-    (replace(PLANT, input_matrix_degree=1), 600, 'set input_matrix_degree to 0')])
-def test_what_cannot_be_learned_from_is_refused(plant, samples, words):
+@pytest.mark.parametrize(('plant', 'samples', 'length', 'words'), [
+    (PLANT, 100, 100, 'record at least 160'),
+    (PLANT, 600, 40, 'too short for a filter'),
+    (replace(PLANT, input_matrix_degree=1), 600, 600, 'set input_matrix_degree to 0')])
+def test_unsuitable_records_and_plants_are_refused(plant, samples, length, words):
+    whole = record(oscillator, samples=samples)
     with pytest.raises(ValueError, match=words):
-        identify_unmeasured(plant, [record(oscillator, samples=samples)], 1)
-
-
-def test_episodes_in_which_no_filter_finds_the_state_are_refused():
-    whole = record(oscillator, samples=600)
-    parts = [whole.part(k, k + 40) for k in range(0, 600, 40)]
-    with pytest.raises(ValueError, match='too short for a filter'):
-        identify_unmeasured(PLANT, parts, 1)
+        identify_unmeasured(plant, [whole.part(k, k + length) for k in range(0, samples, length)],
+                            1)
