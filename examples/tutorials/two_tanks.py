@@ -94,8 +94,7 @@ figure.savefig(OUT / 'two_tanks_record.png')
 # %%
 unknown = np.full(2, np.nan)
 plant = PlantDescription('two tanks', LEVELS, ('m', 'm'), PUMPS, ('V', 'V'), 's',
-                         nominal_state=unknown,
-                         nominal_input=unknown, B=None)
+                         nominal_state=unknown, nominal_input=unknown, B=None)
 found = identify(plant, [episode], degrees=(1, 2, 3),
                  methods={'weak form': WeakForm(WeakFormParameters((20,)))})
 print(f'drift of degree {found.drift.degree}, found by {found.method}')
