@@ -164,6 +164,11 @@ class Processes(_Pool):
     def close(self) -> None:
         """End the processes."""
         if self._executor is not None:
+            # loky's own thread fails with a KeyError where it still finds the number of a queued
+            # task, whose entry it has just dropped
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    self._executor._work_ids.get_nowait()
             self._executor.shutdown(kill_workers=True)
             self._executor = None
 
