@@ -14,6 +14,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array, frozen
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
+from koopman_ros.estimation.sensor_checks import out_of_range
 
 _FOLLOWS_WITHIN = 1e-3  # of an input's range
 _COMES_NEARER = 1e-5  # likewise, less than any rate limit allows between two commands
@@ -89,15 +90,8 @@ class Experiment:
 
     def refusal(self, measured: Array) -> Reason | None:
         """Return why the experiment must not go on with a measurement (n,), or None."""
-        for name, value, lower, upper in zip(
-                self.measured, measured.tolist(), self.measured_lower.tolist(),
-                self.measured_upper.tolist(), strict=True):
-            if not np.isfinite(value):
-                return reason(StatusCode.NOT_FINITE, signal=name, value=value)
-            if not lower <= value <= upper:
-                return reason(StatusCode.EXPERIMENT_BOUNDS, signal=name, value=value, lower=lower,
-                              upper=upper)
-        return None
+        return out_of_range(self.measured, measured, self.measured_lower, self.measured_upper,
+                            StatusCode.EXPERIMENT_BOUNDS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,10 @@ from koopman_ros.core.signals import Outputs
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
+# Half-ranges of the training data beyond which a prediction of the state, or its standard
+# deviation, is worth nothing.
+LOST = 10.0
+
 
 @dataclass(frozen=True, slots=True)
 class Innovation:

@@ -10,16 +10,13 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.estimation.base import Estimate, Estimator
+from koopman_ros.estimation.base import Estimate, Estimator, LOST
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1
 _MAX_STEPS = 20
-# A prediction this many half-ranges out of the trained range is worth nothing: the model's drift
-# grows without bound there, and correction could not bring the estimate back.
-_LOST = 10.0
 _CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
 
 
@@ -33,7 +30,8 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
     for _ in range(steps):
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
-    if not np.all(np.abs(x) <= _LOST * model.states.half_widths):
+    # far out the model's drift grows without bound, and corrections could not bring x back
+    if not np.all(np.abs(x) <= LOST * model.states.half_widths):
         return None
     return Estimate(x, estimate.w)
 

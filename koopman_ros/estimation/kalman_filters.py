@@ -14,7 +14,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import SECONDS_PER_MINUTE
-from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW
+from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW, LOST
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -32,10 +32,6 @@ _WANDERED, _A_DAY = 3.0, 86400.0
 # The singular values of a matrix count as 0 below this share of the largest.
 _RANK = 1e-9
 _NO_VARIANCE = 1e-14  # likewise of a covariance
-# A prediction says nothing whose standard deviation is so many times that of a first guess, and so
-# many half-ranges of the training data. That also bounds the condition of the covariance, which
-# rounding would make indefinite.
-_LOST = 10.0
 
 
 def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
@@ -147,7 +143,9 @@ class ExtendedKalmanFilter(Estimator):
     @cached_property
     def _lost(self) -> Array:
         """(n_x,) variances from which on a prediction of the state is worth nothing."""
-        return (_LOST * np.maximum(
+        # also that of a first guess; it bounds the condition of the covariance, which rounding
+        # would make indefinite
+        return (LOST * np.maximum(
             self._initial_error, self.model.states.half_widths)) ** 2
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:

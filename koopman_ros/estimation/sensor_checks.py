@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,7 +58,8 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     :param travel: predicts how far (n_y,) the signals have moved since the last measurement,
         under the disturbance that is remembered.
     """
-    fault = _out_of_range(limits, outputs, y)
+    fault = out_of_range(outputs.names, y, limits.lower, limits.upper,
+                         StatusCode.OUTSIDE_SENSOR)
     if fault is not None:
         return Verdict(last, fault)
     changed = Standstill((time_ns,) * len(y), np.zeros(len(y)), w)
@@ -94,12 +95,17 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     return Verdict(accepted, moved=moved)
 
 
-def _out_of_range(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | None:
-    for name, value, lower, upper in zip(
-            outputs.names, y.tolist(), limits.lower.tolist(), limits.upper.tolist(), strict=True):
+def out_of_range(names: Sequence[str], y: Array, lower: Array, upper: Array, code: StatusCode
+                 ) -> Reason | None:
+    """
+    Return which of the measurements (n_y,) is not finite or outside its range, or None.
+
+    :param code: of a measurement outside its range.
+    """
+    for name, value, low, high in zip(
+            names, y.tolist(), lower.tolist(), upper.tolist(), strict=True):
         if not np.isfinite(value):
             return reason(StatusCode.NOT_FINITE, signal=name, value=value)
-        if not lower <= value <= upper:
-            return reason(StatusCode.OUTSIDE_SENSOR, signal=name, value=value, lower=lower,
-                          upper=upper)
+        if not low <= value <= high:
+            return reason(code, signal=name, value=value, lower=low, upper=high)
     return None

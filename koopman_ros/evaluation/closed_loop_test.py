@@ -172,7 +172,7 @@ class ClosedLoopTest:
 
     def __repr__(self) -> str:
         """Keep the arrays out."""
-        return f'<LawCheck: {self}>'
+        return f'<ClosedLoopTest: {self}>'
 
 
 def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,

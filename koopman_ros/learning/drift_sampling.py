@@ -104,7 +104,7 @@ def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: in
 
     :param plant: names, units and the nominal point. Where it is not known, or the episodes do not
         surround it, a steady state in the middle of their range is taken.
-    :raises NoUsefulLift: when no lift is better than a linear model.
+    :raises TrainingFailed: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
     known, samples = _estimated(found, plant)
@@ -148,7 +148,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     :param judging: called with the class whose law is being tried and the share that is done.
     :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
         run, too.
-    :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
+    :raises TrainingFailed: when there is no model of the class that was asked for, or of any.
     :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
     :raises Stopped: when `judging` ended it.
     """

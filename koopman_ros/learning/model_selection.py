@@ -73,7 +73,7 @@ class ClassComparison:
     """The result of :func:`compare`; as text a table in Markdown."""
 
     contenders: tuple[ModelCandidate, ...]  #: the plainest first
-    chosen: ModelCandidate  #: by the rule, or as it was asked for
+    chosen: ModelCandidate  #: selected by the rule, or named by the user
     state_names: tuple[str, ...]  #: of the states, with their units
     state_units: tuple[str, ...]
 
@@ -153,7 +153,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     :param alone: whether it is the only one to be learned.
     :param judge: of the models, in place of validation episodes and `loops`.
     :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
-    :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
+    :raises TrainingFailed: when there is no model of the class that was asked for, or of any.
     :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
         was asked for or all samples are to blame.
     """
@@ -210,7 +210,7 @@ def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING)
     Where none passes, the one whose law fails in the smallest share of its closed loops.
 
     :param resolution: errors below it count as equal.
-    :raises NoUsefulLift: when there is no model of any class.
+    :raises TrainingFailed: when there is no model of any class.
     """
     able = [one for one in contenders if not one.refusal]
     if not able:

@@ -177,7 +177,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
-    :raises Stopped: when `on_progress` asked for it; nothing is written then.
+    :raises Stopped: when `on_progress` returned True; nothing is written.
     :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
     :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
     """

@@ -153,7 +153,7 @@ _MESSAGES = (
            says=('^controller: control: .*does not advance',)),
     _clock('clock-jitter', 'stamps are up to 0.4 s wrong', lambda: stamped(_jittered), 120.0),
     _clock('clock-twins', 'two measurements with each stamp', _twins(0.01), 60.0),
-    FaultCase('clocks', 'no-clock', 'use_sim_time is set, and nobody publishes /clock',
+    FaultCase('clocks', 'no-clock', 'use_sim_time is set, but /clock has no publisher',
               operators.without_clock, plant={**LOCKSTEP, 'publish_clock': False},
               controller=_BY_CLOCK, says=(operators.NO_CLOCK,)))
 

@@ -43,7 +43,7 @@ class Day:
     setpoints: tuple[float, float]
     plant: Mapping[str, tuple[float, float]]  #: parameters of the plant
     models: tuple[str, ...]  #: one of which there is not
-    #: longest manual mode, in s: nobody holds the plant meanwhile
+    #: longest manual mode, in s, in which no law controls the plant
     manual: float = 60.0
 
 

@@ -62,7 +62,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
 
     :param plant: names and units of the measured signals; B and the nominal point play no part.
     :param equations: a plant's class, see :func:`koopman_ros.plants.plant_class`.
-    :param ranges: of the constants that are looked for, see :func:`sought_of`.
+    :param ranges: of the constants to be estimated, see :func:`estimated_parameters_of`.
     :param seed: of the split.
     :return: an estimate with `constants`; its first states are the measured ones.
     :raises ValueError: when names, units or ranges do not fit the class, the episodes are too
