@@ -105,10 +105,9 @@ def _model(page: PageLayout) -> None:
                     now.status(TRAINING).message]):
                 return
             answer.set_text('sent …')
-            old = now.parameter(CONTROLLER, 'model')
-            answer.show(await (
-                page.act('reload', CONTROLLER) if old == new else
-                page.act('parameters', CONTROLLER, {'model': new}, {'model': old})))
+            # the controller reads the file again even where its name is the same
+            answer.show(await page.act('parameters', CONTROLLER, {'model': new},
+                                       {'model': now.parameter(CONTROLLER, 'model')}))
 
         def trained_model() -> str:
             values = page.source.snapshot.status(TRAINING).values

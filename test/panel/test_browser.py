@@ -149,11 +149,12 @@ def activated(page: Page, button: str | re.Pattern[str]) -> None:
     """Activate a model; again if a busy machine did not read it in time."""
     model = card(page, 'Model')
     for _ in range(TRIES):
+        # not to take the answer to the button before for one to this
+        page.reload()
         press(model, button)
         confirmed(page, 'Activate', model, re.compile('^set$|is still being read after'))
         if model.locator('.answer').inner_text() == 'set':
             return
-        page.reload()
     raise AssertionError(f'the model was not read in {TRIES} tries')
 
 
