@@ -81,7 +81,11 @@ def test_cut_leaves_no_interval_out():
 
 @pytest.mark.parametrize(('changes', 'words'), [
     ({'time': [0.0, 1.0]}, r'incompatible time and x: .* got \(2,\) and \(3, 1\)'),
-    ({'u': [1.0, 2.0]}, 'incompatible input_time and u'),
+    ({'u': [1.0, 2.0]}, r'one column for each signal, u\[:, None\] for one'),
+    ({'u': np.zeros((2, 1, 1))}, 'incompatible input_time and u'),
+    ({'time': np.zeros((3, 1)), 'x': [0.0, 1.0, 2.0]}, 'exchanged; pass the times first'),
+    ({'x': [[1.0], [1j], [2.0]]}, 'x must be real, got complex numbers'),
+    ({'x': [['1 V'], ['2 V'], ['3 V']]}, 'x must be numbers'),
     ({'time': [], 'x': np.zeros((0, 1))}, 'with n > 0'),
     ({'x': [[1.0], [np.nan], [2.0]]}, 'not finite: drop them'),
     ({'input_time': [0.0, np.inf]}, 'not finite: drop them'),
@@ -206,6 +210,9 @@ def test_episodes_are_cut_where_a_state_leaves_a_range():
 
 
 @pytest.mark.parametrize(('plant', 'change', 'message'), [
+    (BENT, {'state_names': 'level'}, r"state_names is the text 'level': pass a sequence"),
+    (BENT, {'state_units': ('pH',)}, "'pH' is a number without unit: write 1"),
+    (BENT, {'nominal_state': (1j,)}, 'nominal_state must be real'),
     (BENT, {'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h': give times and rates"),
     (BENT, {'state_units': ()}, r"incompatible state_names and state_units: .* \['level'\] and "),
     (TWO_STATE, {'state_names': ('x', 'x')}, 'expected different names and as many units'),
