@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of nodes: what goes with them; what a recorder and a plan write; models refused."""
+"""Parts of nodes: what goes with them; what a recorder and a plan write."""
 
-from dataclasses import replace
 import math
 from pathlib import Path
 import threading
@@ -24,10 +23,8 @@ from koopman_ros.control.laws import Plan
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from koopman_ros.model import LiftedModel, load, ModelFileError, save
-from koopman_ros.parameters import model_checks
+from koopman_ros.model import load
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.parameters.model_checks import load_suitable
 from koopman_ros.parameters.signal_topics import Signals, signals_of, SignalTopics
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.records import BagWriter, read_messages
@@ -160,52 +157,6 @@ def test_time_of_receipt(received: float, source: float, found: float) -> None:
             'source_timestamp': round(source * NANOSECONDS)}
     assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS) == round(
         found * NANOSECONDS)
-
-
-@pytest.mark.parametrize(('state', 'coolant', 'fits'), [
-    ('temperature', 'coolant_temperature', True), ('T', 'coolant_temperature', False),
-    ('temperature', 'coolant', False), ('coolant_temperature', 'temperature', False)])
-def test_model_of_other_signals_than_the_controller_was_started_for_is_refused(
-        tmp_path: Path, state: str, coolant: str, fits: bool) -> None:
-    """By name: one that takes the coolant for what is controlled would cool where it is cold."""
-    path, shipped = tmp_path / 'x.safetensors', load(model_path('reactor_nz4'))
-    save(replace(shipped, states=replace(shipped.states, names=(state,)),
-                 inputs=replace(shipped.inputs, names=(coolant,))), path)
-    # it may be the one to start with
-    assert load_suitable(str(path)).model.states.names[0] == state
-    if fits:
-        assert load_suitable(str(path), SIGNALS).model.states.names[0] == state
-        return
-    with pytest.raises(ModelFileError, match=(
-            rf'has states {state} \[K\] and inputs {coolant} \[K\], this controller was started '
-            r'for states temperature \[K\] and inputs coolant_temperature \[K\]: choose a model')):
-        load_suitable(str(path), SIGNALS)
-
-
-def test_model_whose_step_takes_too_long_is_refused_with_its_time(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    """No model within the bounds takes that long, so the limit is moved."""
-    monkeypatch.setattr(model_checks, '_LONGEST_STEP', 1e-7)
-    with pytest.raises(ModelFileError, match=(
-            r'a control step with the model takes [0-9.e-]+ s of a processor, at most 1e-07 s are '
-            r'allowed: train one with fewer coordinates \(n_z = 4\)$')):
-        load_suitable('reactor_nz4')
-
-
-def test_model_whose_step_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise np.linalg.LinAlgError('Eigenvalues did not converge')
-
-    monkeypatch.setattr(LiftedModel, 'distance', fail)
-    with pytest.raises(ModelFileError, match=r'model fails .*Eigenvalues did not converge'):
-        load_suitable('reactor_nz4')
-
-
-@pytest.mark.parametrize('name', ['x' * 5000 + '.safetensors', '/tmp/\0.safetensors'])
-def test_name_that_is_no_path_is_not_repeated_at_length(name: str) -> None:
-    with pytest.raises(ModelFileError, match='is no path of a file, which has at most 4096') as e:
-        load_suitable(name)
-    assert len(str(e.value)) < 200
 
 
 def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_state() -> None:
