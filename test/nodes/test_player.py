@@ -130,10 +130,6 @@ def play(bag: Path, *arguments: str, **parameters: object) -> None:
     assert player.main(['player', '--ros-args', *given, *arguments]) == 0
 
 
-def stamps(messages: Sequence[Any]) -> list[int]:
-    return [stamp_nanoseconds(message.header.stamp) for message in messages]
-
-
 def test_lockstep_gives_bit_identical_commands(
         ros: Harness, recorded_loop: Path, capfd: pytest.CaptureFixture[str]) -> None:
     recorded = records.read_series(recorded_loop, '/coolant_setpoint')
@@ -142,7 +138,8 @@ def test_lockstep_gives_bit_identical_commands(
     ros.meet('controller')
     play(recorded_loop, rate=0.0)
     ros.wait_until(lambda: len(commands) >= SAMPLES)
-    assert stamps(commands) == recorded.stamp_ns.tolist()
+    assert [stamp_nanoseconds(command.header.stamp) for command in commands] == (
+        recorded.stamp_ns.tolist())
     assert [command.temperature for command in commands] == recorded.values.tolist()
     # the coolant in force with each measurement, and one set-point
     inputs = {f'/{name}' for name in player_table().snapshot({}).topics}
@@ -187,18 +184,18 @@ def test_messages_are_played_byte_for_byte_with_the_shipped_parameter_file(
 
 
 def test_measurements_come_at_their_times(ros: Harness, tmp_path: Path) -> None:
-    """A sample a second, four times as fast."""
+    """A sample a second, ten times as fast."""
     bag = write_bag(tmp_path / 'slow.mcap', [
         ('/temperature', temperature(50.0 - 0.1 * k, float(k)), float(k)) for k in range(9)])
     arrived: list[float] = []
     ros.node.create_subscription(Temperature, reactor.TEMPERATURE, lambda _: arrived.append(
         time.monotonic()), topics.LOOP_QOS)
     ros.start('controller')
-    process = ros.start('player', {'bag': bag, 'rate': 4.0, 'wait_for_subscribers': 2})
+    process = ros.start('player', {'bag': bag, 'rate': 10.0, 'wait_for_subscribers': 2})
     ros.wait_until(lambda: len(arrived) == 9)
     assert ros.wait_for_end(process) == 0
     # the first one may come late on a busy machine, but none before its time
-    assert arrived[-1] - arrived[0] > 0.5 * 8.0 / 4.0
+    assert arrived[-1] - arrived[0] > 0.5 * 8.0 / 10.0
 
 
 def test_clock_shows_the_stamp_of_each_measurement(ros: Harness, tmp_path: Path) -> None:
@@ -234,20 +231,16 @@ def test_order_is_that_of_receipt_and_the_offset_leaves_out_the_beginning(
     assert [message.temperature for message in heard] == [2.0, 3.0]
 
 
-@pytest.mark.parametrize(('offered', 'reliability', 'durability'), [
-    ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-    ((BEST_EFFORT_QOS,),
-     ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    ((LATCHED_QOS,),
-     ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    ((BEST_EFFORT_QOS, DEFAULT_QOS),
-     ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-])
+@pytest.mark.parametrize(('offered', 'reliable', 'latched'), [
+    ((), True, False),
+    ((BEST_EFFORT_QOS,), False, False),
+    ((LATCHED_QOS,), True, True),
+    ((BEST_EFFORT_QOS, DEFAULT_QOS), True, False)])
 def test_offer_is_that_of_the_recorded_publishers(
-        offered: tuple[Qos, ...], reliability: ReliabilityPolicy,
-        durability: DurabilityPolicy) -> None:
+        offered: tuple[Qos, ...], reliable: bool, latched: bool) -> None:
     profile = player.recorded_offer(offered)
-    assert (profile.reliability, profile.durability) == (reliability, durability)
+    assert (profile.reliability is ReliabilityPolicy.RELIABLE) is reliable
+    assert (profile.durability is DurabilityPolicy.TRANSIENT_LOCAL) is latched
 
 
 def test_bag_in_a_namespace_is_played_into_another_controller(
@@ -266,7 +259,6 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'bag': 'none.mcap'}, "cannot start: bag 'none.mcap' does not exist"),
     ({'topics': ['pressure']}, 'no message on /pressure: choose topics among /temperature'),
-    ({'topics': ['a b']}, 'cannot start: topics: Invalid topic name'),
     ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
     ({'wait_timeout': 0.1}, '/temperature found no counterpart within 0.1 s: start the'),
     ({'wait_for_subscribers': 0, 'rate': 0.0, 'answer_timeout': 0.1},

@@ -33,7 +33,7 @@ from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.closed_loops import REACTOR
 from support.controller_bench import PATIENT, reproduced, STATUS, STEADY, until_read
-from support.nodes import opened, temperature, value
+from support.nodes import change, opened, temperature, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
 SETPOINTS = [(20.0 * k, 46.0 + math.sin(k)) for k in range(1, 150)]
@@ -295,6 +295,17 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     ros.wait_until(reloaded.done)
     assert reloaded.result().success
     assert 'n_z = 3' in reloaded.result().message
+
+    # a node that is taken down while a file is read goes on when it is configured again
+    bench.ask_to_reload()
+    with opened(ros, disk(file)):
+        for transition in ('deactivate', 'cleanup'):
+            assert change(ros, 'controller', transition)
+    for transition in ('configure', 'activate'):
+        assert change(ros, 'controller', transition)
+    ros.meet('controller')
+    bench.measure()
+    ros.wait_until(lambda: len(bench.commands) == 51)
 
     # one that is changed during a slow reload stays
     reloaded = bench.ask_to_reload()
