@@ -350,15 +350,14 @@ def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
     assert status.message == 'running'
 
 
-@pytest.mark.parametrize('speed', [5.0, 0.0])
 def test_time_of_an_inactive_plant_stands_still(
-        shared_ros: Harness, monkeypatch: pytest.MonkeyPatch, speed: float) -> None:
+        shared_ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(plant_module, 'time', SimpleNamespace(
         monotonic=lambda: clock.now, time_ns=time.time_ns))
     context = shared_ros.node.context
-    arguments = ['--ros-args', '-p', f'speed:={speed}', '-r', '__ns:=/still']
-    node = PlantNode(context=context, cli_args=arguments)
+    node = PlantNode(context=context, cli_args=[
+        '--ros-args', '-p', 'speed:=5.0', '-r', '__ns:=/still'])
     node.start()
     measured = shared_ros.listen(Temperature, '/still/temperature')
     shared_ros.wait_until(lambda: node.count_subscribers('/still/temperature'))
