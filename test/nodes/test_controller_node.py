@@ -75,8 +75,8 @@ def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
     # patient, or a busy machine could be too slow for it
     program = ('import sys\n'
                'from koopman_ros.nodes import controller\n'
-               'from koopman_ros.ros import measurements\n'
-               'measurements._PATIENCE = 100.0\n'
+               'from koopman_ros.ros import signals\n'
+               'signals._PATIENCE = 100.0\n'
                'sys.exit(controller.main())\n')
     ros.start('controller', arguments=('-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket'),
               command=(sys.executable, '-c', program))
