@@ -11,8 +11,6 @@ from typing import Any
 
 from mcap.reader import make_reader
 import pytest
-from rclpy.duration import Duration
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
@@ -146,30 +144,6 @@ def test_lockstep_gives_bit_identical_commands(
     counts = records.summary(recorded_loop).counts
     assert f'played {sum(counts[topic] for topic in inputs & set(counts))} messages' in (
         capfd.readouterr().err)
-
-
-def test_lockstep_waits_for_requests_alone(
-        ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To wait until a message is received takes 0.1 s with some middlewares."""
-    bag = write_bag(tmp_path / 'bag.mcap', [
-        (topic, temperature(celsius, stamp), float(k)) for k in range(1, 21)
-        for topic, celsius, stamp in [
-            ('/coolant_temperature', 22.0, float(k)), ('/temperature', 50.0 + 0.1 * k, float(k)),
-            *([('/setpoint', 49.0, 0.0)] if k in (5, 6) else [])]],
-        [LATCHED_QOS])
-    waits: list[str] = []
-    wait = Publisher.wait_for_all_acked
-
-    def counted(publisher: Publisher, timeout: Duration) -> bool:
-        waits.append(publisher.topic_name)
-        return wait(publisher, timeout)
-
-    monkeypatch.setattr(Publisher, 'wait_for_all_acked', counted)
-    ros.start('controller')
-    play(bag, rate=0.0)
-    # and at the start, until the subscribers have found each topic, and at the end
-    assert waits[:-3] == ['/coolant_temperature', '/setpoint', '/setpoint']
-    assert sorted(waits[-3:]) == ['/coolant_temperature', '/setpoint', '/temperature']
 
 
 def test_messages_are_played_byte_for_byte_with_the_shipped_parameter_file(

@@ -115,7 +115,7 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(ros: Harness, tmp_path: Pat
 def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     # no quicker: what is recorded while the machine is busy is what there is to train from
     ros.start('plant', {
-        'lockstep': True, 'speed': 30.0, 'lockstep_subscribers': 2,
+        'lockstep': True, 'speed': 80.0, 'lockstep_subscribers': 2,
         'temperature.measurement_noise': 0.1,
         'constants.heat_transfer_coefficient': 0.8 * constant('heat_transfer_coefficient')})
     process = ros.start('trainer', {
