@@ -3,6 +3,7 @@
 
 """Parts of nodes: what goes with them; what a recorder and a plan write."""
 
+from collections.abc import Callable
 import math
 from pathlib import Path
 import threading
@@ -13,7 +14,6 @@ from typing import Any
 from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
-from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import Temperature
@@ -24,20 +24,18 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
 from koopman_ros.model import load
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.nodes.plant import PlantNode
+from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.parameters.signal_topics import Signals, signals_of, SignalTopics
-from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.signal_topics import Signals, signals_of
 from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.controller_messages import active_constraints, planned
 from koopman_ros.ros.controller_status import statuses
 from koopman_ros.ros.diagnostics import Severity
-from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
-from koopman_ros.ros.recording import Recording
-from koopman_ros.ros.training import Training
-from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
 from support.nodes import temperature, TIMEOUT
 
@@ -45,60 +43,29 @@ SIGNALS = signals_of(load(model_path(reactor.MODEL)))
 NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
 
 
-class PartNode(ManagedNode):
-    """A managed node of one part."""
-
-    def __init__(self, part: str, folder: Path, context: Context) -> None:
-        super().__init__('part', context=context)
-        self._part, self._folder = part, folder
-
-    def configure(self) -> None:
-        table = trainer_table(load(model_path(reactor.MODEL)))
-        settings = table.snapshot({'output': str(self._folder / 'bag')})
-        wiring = SignalTopics(SIGNALS, settings.states, settings.inputs)
-        match self._part:
-            case 'endpoint monitor':
-                monitor = topics.EndpointMonitor(self, lambda: None)
-                monitor.publish('mine', Temperature)
-                monitor.subscribe('other', lambda _: None, Temperature)
-                self.complete = lambda: None
-            case 'recorder':
-                self.complete = Recorder(self, BagWriter(self._folder / 'bag'), NAMES,
-                                         topics.expected_topics(wiring)).close
-            case 'recording':
-                recording = Recording(self, settings, wiring)
-                recording.start()
-                self.complete = recording.complete
-            case 'experiment':
-                experiment = PlantExperiment(self, settings, wiring)
-                assert experiment._start() == ''
-                self.complete = experiment.complete
-            case 'training':
-                training = Training(self, settings, wiring, lambda: str(self._folder / 'missing'))
-                training.start()
-                self.complete = training.complete
-            case 'watchdog':
-                watchdog = Watchdog(lambda _: None)
-                watchdog.start()
-                self.complete = watchdog.end
-
-
-@pytest.mark.parametrize('part', ['endpoint monitor', 'recorder', 'recording', 'experiment',
-                                  'training', 'watchdog'])
-def test_clean_up_removes_everything_that_a_part_created(
-        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+@pytest.mark.parametrize('create', [PlantNode, ControllerNode, TrainerNode])
+def test_clean_up_removes_everything_that_a_node_created(
+        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        create: Callable[..., ManagedNode]) -> None:
     # a training that loads no library, and ends when it is asked to
     monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
         'sh', '-c', 'cat > /dev/null'))
-    node = PartNode(part, tmp_path, shared_ros.node.context)
+    node = create(context=shared_ros.node.context, cli_args=[
+        '--ros-args', '-p', f'output:={tmp_path}/bag', '-p', f'bags:=[{tmp_path}/missing]'])
 
     def created() -> tuple[object, ...]:
         return (*map(set, (node.publishers, node.subscriptions, node.services, node.timers)),
                 set(threading.enumerate()), tuple(node.diagnostics.tasks))
 
     before = created()
-    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    node.start()
+    if isinstance(node, TrainerNode):
+        assert node._experiment is not None
+        assert node._training is not None
+        assert node._experiment._start() == ''
+        node._training.start()
     assert created() != before
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     assert created() == before
     node.destroy_node()
