@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 import re
-import time
 from typing import Any
 from xml.etree import ElementTree
 
@@ -16,7 +15,6 @@ import rclpy
 from rclpy import qos
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
@@ -39,8 +37,8 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.node_descriptions import OPERATOR, policy, Program, PROGRAMS, programs
-from koopman_ros.testing import Harness, isolated_domain
-from support.nodes import temperature, TIMEOUT
+from koopman_ros.testing import Harness
+from support.nodes import temperature
 
 Seen = dict[str, set[str]]
 BEST_EFFORT = QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
@@ -213,55 +211,46 @@ def test_policy_has_the_form_that_sros2_reads() -> None:
 
 
 class Pair:
-    """A node that watches what matches it, and another one."""
+    """A node that watches what matches it, beside the bench."""
 
-    def __init__(self) -> None:
-        # no participant may use a topic for two types
-        self.own, self.other = (self._node(name) for name in ('own', 'other'))
-        self.executor = SingleThreadedExecutor(context=self.own.context)
-        self.executor.add_node(self.own)
+    def __init__(self, ros: Harness, context: Context) -> None:
+        self.ros, self.other = ros, ros.node
+        self.own = HostedNode('own', None, context=context)
         self.matching = topics.EndpointMonitor(self.own, lambda: None)
         self.speaker = self.matching.publish('command', Temperature)
         self.matching.subscribe('temperature', lambda _: None, Temperature)
 
-    def _node(self, name: str) -> HostedNode:
-        context = Context()
-        rclpy.init(context=context)
-        return HostedNode(name, None, context=context)
-
     def wait(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + TIMEOUT
-        while not condition():
-            assert time.monotonic() < deadline, self.matching.complaint
-            self.executor.spin_once(timeout_sec=0.05)
+        def met() -> bool:
+            self.matching._look()
+            return condition()
 
-    def close(self) -> None:
-        self.executor.shutdown()
-        for node in (self.own, self.other):
-            node.destroy_node()
-            rclpy.shutdown(context=node.context)
+        self.ros.wait_until(met, lambda: self.matching.complaint)
 
 
 @pytest.fixture(scope='module')
-def pair() -> Iterator[Pair]:
-    with isolated_domain():
-        pair = Pair()
-        yield pair
-        pair.close()
+def pair(shared_ros: Harness) -> Iterator[Pair]:
+    # a participant of its own, as none may use a topic for two types
+    context = Context()
+    rclpy.init(context=context)
+    pair = Pair(shared_ros, context)
+    yield pair
+    pair.own.destroy_node()
+    rclpy.shutdown(context=context)
 
 
 @pytest.mark.parametrize(('topic', 'kind', 'profile', 'words'), [
     ('command', Temperature, QoSProfile(
         depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL),
-     ('/command: /other subscribes ', 'transient local')),
+     ('/command: /bench subscribes ', 'transient local')),
     ('command', Temperature, QoSProfile(depth=1, deadline=Duration(seconds=1)), ('deadline',)),
     ('command', Temperature, QoSProfile(
         depth=1, liveliness=qos.LivelinessPolicy.MANUAL_BY_TOPIC), ('liveliness',)),
     ('temperature', Temperature, BEST_EFFORT,
-     ('/temperature: /other publishes', 'Best effort publisher and reliable subscription',
+     ('/temperature: /bench publishes', 'Best effort publisher and reliable subscription',
       'qos_overrides./temperature.subscription.reliability:=best_effort')),
     ('temperature', JointState, topics.LOOP_QOS,
-     ('/other uses it for sensor_msgs/msg/JointState', 'remap'))])
+     ('/bench uses it for sensor_msgs/msg/JointState', 'remap'))])
 def test_another_end_that_does_not_match_is_reported_and_logged(
         pair: Pair, capfd: pytest.CaptureFixture[str], topic: str, kind: type,
         profile: QoSProfile, words: tuple[str, ...]) -> None:
@@ -270,7 +259,7 @@ def test_another_end_that_does_not_match_is_reported_and_logged(
     else:
         publisher = pair.other.create_publisher(kind, topic, profile)
     # the node may be known after its publisher or subscription
-    pair.wait(lambda: pair.matching.complaint.startswith(f'/{topic}: /other '))
+    pair.wait(lambda: pair.matching.complaint.startswith(f'/{topic}: /bench '))
     complaint = pair.matching.complaint
     assert all(word in complaint for word in words)
     if topic == 'command':
@@ -286,7 +275,6 @@ def test_subscriptions_that_match_are_no_complaint(pair: Pair) -> None:
         hearing = pair.other.create_subscription(Temperature, 'command', lambda _: None, profile)
         pair.wait(lambda: pair.speaker.get_subscription_count() == 1)
         pair.wait(lambda: len(pair.own.get_subscriptions_info_by_topic('command')) == 1)
-        pair.matching._look()
         assert not pair.matching.complaint
         pair.other.destroy_subscription(hearing)
         pair.wait(lambda: not pair.own.get_subscriptions_info_by_topic('command'))
