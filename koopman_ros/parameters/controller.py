@@ -23,10 +23,10 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.estimation import Estimator, ESTIMATORS
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
+    box_defaults,
     DEFAULT_SYSTEM,
     InputPlaces,
     named_units,
@@ -169,16 +169,12 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))),
                          expected.states)
     defaults: dict[str, Any] = {**signals.defaults(), **_dynamics(model)}
-    for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):
-        if name in signals.states:
-            defaults[f'{name}.weight'] = 1.0 / scale ** 2
     box = model.inputs
-    for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
-        shown = conversion(unit, display_unit(unit))
-        defaults |= {f'{name}.weight': 1.0 / float(box.scale[i]) ** 2,
-                     f'{name}.min': shown(float(box.lower[i])),
-                     f'{name}.max': shown(float(box.upper[i])),
-                     f'{name}.safe_value': shown(float(box.center[i]))}
+    defaults |= box_defaults(box, min=box.lower, max=box.upper, safe_value=box.center)
+    for one in (model.states, box):
+        defaults |= {f'{name}.weight': 1.0 / scale ** 2
+                     for name, scale in zip(one.names, one.scale.tolist(), strict=True)
+                     if name in signals.units}
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),

@@ -14,12 +14,13 @@ import re
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import parameter
 from koopman_ros.core.message_fields import base_name, MessageField, place, SIGNAL_NAME
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.status import StatusFormatter
-from koopman_ros.core.units import check_unit, conversion, Display, Displays
-from koopman_ros.model import LiftedModel
+from koopman_ros.core.units import check_unit, conversion, Display, Displays, shown
+from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.parameters.table import ConfigurationError
 
 CONTROLLER_INTERNALS = 'controller_internals'
@@ -167,6 +168,12 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
                    {} if len(states) == len(every) else every)
+
+
+def box_defaults(box: Coordinates, **values: Array) -> dict[str, float]:
+    """Return values (n,) of the signals of a box as people read them, like ``pump.min``."""
+    return {f'{name}.{row}': shown(value, unit) for row, numbers in values.items()
+            for name, unit, value in zip(box.names, box.units, numbers.tolist(), strict=True)}
 
 
 def words_of(signals: Signals,

@@ -25,7 +25,7 @@ from koopman_ros.core.declaration import (
     value_column,
 )
 from koopman_ros.core.plugins import short_name
-from koopman_ros.core.units import conversion, display_unit
+from koopman_ros.core.units import display_unit
 from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
@@ -34,6 +34,7 @@ from koopman_ros.parameters.equations import named_ranges, refused
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
     AUDIT_LOG,
+    box_defaults,
     CONTROLLER_INTERNALS,
     DEFAULT_SYSTEM,
     DIAGNOSTICS,
@@ -272,16 +273,13 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
                           PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS, EVENT_LOG,
                           AUDIT_LOG, DIAGNOSTICS)
     if present is not None:
-        defaults['input_matrix_degree'] = present.input_matrix_degree
-        for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
-                               (present.states, 'setpoint_min', 'setpoint_max'),
-                               (present.inputs, 'experiment_min', 'experiment_max')):
-            for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
-                shown = conversion(unit, display_unit(unit))
-                defaults |= {f'{name}.{low}': shown(float(box.lower[i])),
-                             f'{name}.{high}': shown(float(box.upper[i]))}
-                if box is present.inputs:
-                    defaults[f'{name}.safe_value'] = shown(float(box.center[i]))
+        states, inputs = present.states, present.inputs
+        defaults |= {
+            'input_matrix_degree': present.input_matrix_degree,
+            **box_defaults(states, experiment_min=states.lower, experiment_max=states.upper,
+                           setpoint_min=states.lower, setpoint_max=states.upper),
+            **box_defaults(inputs, experiment_min=inputs.lower, experiment_max=inputs.upper,
+                           safe_value=inputs.center)}
     methods: dict[str, type[Any]] = {}
     for names in ((), given.get('identification_methods', ())):
         # what is no method, the check of the parameters refuses
