@@ -56,7 +56,7 @@ class Feasibility:
         if not given.all():
             kept = tuple(name for name, is_given in zip(self.box.names, given, strict=True)
                          if is_given)
-            some = replace(self, level=self.level.controlling(kept))
+            some = replace(self, level=replace(self.level, controlled=kept))
             return some.infeasibility(goal[given], (), command, whole)
         cause = self._cause(self._target(goal))
         if cause is None:
