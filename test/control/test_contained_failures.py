@@ -230,8 +230,8 @@ def test_random_events_on_every_law_and_estimator_end_in_a_command_that_a_replay
         options = [values_of(name, measured, fallback_order=order, estimator=estimator, **rates)
                    for order in (levels, *LEVELS)]
         (values, model), *others = options
-        run, rng, texts, commands = Checked(build(values, model)), np.random.default_rng(seed), [
-            ], []
+        run, rng = Checked(build(values, model)), np.random.default_rng(seed)
+        texts, commands = [], []
 
         def write(event, fields, texts=texts):
             texts.append(records.EventRecord('run', len(texts), event, fields).text())
