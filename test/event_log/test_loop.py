@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from koopman_ros.control import events, Mode, State
+from koopman_ros.control import events, Mode
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.status import UNMEASURED
 from koopman_ros.event_log import records
@@ -172,13 +172,6 @@ def test_same_model_under_the_same_parameters_commands_the_same() -> None:
     assert all(identical(found))
 
 
-def test_model_that_refuses_the_set_point_goes_by_what_was_tracked() -> None:
-    texts = day().texts
-    found = replayed(texts, Alternative(*MODELS['reactor_linear']))
-    assert all(sample.alternative is not None for sample in found.samples)
-    assert not all(identical(found, 'alternative'))
-
-
 def test_own_model_is_found_where_it_lies_now(tmp_path: Path) -> None:
     path = tmp_path / 'own.safetensors'
     own = MODELS['reactor_nz4'][0]
@@ -280,14 +273,6 @@ def test_values_survive_bit_identical(value: object) -> None:
     assert exact(records.decoded(json.loads(text))) == exact(value)
 
 
-@given(st.lists(FLOATS, max_size=5))
-def test_numbers_survive_bit_identical(values: list[float]) -> None:
-    array = np.array(values, dtype=np.float64)
-    back = records.float_array(json.loads(json.dumps(records.numbers(array), allow_nan=False)))
-    assert exact(back) == exact(array)
-    assert not back.flags.writeable
-
-
 @pytest.mark.parametrize(('text', 'error'), [
     ({'@': 'os:system'}, ValueError), ({'@': 'subprocess:Popen', 'args': ['true']}, ValueError),
     ({'@': f'{__name__}:Plain'}, ValueError), ({'@': 'no_such_module:State'}, ValueError),
@@ -303,7 +288,3 @@ def test_only_known_data_is_made(text: dict, error: type[Exception]) -> None:
 def test_what_is_no_data_is_refused(value: object) -> None:
     with pytest.raises(TypeError, match='cannot be written to a record'):
         records.encoded(value)
-
-
-def test_first_state_of_a_controller() -> None:
-    assert exact(records.decoded(records.encoded(State()))) == exact(State())
