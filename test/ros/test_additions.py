@@ -97,9 +97,9 @@ def test_a_message_type_is_learned_from(tmp_path: Path) -> None:
             message = BatteryState(voltage=voltage)
             message.header.stamp.sec = second
             writer.write('/cell', serialize_message(message), second * NANOSECONDS)
-    series = read_series(tmp_path / 'run', '/cell')
-    assert (series.values.tolist(), series.unit) == ([3.5, -1.0, 3.75], 'V')
     where = message_fields.place('/cell', 'cell', 'mV', {'type': 'sensor_msgs/msg/BatteryState'})
     assert where == message_fields.MessageField('/cell', 'sensor_msgs/msg/BatteryState', 'voltage',
                                                 'V')
+    series = read_series(tmp_path / 'run', where)
+    assert (series.values.tolist(), series.unit) == ([3.5, -1.0, 3.75], 'V')
     assert where.range == (0.0, 1e3)
