@@ -24,7 +24,7 @@ from koopman_ros.core.status import UNMEASURED
 from koopman_ros.event_log import records
 from koopman_ros.event_log.loop import Alternative, Lost, Replay
 from koopman_ros.event_log.run import replay_records
-from koopman_ros.event_log.sources import Models
+from koopman_ros.event_log.sources import find_model
 from koopman_ros.model import load_with_digest, save
 from support.recorded_runs import COOLANT, MODELS, Recorded, SECOND, STEADY
 
@@ -178,11 +178,10 @@ def test_own_model_is_found_where_it_lies_now(tmp_path: Path) -> None:
     save(replace(own, provenance=replace(own.provenance, plant='another')), path)
     model, digest = load_with_digest(path)
     name = str(tmp_path / 'gone' / 'own.safetensors')
-    moved = Models([tmp_path]).find(name, digest)
-    assert moved.provenance == model.provenance
-    assert Models([path]).find(name, digest).provenance == model.provenance
+    for place in (tmp_path, path):
+        assert find_model([place], name, digest).provenance == model.provenance
     with pytest.raises(records.RecordError, match=r'own.safetensors \(SHA-256 .* neither shipped'):
-        Models([config_directory() / 'models']).find(name, digest)
+        find_model([config_directory() / 'models'], name, digest)
 
 
 @pytest.mark.parametrize(('text', 'words'), [
