@@ -172,6 +172,12 @@ def test_same_model_under_the_same_parameters_commands_the_same() -> None:
     assert all(identical(found))
 
 
+def test_model_that_refuses_the_set_point_goes_by_what_was_tracked() -> None:
+    found = replayed(day().texts, Alternative(*MODELS['reactor_linear']))
+    assert all(sample.alternative is not None for sample in found.samples)
+    assert not all(identical(found, 'alternative'))
+
+
 def test_own_model_is_found_where_it_lies_now(tmp_path: Path) -> None:
     path = tmp_path / 'own.safetensors'
     own = MODELS['reactor_nz4'][0]
