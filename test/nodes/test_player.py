@@ -20,6 +20,7 @@ from sensor_msgs.msg import Temperature
 import yaml
 
 from koopman_ros import records
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
@@ -31,7 +32,7 @@ from koopman_ros.parameters.trainer import player_table, preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from support.bag_samples import DEFAULT_QOS
+from support.bag_samples import DEFAULT_QOS, TEMPERATURE
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
 SAMPLES = 61
@@ -130,7 +131,8 @@ def play(bag: Path, *arguments: str, **parameters: object) -> None:
 
 def test_lockstep_gives_bit_identical_commands(
         ros: Harness, recorded_loop: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    recorded = records.read_series(recorded_loop, '/coolant_setpoint')
+    place = MessageField('/coolant_setpoint', TEMPERATURE, 'temperature', 'degC')
+    recorded = records.read_series(recorded_loop, place)
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.start('controller', {'observer_bandwidth': 0.0})
     ros.meet('controller')
