@@ -56,7 +56,7 @@ setup(
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'numba', 'psutil',
+        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'numba',
                   'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
