@@ -121,6 +121,8 @@ def _failed(error: BaseException) -> TrainingOutcome:
 
 def error_text(error: BaseException) -> str:
     """Return the text of an error in a line; of an unexpected one with its class."""
+    if isinstance(error, MemoryError):
+        return 'the memory does not suffice: free some, or train on fewer bags'
     said = ' '.join(str(error).split())
     expected = isinstance(error, EXPECTED)
     return said if said and expected else ': '.join(filter(None, [type(error).__name__, said]))

@@ -47,7 +47,6 @@ from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport
-from koopman_ros.records.limits import bounded_reading
 
 # A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
@@ -198,10 +197,9 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
     _stop_if(on_progress(0.0, 'reading bags'))
-    with bounded_reading(task.bags):
-        record = read_record(source, task.most_samples, task.seed,
-                             hidden=bool(task.unmeasured_states or task.physical_model),
-                             tick=_reading(on_progress, source), backend=backend)
+    record = read_record(source, task.most_samples, task.seed,
+                         hidden=bool(task.unmeasured_states or task.physical_model),
+                         tick=_reading(on_progress, source), backend=backend)
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(record.account.lines()))

@@ -5,6 +5,7 @@
 
 import os
 from pathlib import Path
+import resource
 import subprocess
 import sys
 import time
@@ -36,6 +37,8 @@ def test_it_gives_way_and_says_what_is_wrong(tmp_path: Path) -> None:
     job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]', '-p', f'output:={tmp_path}/out'])
     try:
         assert os.getpriority(os.PRIO_PROCESS, job.process.pid) >= 10
+        for limit in (resource.RLIMIT_DATA, resource.RLIMIT_CPU):
+            assert resource.prlimit(job.process.pid, limit)[1] != resource.RLIM_INFINITY
         deadline = time.monotonic() + TIMEOUT
         while job.running:
             assert time.monotonic() < deadline
