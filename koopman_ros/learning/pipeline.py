@@ -17,6 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import backup_path
+from koopman_ros.core.plots import finite
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import (
@@ -91,8 +92,8 @@ class Retrained:
         states, inputs = box.states, box.inputs
         gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
 
-        def by_state(values: Array) -> dict[str, float | None]:
-            return {name: _finite(value) for name, value in zip(states.names, values, strict=True)}
+        def by_state(values: Array) -> dict[str, float]:
+            return dict(zip(states.names, map(float, values), strict=True))
 
         def of_class(one: ModelCandidate) -> dict[str, object]:
             said: dict[str, object] = {
@@ -100,14 +101,13 @@ class Retrained:
                 'refusal': one.refusal, 'seconds': one.seconds, 'steps': one.steps}
             if one.figures and one.law_check:
                 assert one.figures.rollout_rmse is not None
-                assert one.excess is not None
                 said |= {
-                    'heldout_rx': _finite(one.figures.fit.rx),
+                    'heldout_rx': one.figures.fit.rx,
                     'heldout_error': by_state(one.figures.rollout_rmse),
-                    'beyond_noise': _finite(one.excess),
+                    'beyond_noise': one.excess,
                     'closed_loops': one.law_check.loops,
                     'closed_loops_failed': int(np.sum(one.law_check.failed)),
-                    'closed_loop_cost_beside_linear': _finite(one.law_check.median_ratio)}
+                    'closed_loop_cost_beside_linear': one.law_check.median_ratio}
             return said
 
         figures: dict[str, object] = {
@@ -130,7 +130,7 @@ class Retrained:
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
             'constants': {one.name: {
-                'value': one.value, 'standard_error': _finite(one.standard_error),
+                'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
                 'standing': one.standing.name.lower(), 'text': str(one)}
                 for one in self.found.constants},
@@ -156,12 +156,8 @@ class Retrained:
                 'closed_loop_cost_beside_linear': check.median_ratio,
                 'worst_closed_loop_cost_beside_linear': check.worst_ratio,
             }
-        return {name: _finite(value) if isinstance(value, float) else value
-                for name, value in figures.items()}
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+        finite_figures: dict[str, object] = finite(figures)
+        return finite_figures
 
 
 def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
