@@ -57,30 +57,22 @@ def lifted(grown, data):
 
 
 @pytest.mark.parametrize(('n_z', 'identity', 'n_x', 'expected'), [
-    (2, True, 1, (2,)), (5, True, 1, (2, 3, 4, 5)), (5, True, 3, (4, 5)), (1, False, 1, (1,)),
-    (4, False, 2, (2, 3, 4))])
+    (2, True, 1, (2,)), (5, True, 3, (4, 5)), (1, False, 1, (1,)), (4, False, 2, (2, 3, 4)),
+    (2, True, 2, None), (2, False, 3, None)])
 def test_rounds(n_z, identity, n_x, expected):
-    assert IncrementalTraining(n_z, identity=identity).rounds(n_x) == expected
+    recipe = IncrementalTraining(n_z, identity=identity)
+    if expected:
+        assert recipe.rounds(n_x) == expected
+        return
+    with pytest.raises(ValueError, match=f'n_z = {n_z} is too small for {n_x} states'):
+        recipe.rounds(n_x)
 
 
-@pytest.mark.parametrize(('n_z', 'identity', 'n_x', 'hint'), [
-    (2, True, 2, r' as its first coordinates: use Edmd\(degree=1\) for a linear model'),
-    (2, False, 3, '$')])
-def test_fewer_coordinates_than_a_lift_needs(n_z, identity, n_x, hint):
-    with pytest.raises(ValueError, match=f'n_z = {n_z} is too small for {n_x} states{hint}'):
-        IncrementalTraining(n_z, identity=identity).rounds(n_x)
-
-
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'n_z': 0}, 'n_z must be at least 1, got 0'),
-    ({'hidden_first': 0}, 'hidden units must be positive, got 0 first and 3 more'),
-    ({'hidden_more': -1}, 'hidden units must be positive, got 8 first and -1 more'),
-    ({'whitening': -1.0}, r'whitening weights must be at least 0, got \(-1.0,\)'),
-    ({'other_whitenings': (1.0, -2.0)}, r'must be at least 0, got \(1.0, 1.0, -2.0\)'),
-    ({'pre_feedback': 0.0}, 'pre_feedback, the weight of the input, must be above 0 or None, got'),
-])
-def test_a_recipe_without_sense(change, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize('change', [
+    {'n_z': 0}, {'hidden_first': 0}, {'hidden_more': -1}, {'whitening': -1.0},
+    {'other_whitenings': (1.0, -2.0)}, {'pre_feedback': 0.0}], ids=str)
+def test_a_recipe_without_sense(change):
+    with pytest.raises(ValueError, match='must be'):
         IncrementalTraining(**{'n_z': 2, **change})
 
 
@@ -156,9 +148,7 @@ def test_the_model_describes_its_origin(small):
     everything, model = bent_samples(), small.model
     assert model.provenance.plant == 'bent'
     assert model.provenance.data_digest == everything.digest()
-    assert (model.n_x, model.n_u, model.n_z, model.identity) == (1, 1, 2, True)
-    assert (model.states.names, model.states.units) == (('level',), ('m',))
-    assert (model.inputs.names, model.inputs.units) == (('flow',), ('m/s',))
+    assert (model.n_z, model.states.names, model.inputs.units) == (2, ('level',), ('m/s',))
     np.testing.assert_array_equal(model.states.center, [3.0])
     np.testing.assert_array_equal(model.states.lower, everything.x.min(axis=0))
     np.testing.assert_array_equal(model.states.upper, everything.x.max(axis=0))
@@ -189,15 +179,13 @@ def test_a_law_is_tried_on_the_drift_that_predicts_best(small):
     assert np.max(np.abs(own - true)) > 1e-6
 
 
-def test_figures_come_from_the_untouched_episodes():
-    everything = bent_samples()
-    trained = train(BENT, everything, SMALL, starts=1, split_seed=3, loops=16)
-    training, _, held_out = split_by_episode(everything, 3)
-    assert trained.figures.fit == fit(trained.model, held_out.x, held_out.dxdt, held_out.u)
-    assert trained.model.provenance.metrics == trained.figures.metrics(('level',))
-    linear = Edmd(1).learn(BENT, training, Box.of(BENT, everything.x, everything.u))
-    assert trained.linear.fit == evaluate(linear, held_out).fit
-    assert trained.figures.fit.rw < 2e-3 < trained.linear.fit.rw
+def test_figures_come_from_the_untouched_episodes(small):
+    training, _, held_out = split_by_episode(bent_samples(), 0)
+    assert small.figures.fit == fit(small.model, held_out.x, held_out.dxdt, held_out.u)
+    assert small.model.provenance.metrics == small.figures.metrics(('level',))
+    linear = Edmd(1).learn(BENT, training, Box(small.model.states, small.model.inputs, 's'))
+    assert small.linear.fit == evaluate(linear, held_out).fit
+    assert small.figures.fit.rw < 2e-3 < small.linear.fit.rw
 
 
 def test_there_is_a_model_for_every_size():
