@@ -262,7 +262,8 @@ class Cluster(_Pool):
         self._client.subscribe_topic(token, lambda message: told.put(message[1]))
         try:
             # not scattered: that would be lost with the worker that has it
-            yield partial(_to_topic, token), self._client.submit(bytes, call, pure=False), news, stop
+            source = self._client.submit(bytes, call, pure=False)
+            yield partial(_to_topic, token), source, news, stop
         finally:
             with contextlib.suppress(OSError, ValueError, RuntimeError):
                 self._client.unsubscribe_topic(token)

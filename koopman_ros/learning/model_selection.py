@@ -132,7 +132,7 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
 def compare(plant: PlantDescription, samples: DriftSamples,
             recipes: Mapping[str, Recipe] | None = None, *,
             degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
-            seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
+            seed: int = 0, starts: int = 2, watch: Watch | None = None,
             loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
             backend: Backend | None = None, begin: LiftedModel | None = None) -> ClassComparison:
     """
@@ -171,7 +171,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
         raise ValueError(f'no class of {", ".join(names)} begins from a lift '
                          f'{"with" if begin.identity else "without"} identity coordinates: learn '
                          'a lift of its kind, or begin from nothing')
-    learner = _Learner(plant, samples, split_seed)
+    learner = _Learner(plant, samples)
     judge = judge or learner.judge(loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
     found: list[ModelCandidate] = []
@@ -182,7 +182,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             if name in recipes:
                 trained = train(
                     plant, samples, recipes[name], seed=seed, starts=starts,
-                    split_seed=split_seed, loops=0, watch=_among(watch, name, counts),
+                    loops=0, watch=_among(watch, name, counts),
                     device=device, backend=backend,
                     begin=begin if name in continuing else None)
                 steps = trained.steps
@@ -252,9 +252,9 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
 class _Learner:
     """The samples that all contenders are learned from, and judged by without a record."""
 
-    def __init__(self, plant: PlantDescription, samples: DriftSamples, split_seed: int) -> None:
+    def __init__(self, plant: PlantDescription, samples: DriftSamples) -> None:
         self._plant = plant
-        self._parts = split_by_episode(samples, split_seed)
+        self._parts = split_by_episode(samples, seed=0)
         self._training, self._validation, self._test = self._parts
         self._box = Box.of(plant, samples.x, samples.u)
         # errors of the samples concern all classes

@@ -84,9 +84,9 @@ class _Candidate:
 
 
 def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, seed: int = 0,
-          starts: int = 4, split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
-          loops: int = LOOPS, device: str = 'cpu', threads: int = 1,
-          backend: Backend | None = None, begin: LiftedModel | None = None) -> Trained:
+          starts: int = 4, watch: Watch | None = None, refuse: bool = True, loops: int = LOOPS,
+          device: str = 'cpu', backend: Backend | None = None,
+          begin: LiftedModel | None = None) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
@@ -97,13 +97,11 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
     :param starts: number of starts in each round; their seeds are drawn from `seed`.
-    :param split_seed: seed of the split into training, validation and test episodes.
     :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
         refused.
     :param loops: closed loops in which the law is tried before, see
         :func:`~koopman_ros.evaluation.closed_loop_test.evaluate_closed_loops`; 0 for none.
     :param device: that evaluates the residuals, as torch names it, on every worker.
-    :param threads: torch's threads for each start, for a number of which the bits are the same.
     :param backend: of starts and closed loops, see :func:`~koopman_ros.execution.backend_of`; this
         process by default.
     :param begin: a lift of a plant of the same kind that the training begins from: its coordinates
@@ -123,7 +121,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     rounds = recipe.rounds(samples.x.shape[1])
     if begin is not None:
         rounds = _further(recipe, rounds, begin)
-    parts = split_by_episode(samples, split_seed)
+    parts = split_by_episode(samples, seed=0)
     tracker = Tracker(watch, starts * len(rounds) - (starts - 1) * (begin is not None))
     backend = backend or Serial()
     box = Box.of(plant, samples.x, samples.u)
@@ -140,8 +138,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
 
     def run(n_z: int, parent: TrainedLift | None) -> Generator[tuple[str, TrainedLift | str]]:
         count = 1 if parent is None and first is not None else starts
-        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, threads,
-                          tracker)
+        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, tracker)
 
     def judge(grown: TrainedLift | str) -> _Candidate | str:
         return _judged(grown, lambda found: scaling.model(found, **about), parts)
