@@ -21,7 +21,7 @@ from koopman_ros.learning import Edmd, fit, IncrementalTraining, NeuralDrift, ro
 from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.model import Box, load, save
+from koopman_ros.model import Box
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.plants import (
     advance,
@@ -97,16 +97,6 @@ def test_a_function_that_is_no_polynomial_is_refused_and_a_constant_one_is_a_con
         replace(KNOWN, B=lambda x: x).input_matrix(np.zeros(2))
     with pytest.raises(ValueError, match='input_matrix_degree is 1, must be at least 0, and 0'):
         replace(KNOWN, input_matrix_degree=1)
-
-
-def test_the_file_gives_the_model_back(tmp_path):
-    model = replace(Edmd(1).learn(UNKNOWN, samples()))
-    save(model, tmp_path / 'fed.safetensors')
-    read = load(tmp_path / 'fed.safetensors')
-    np.testing.assert_array_equal(read.input_terms.coefficients, model.input_terms.coefficients)
-    x = np.array([0.3, -0.7])
-    np.testing.assert_array_equal(read.input_matrix(x), model.input_matrix(x))
-    assert read.linearised.input_terms is None
 
 
 def test_targets_are_steady_states_of_the_plant():
