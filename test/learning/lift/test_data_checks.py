@@ -109,7 +109,7 @@ RISING = replace(bent_samples(), dxdt=bent_samples().dxdt + 20.0)
       for B in (BENT.B, None)),
     # dx1/dt = -0.1 x1 stands still at x1 = 0 alone, dx2/dt = x2 - x1^2 + u wherever u = -x2
     (replace(TWO_STATE, nominal_state=[0.5, 0.0]), two_state_samples(),
-     r'-0\.05 1/s of x1: .* nominal_state = \[0\.0, '),
+     r'-0\.05 1/s of x1, .* nominal_state = \[0\.0, '),
     (BENT, RISING, '20 m/s of level: move the plant around a')],
     ids=['known B', 'learned B', 'more states than inputs', 'no steady state'])
 def test_a_nominal_point_where_the_plant_moves_is_refused(plant, samples, words):
