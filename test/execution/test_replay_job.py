@@ -6,31 +6,10 @@
 import os
 from pathlib import Path
 import resource
-import subprocess
-import sys
 import time
 
 from koopman_ros.execution.job import ReplayJob
-from support.nodes import TIMEOUT, wait_until_ended
-
-START = """
-import sys
-from koopman_ros.execution.job import ReplayJob
-job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]'])
-print(job.process.pid, flush=True)
-sys.stdin.read()
-"""
-
-
-def test_it_ends_with_the_process_that_started_it() -> None:
-    with subprocess.Popen([sys.executable, '-c', START],
-                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as parent:
-        try:
-            assert parent.stdout is not None
-            child = int(parent.stdout.readline())
-        finally:
-            parent.kill()
-    wait_until_ended(child)
+from support.nodes import TIMEOUT
 
 
 def test_it_gives_way_and_says_what_is_wrong(tmp_path: Path) -> None:
