@@ -82,8 +82,6 @@ def test_a_start_without_a_result_is_no_candidate(change, words):
         recorded = Recorded(replace(SMALL, max_iterations=5))
         train(UNFORCED, unforced_samples(), recorded, starts=1)
         given = replace(recorded.found[2][0][2], **change)
-    # a ValueError to whoever does not know it
-    assert issubclass(TrainingFailed, ValueError)
     with pytest.raises(TrainingFailed, match=f'no start gave a usable lift with n_z = 2: {words}'):
         train(UNFORCED, unforced_samples(), Given(given), starts=2)
 
@@ -103,9 +101,7 @@ def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     """Two free coordinates can be x1 and x1^2, whose rw is 0 and which do not hold x2."""
     plant, samples = small_plants.TWO_STATE, small_plants.two_state_samples(400)
     exact = IncrementalTraining(3, identity=False, decoder=0, max_iterations=150)
-    with pytest.raises(TrainingFailed,
-                       match=r'does not predict the motion better than a linear .*, '
-                       r'or use identity coordinates$'):
+    with pytest.raises(TrainingFailed, match='or use identity coordinates'):
         train(plant, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
     kept = train(plant, samples, replace(exact, identity=True), starts=1, loops=0)

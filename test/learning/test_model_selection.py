@@ -111,10 +111,9 @@ def test_a_class_that_cannot_be_learned_has_its_reason():
                     starts=1, loops=0)
     assert found.chosen.name == 'linear'
     assert [one.model is None for one in found.contenders] == [False, True, True]
-    assert found.contenders[2].refusal.startswith('n_z = 1 is too small for 1 states')
-    none = [contender(name, math.inf, 'is none') for name in ('a', 'b')]
+    assert 'is too small for 1 states' in found.contenders[2].refusal
     with pytest.raises(TrainingFailed, match='no class has a model: a: is none; b: is none'):
-        plainest(none)
+        plainest([contender(name, math.inf, 'is none') for name in ('a', 'b')])
 
 
 def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
@@ -141,9 +140,7 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     monkeypatch.setattr(model_selection, 'evaluate_closed_loops', fails)
     found = compare(BENT, bent_samples(), {}, loops=16)
     assert found.chosen.name == chosen
-    refusal = f'no controller: the law fails in {failing[2]} of 16'
-    assert found.contenders[1].refusal.startswith(refusal)
-    assert f'{"chosen; " * (chosen == "polynomial")}{refusal}' in str(found)
+    assert f'the law fails in {failing[2]} of 16' in found.contenders[1].refusal
 
 
 def test_all_laws_are_tried_where_the_data_are(monkeypatch):
@@ -161,10 +158,7 @@ def test_all_laws_are_tried_where_the_data_are(monkeypatch):
         assert one.model.training_states is known
 
 
-def test_a_plant_without_inputs_and_degrees_that_cannot_be():
-    found = compare(UNFORCED, unforced_samples(), {}, degrees=(40,))
-    assert found.chosen.name == 'linear'
-    assert found.contenders[1].refusal
+def test_a_plant_without_inputs_has_no_law():
     assert compare(UNFORCED, unforced_samples(), {}).chosen.law_check is None
 
 
