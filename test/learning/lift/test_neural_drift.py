@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from koopman_ros.core.datasets import DriftSamples, split_by_episode
-from koopman_ros.learning import fit, IncrementalTraining, NeuralDrift, train, TrainingFailed
+from koopman_ros.learning import fit, IncrementalTraining, NeuralDrift, train
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.neural_drift import NeuralDriftProblem, with_readout
@@ -134,13 +134,6 @@ def test_a_neural_drift_is_learned(B):
     np.testing.assert_allclose(units, TWO_STATE.B, rtol=0, atol=1e-3)
     # z = x: the lifted A is the linear fit
     np.testing.assert_array_equal(model.lift(np.array([0.3, -0.2])), [0.3, -0.2])
-
-
-def test_a_plant_that_is_linear_needs_no_network():
-    samples = bent_samples()
-    linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    with pytest.raises(TrainingFailed, match='does not predict the motion better than a linear'):
-        train(BENT, linear, NeuralDrift(3, max_iterations=20), starts=1)
 
 
 def test_a_recipe_without_sense():

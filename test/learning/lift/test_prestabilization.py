@@ -16,11 +16,10 @@ from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.learning.lift.prestabilization import PrestabilizedFrame
 from koopman_ros.model import NetworkObservables
+from support.small_plants import BENT
 
 # dx/dt = x + 0.3 x^2 + 2 u in deviations from 3 m and 0.5 m/s
-GROWING = PlantDescription('growing', ('level',), ('m',), ('flow',), ('m/s',), 's',
-                           np.array([3.0]),
-                           np.array([0.5]), np.array([[2.0]]))
+GROWING = replace(BENT, name='growing')
 # of a pendulum about its upright position, x2' = 4 sin x1 - 0.2 x2 + 3 u
 UPRIGHT = PlantDescription('upright', ('angle', 'rate'), ('rad', 'rad/s'), ('torque',), ('N m',),
                            's',
@@ -35,13 +34,12 @@ def upright(x):
     return np.stack([x[..., 1], 4.0 * np.sin(x[..., 0]) - 0.2 * x[..., 1]], axis=-1)
 
 
-def samples_of(plant, drift, half, count=400, B=None):
-    """Return samples all over a box of half-ranges about the nominal state, with B(x) if given."""
+def samples_of(plant, drift, half, count=400):
+    """Return samples all over a box of half-ranges about the nominal state."""
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-half, half, (count, len(half))), rng.uniform(-1.0, 1.0, (count, 1))
-    pushed = u @ plant.B.T if B is None else (B(x) @ u[..., None])[..., 0]
-    return DriftSamples(x + plant.nominal_state, drift(x) + pushed, u + plant.nominal_input,
-                        np.arange(count) // (count // 10))
+    return DriftSamples(x + plant.nominal_state, drift(x) + u @ plant.B.T,
+                        u + plant.nominal_input, np.arange(count) // (count // 10))
 
 
 def learned(plant, samples, recipe, starts=1):
