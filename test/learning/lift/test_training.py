@@ -11,12 +11,12 @@ import torch
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.learning import Edmd, evaluate, fit, IncrementalTraining, train
-from koopman_ros.learning.lift import training
 from koopman_ros.learning.lift.incremental import least_squares
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.learning.lift.network import Pass
 from koopman_ros.learning.lift.residuals import ScaledSamples
+from koopman_ros.learning.lift.training import PreparedSamples
 from koopman_ros.model import Box
 from koopman_ros.plants import scalar_example
 from support import small_plants
@@ -163,15 +163,14 @@ def test_the_model_describes_its_origin(small):
 
 def test_a_law_is_tried_on_the_drift_that_predicts_best(small):
     """The plant's is a polynomial of degree 2."""
-    parts = split_by_episode(bent_samples(), 0)
-    box = Box(small.model.states, small.model.inputs, 's')
+    prepared = PreparedSamples.of(BENT, bent_samples())
     x, u = np.array([[2.2], [3.9]]), np.array([[0.1], [1.2]])
     true = -(x - 3.0) - 0.3 * (x - 3.0) ** 2 + 2.0 * (u - 0.5)
-    found = training.reference_drift(BENT, box, parts, small.model)(x, u)
+    found = prepared.reference_drift(small.model)(x, u)
     np.testing.assert_allclose(found, true, rtol=0, atol=1e-12)
     # 12 samples are too few for any but the linear one, and the lift is better than that
-    few = (bent_samples(1, 12), *parts[1:])
-    found = training.reference_drift(BENT, box, few, small.model)(x, u)
+    few = replace(prepared, parts=(bent_samples(1, 12), *prepared.parts[1:]))
+    found = few.reference_drift(small.model)(x, u)
     own = lifted_rate(small.model, 1.0)(x, u)
     np.testing.assert_array_equal(found, own)
     assert np.max(np.abs(own - true)) > 1e-6
