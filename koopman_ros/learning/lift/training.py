@@ -176,9 +176,8 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     data = scaling.data(parts[0], device)
     about = {'training_states': prepared.states,
              'provenance': Provenance(plant.name, seed, samples.digest(), {}, __version__)}
-    first = None if begin is None or not isinstance(recipe,
-                                                    IncrementalTraining) else scaling.planted(
-        recipe, begin, data)
+    first = (scaling.planted(recipe, begin, data)
+             if begin is not None and isinstance(recipe, IncrementalTraining) else None)
 
     def run(n_z: int, parent: TrainedLift | None) -> Generator[tuple[str, TrainedLift | str]]:
         count = 1 if parent is None and first is not None else starts
