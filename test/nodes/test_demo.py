@@ -46,21 +46,16 @@ def test_demo_leaves_bag_picture_and_summary(
     assert len(re.findall(r'^ +[\d.]+ +', done.stdout, re.MULTILINE)) >= 20
 
 
-def test_demo_says_which_plants_it_knows(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert setpoint_demo.main(['--plant', 'volcano', '--output', str(tmp_path)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("demo: there is no demo of 'volcano': choose one of ")
-    assert {'fed_reactor', 'pendulum', 'two_tanks'} <= set(line.split(' of ')[-1].split(', '))
-
-
 def test_demo_says_in_one_line_why_it_cannot_run(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'taken').write_text('a file, not a folder')
-    assert setpoint_demo.main(['--output', str(tmp_path / 'taken')]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith('demo: ')
-    assert str(tmp_path / 'taken') in line
+    for options, words in ((['--output', str(tmp_path / 'taken')], str(tmp_path / 'taken')),
+                           (['--plant', 'volcano', '--output', str(tmp_path)],
+                            "no demo of 'volcano': choose one of fed_reactor, pendulum")):
+        assert setpoint_demo.main(options) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith('demo: ')
+        assert words in line
 
 
 def test_demo_commands_nothing_in_a_domain_with_another_loop(
