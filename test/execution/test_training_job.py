@@ -75,6 +75,7 @@ def test_process_that_gets_a_signal(
      'print(\'{"progress": 0.25, "text": "learning"}\', flush=True); '
      'raise RuntimeError("the core melts")', 0.25, 'code 1: RuntimeError: the core melts'),
     ('import no_such_torch', 0.0, "No module named 'no_such_torch'): pip install torch"),
+    ('import os, signal; os.kill(os.getpid(), signal.SIGXCPU)', 0.0, 'a day of processor time'),
     # before it has read its task
     ('raise SystemExit("no time")', 0.0, 'code 1: no time')])
 def test_process_that_breaks_down(
