@@ -74,7 +74,7 @@ class Tracker:
 
 @contextlib.contextmanager
 def _one_thread() -> Generator[None]:
-    """Let torch work with one thread for a while; the bits of its sums depend on their number."""
+    """Run torch with one thread: the rounding of its sums depends on their number."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
