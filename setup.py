@@ -47,7 +47,7 @@ setup(
             'ros-jazzy-common-interfaces==5.3.6',
             'ros-jazzy-rmw-fastrtps-cpp==8.4.3',
         ],
-        'demo': ['matplotlib', 'rich'],
+        'demo': ['matplotlib'],
         # the operator's panel, with all that its pages load
         'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
         # the predictive law: solver of quadratic programs, and compiler

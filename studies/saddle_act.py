@@ -109,8 +109,8 @@ def run_seed(folder: Path, seed: int, speed: float) -> dict[str, float | bool]:
         rows.append(row)
         table.show(row)
 
-    with table, running_loop(scenario, logs, _trainer_parameters(bags[0], learned, seed),
-                             on_row, table.announce) as operator:
+    with running_loop(scenario, logs, _trainer_parameters(bags[0], learned, seed),
+                      on_row) as operator:
         def on_estimate(message: JointState) -> None:
             estimates[stamp_nanoseconds(message.header.stamp)] = message
 

@@ -71,7 +71,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     table = LiveTable('a controller without observer learns its plant anew',
                       scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
-    with table, running_loop(scenario, logs, trainer, table.show, table.announce) as operator:
+    with running_loop(scenario, logs, trainer, table.show) as operator:
         phases = _operate(operator, bags[1], new_model)
     history = read_run(scenario.wiring, *bags)
     learned = load(new_model)

@@ -137,16 +137,14 @@ class AcceptanceResult:
 
 
 def evaluate_model(found: Identified, learned: Trained | ClassComparison,
-                   current: LiftedModel | None,
-                   thresholds: Thresholds, *, loops: int = LOOPS,
-                   watch: Callable[[float], bool] = lambda _: False) -> AcceptanceResult:
+                   current: LiftedModel | None, thresholds: Thresholds, *, loops: int = LOOPS
+                   ) -> AcceptanceResult:
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
     :param learned: what was trained, or compared by :func:`compare_classes`, of which the chosen
         model is judged, and whose closed loops are not run again.
-    :param loops: see :func:`evaluate_closed_loops`, as for `watch`.
-    :raises Stopped: when `watch` ended it.
+    :param loops: see :func:`evaluate_closed_loops`.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)
     rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
@@ -154,7 +152,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     chosen = learned.chosen if isinstance(learned, ClassComparison) else None
     law_check = chosen.law_check if chosen and chosen.excess is not None else None
     if law_check is None:
-        law_check = held_out.law_check(model, loops, watch)
+        law_check = held_out.law_check(model, loops, lambda _: False)
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
@@ -163,8 +161,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
-                            held_out.linear_rmse,
-                            found.noise, law_check)
+                            held_out.linear_rmse, found.noise, law_check)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:
