@@ -169,7 +169,7 @@ def _operate(operator: Operator, bag: Path, learned: Path) -> list[tuple[str, fl
     """Run all phases; return name and start, in s of plant time, of each phase."""
     operator.begin('start-up', 'a PI law brings the reactor to its saddle and holds it there')
     operator.run_until(_SETTLED)
-    operator.record_anew(bag)
+    operator.record_again(bag)
     operator.leave_setpoints()
     operator.switch('trainer/experiment', True)
     operator.begin('experiment', f'set-points are stepped for {MINUTES:.0f} min')

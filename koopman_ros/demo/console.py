@@ -30,7 +30,7 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
         parser.add_argument('--plant', default=plant, help='plant that is shipped, by the name '
                             'of its file in config/plants (default: %(default)s)')
         parser.add_argument('--panel', action='store_true', help='run until Ctrl-C, with the '
-                            'panel beside it, which says where to look in a browser')
+                            'panel, whose address is printed')
         parser.add_argument('--port', type=int, default=8080, help='of the panel, 0 for any free '
                             'one (default: %(default)s)')
     parser.add_argument('--speed', type=float, default=speed,

@@ -163,7 +163,7 @@ class Operator:
             if reason:
                 raise HarnessError(f'{node}: {reason}')
 
-    def record_anew(self, bag: Path) -> None:
+    def record_again(self, bag: Path) -> None:
         """End the recording, and begin another one."""
         self.switch('trainer/record', False)
         self.set('trainer', output=str(bag))

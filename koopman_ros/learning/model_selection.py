@@ -95,7 +95,7 @@ class ClassComparison:
         head = ['model', 'n_z', 'rx, validation', 'rx, test', *['beyond noise'] * recorded,
                 *(f'roll-out of {name}, {unit}' for name, unit in zip(
                     self.state_names, self.state_units, strict=True)),
-                'loops failed', 'cost beside linear', 's', 'remark']
+                'loops failed', 'cost relative to linear', 's', 'remark']
         rows = []
         for one in self.contenders:
             found = one.figures

@@ -191,28 +191,28 @@ class ReplayParameters:
     """Snapshot of the replay's parameters; a controller's may be given for the new model."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'plant that is shipped, whose topics are those of the bag; any other '
-        'name for none')
+        DEFAULT_SYSTEM, 'Bundled plant whose topics are those of the bag; any other name: no '
+        'defaults.')
     model: str = parameter(
-        '', 'where a recorded model is looked for beside the shipped ones: a name, a .safetensors '
-        'file or a folder of them')
+        '', 'Where to look for a recorded model that is not a bundled one: a .safetensors file, a '
+        'name, or a folder of such files.')
     bags: tuple[str, ...] = parameter(
-        ('run_1',), 'bags to replay, each a run of its own: .mcap files or bag folders')
+        ('run_1',), 'Bags to replay, each as a separate run: .mcap files or bag folders.')
     new_model: str = parameter(
-        '', 'model whose commands are compared with the recorded ones, by name or path, under the '
-        'recorded parameters but for those of a controller that are given here, too; empty only '
-        'checks that the recorded commands are reproduced')
+        '', 'Model, by name or path, whose commands are compared with the recorded ones. The '
+        'recorded parameters of the controller apply except those given here. Empty: only check '
+        'that the recorded commands are reproduced.')
     output: str = parameter(
-        'replay', 'folder for report.md, summary.json and the pictures; older ones in it are '
-        'replaced')
+        'replay', 'Folder for report.md, summary.json and the pictures; existing ones are '
+        'replaced.')
     tolerance: float = parameter(
-        0.1, 'difference of two commands, in the unit of the input, from which on it is counted '
-        'and marked', '', 0.0, 1e9)
+        0.1, 'Difference between two commands, in the unit of the input, above which it is '
+        'counted and marked.', '', 0.0, 1e9)
     recover: bool = parameter(
-        False, 'read bags that were not closed or are damaged as far as they are whole')
+        False, 'Read the intact part of bags that are damaged or were not closed.')
     last: float = parameter(
-        0.0, 'how much of the end of each bag is replayed, from the snapshot before it; 0 for all '
-        'of it', 's', 0.0, 1e9)
+        0.0, 'Length of the last part of each bag to replay, from the snapshot before it; 0: the '
+        'whole bag.', 's', 0.0, 1e9)
 
 
 def _check_replay(values: ReplayParameters) -> str:

@@ -102,7 +102,7 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
                                     and signals.states.items() <= own.states.items()):
         raise ModelFileError(
             f'{path} has {own}, this controller was started for {signals}: choose a model of '
-            'the same signals, or start it anew')
+            'the same signals, or restart the controller')
     _refuse_slow(path, model)
     written = 'unknown'
     # the file may be gone since it was read

@@ -233,7 +233,7 @@ class _BagImport:
         spiked = spike.any(axis=1)
         for state, count in zip(self.states, spike.sum(axis=0).tolist(), strict=True):
             dropped[named(self.states, state, 'spike of a single sample')] += count
-        dropped['beside a spike'] += n_x * int(np.sum(spiked)) - int(np.sum(spike))
+        dropped['in a sample with a spike'] += n_x * int(np.sum(spiked)) - int(np.sum(spike))
         stamps, x = stamps[~spiked], x[~spiked]
         period = float(np.median(np.diff(stamps)))
         ends = self._ends(stamps, x, period)

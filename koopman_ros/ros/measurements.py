@@ -79,8 +79,8 @@ class Measurements:
     def complaint(self) -> str:
         """What is wrong with the messages, or an empty string."""
         return '' if self._frame_length <= LONGEST_FRAME_ID else (
-            f'the frame_id of the measurement has {self._frame_length} characters, of which '
-            f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
+            f'the frame_id of the measurement has {self._frame_length} characters; only '
+            f'the first {LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
 
     def _on_measurement(self, received: SignalSample) -> None:
         self.frame_id = received.frame_id[:LONGEST_FRAME_ID]

@@ -159,7 +159,7 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
         message.clock.sec, message.clock.nanosec = sec, nanosec
         clock.publish(message)
         ros.meet('controller')
-    ros.wait_until(lambda: '/clock told sec -5, nanosec 0, which is no time: ignored' in (
+    ros.wait_until(lambda: '/clock has sec -5, nanosec 0, which is no valid time: ignored' in (
         process.output()))
     # the true time is taken still
     clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))

@@ -152,7 +152,8 @@ def test_a_type_that_one_row_adds_is_learned_from(
             message = BatteryState(voltage=voltage)
             message.header.stamp.sec = second
             writer.write('/cell', serialize_message(message), second * NANOSECONDS)
-    series = read_series(tmp_path / 'run', '/cell')
+    cell = place('/cell', 'cell', 'V', {'type': kind})
+    series = read_series(tmp_path / 'run', cell)
     assert (series.values.tolist(), series.unit) == ([3.5, -1.0, 3.75], 'V')
     assert place('/cell', 'cell', 'mV', {'type': kind}) == MessageField(
         '/cell', kind, 'voltage', 'V')

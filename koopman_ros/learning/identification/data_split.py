@@ -55,8 +55,8 @@ class SplitRecord:
         self.choose, self.held_out = (
             [i for i in share if i in self._settled] for share in (choose, held_out))
         if not (self.choose and self.held_out):
-            raise ValueError('the episodes are too short for a filter to find what is not '
-                             'measured: record longer without gaps')
+            raise ValueError('the episodes are too short for a filter to estimate unmeasured '
+                             'states: record longer without gaps')
         self.step = longest_step(self.parts)  #: longest of a roll-out
         self._last: tuple[Predictor[Drift], FilterRun] | None = None
         #: usual time between samples
