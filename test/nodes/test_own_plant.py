@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant of one's own as docs/own_plant.md has it: its commands, its files, its messages."""
+"""A plant of one's own as docs/tutorials/own_plant.md has it: its commands, its files, its messages."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +27,7 @@ from support.installation import Installation, ROOT, run, underlay
 from support.nodes import run_here
 
 OVEN = ROOT / 'examples' / 'oven'
-PAGE = (ROOT / 'docs' / 'own_plant.md').read_text()
+PAGE = (ROOT / 'docs' / 'tutorials/own_plant.md').read_text()
 # node and arguments of each command on the page that takes a file, in the order there
 RECORD, SIMULATE, TRAIN, CONTROL, RUN, *_ = (
     (node, tuple(shlex.split(text))) for node, text in re.findall(
