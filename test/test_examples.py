@@ -340,14 +340,14 @@ def test_tutorials_are_cells_that_notebooks_open(path: Path) -> None:
 
 
 def test_page_quotes_the_tutorials() -> None:
-    _, _, page = (ROOT / 'docs' / 'tutorials/own_plant.md').read_text().partition('## From Python')
+    _, _, page = (ROOT / 'docs' / 'how-to' / 'python.md').read_text().partition('# Use')
     sources = [path.read_text() for path in TUTORIALS.glob('*.py')]
     blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
     assert len(blocks) > 2
     for block in blocks:
         assert any(block in source for source in sources), block
-    listed = re.findall(r'\(\.\./examples/tutorials/(\w+)\.py\)',
-                        (ROOT / 'docs' / 'tutorials/python_scripts.md').read_text())
+    listed = re.findall(r'\(\.\./\.\./examples/tutorials/(\w+)\.py\)',
+                        (ROOT / 'docs' / 'tutorials' / 'python_scripts.md').read_text())
     assert sorted(listed) == sorted(path.stem for path in TUTORIALS.glob('*.py'))
 
 

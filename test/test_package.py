@@ -131,8 +131,7 @@ def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> N
     assert nodes | tests <= {*keys['ros'], *keys['apt'], *keys['pip']}
     assert not set(keys['none']) & {key for kind in ('ros', 'apt', 'pip') for key in keys[kind]}
     assert nodes & set(keys['pip']) == {'mcap-ros2-support', 'python3-rosbags-pip'}
-    _, _, install = (ROOT / 'docs' / 'how-to/operate.md').read_text().partition('## Install')
-    install, _, _ = install.partition('## Start')
+    _, _, install = (ROOT / 'docs' / 'how-to' / 'install.md').read_text().partition('# Install')
     assert not [key for key in keys['pip'] if f'`{key}`' not in install]
     assert not [name for name in keys['none'] if not re.search(rf'install[^`]*\b{name}', install)
                 and f'python3-{name}' not in install]

@@ -79,7 +79,7 @@ def test_process_that_was_stopped_ends_in_order(tmp_path: Path) -> None:
 
 
 def test_example_of_the_page_passes(tmp_path: Path) -> None:
-    page = Path(__file__).parents[2] / 'docs' / 'how-to/test_nodes.md'
+    page = Path(__file__).parents[2] / 'docs' / 'how-to' / 'test_nodes.md'
     _, example, _ = re.split('```(?:python)?\n', page.read_text())
     exec(example, names := {})
     (test,) = (found for name, found in names.items() if name.startswith('test_'))
