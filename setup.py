@@ -47,7 +47,7 @@ setup(
             'ros-jazzy-common-interfaces==5.3.6',
             'ros-jazzy-rmw-fastrtps-cpp==8.4.3',
         ],
-        'demo': ['matplotlib', 'rich'],
+        'demo': ['matplotlib'],
         # the operator's panel, with all that its pages load
         'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
         # the predictive law: solver of quadratic programs, and compiler
@@ -56,7 +56,7 @@ setup(
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'numba', 'psutil',
+        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'numba',
                   'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
@@ -90,6 +90,7 @@ setup(
             'player = koopman_ros.process_entry:player',
             'replay = koopman_ros.process_entry:replay',
             'panel = koopman_ros.process_entry:panel',
+            'koopman_ros = koopman_ros.process_entry:command_line',
         ],
     },
 )

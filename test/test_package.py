@@ -7,10 +7,8 @@ import ast
 from collections import Counter
 import functools
 import importlib.metadata
-import os
 from pathlib import Path
 import re
-import subprocess
 import sys
 import tomllib
 import xml.etree.ElementTree as ElementTree
@@ -165,23 +163,9 @@ def test_options_of_pytest_are_those_of_its_release_7_4() -> None:
     # and of pytest-timeout, which the manifest names
     assert set(options) <= {'testpaths', 'pythonpath', 'addopts', 'filterwarnings',
                             'faulthandler_timeout', 'timeout'}
-
-
-def test_plugins_of_a_sourced_ros_are_left_out(tmp_path: Path) -> None:
-    """launch_testing's has an argument that pytest 9 does not know."""
-    (tmp_path / 'hooks.py').write_text(
-        'def pytest_pycollect_makemodule(path, parent):\n    raise AssertionError\n')
-    for name in ('launch_testing', 'launch_ros', 'launch_pytest'):
-        about = tmp_path / f'{name}-3.4.dist-info'
-        about.mkdir()
-        (about / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: 3.4\n')
-        (about / 'entry_points.txt').write_text(f'[pytest11]\n{name} = hooks\n')
-    paths = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get('PYTHONPATH'))))
-    done = subprocess.run(
-        [sys.executable, '-m', 'pytest', '-q', '--collect-only', 'test/core/test_units.py'],
-        cwd=ROOT, env={**os.environ, 'PYTHONPATH': paths}, capture_output=True, text=True,
-        timeout=240, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    # launch_testing's plug-in has an argument that pytest 9 does not know
+    assert {'no:launch_testing', 'no:launch_ros', 'no:launch_pytest'} <= set(
+        options['addopts'].split())
 
 
 def test_lock_holds_each_requirement_within_its_range() -> None:

@@ -17,17 +17,8 @@ from koopman_ros.tuning import InputLimits
 _NEGLIGIBLE = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
-class LimitedInput:
-    """A command within its limits."""
-
-    u: Array  #: (n_u,) command
-    at_range: bool  #: whether the range was active
-    at_rate: bool  #: whether the rate was active
-
-
 def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: float
-          ) -> LimitedInput:
+          ) -> tuple[Array, bool, bool]:
     """
     Bring a command within its range, and within its rate where a previous command is known.
 
@@ -35,6 +26,7 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
 
     :param wanted: (n_u,) the law's command.
     :param previous: (n_u,) command `seconds` ago, or None at the first.
+    :return: the command (n_u,), and whether range and rate were active.
     """
     command = within = limits.within(wanted)
     if previous is not None:
@@ -43,7 +35,7 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
         np.multiply(limits.rate, max(0.0, seconds), out=reach, where=np.isfinite(limits.rate))
         command = np.minimum(np.maximum(within, previous - reach), previous + reach)
     command.setflags(write=False)
-    return LimitedInput(command, bool(np.any(within != wanted)), bool(np.any(command != within)))
+    return command, bool(np.any(within != wanted)), bool(np.any(command != within))
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,10 +77,6 @@ class FallbackLevel:
         """Return the part (n_c,) of a state (n_x,) that has a set-point."""
         return x[self._indices]
 
-    def controlling(self, names: tuple[str, ...]) -> FallbackLevel:
-        """Return the level with set-points for these states alone."""
-        return replace(self, controlled=names)
-
     def target(self, setpoint: Array, w: Array, start: Array | None) -> Target | None:
         """
         Find the steady state of a set-point (n_c,), in state units, under a disturbance (n_x,).

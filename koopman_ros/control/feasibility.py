@@ -56,7 +56,7 @@ class Feasibility:
         if not given.all():
             kept = tuple(name for name, is_given in zip(self.box.names, given, strict=True)
                          if is_given)
-            some = replace(self, level=self.level.controlling(kept))
+            some = replace(self, level=replace(self.level, controlled=kept))
             return some.infeasibility(goal[given], (), command, whole)
         cause = self._cause(self._target(goal))
         if cause is None:
@@ -146,20 +146,18 @@ class Feasibility:
         """Return what keeps a target from being held, or None."""
         if target is None:
             return reason(StatusCode.NO_STEADY_STATE)
-        model = self.level.model
-        u, slack = model.inputs.to_physical(target.u), _SLACK * model.inputs.scale
-        for i, name in enumerate(model.inputs.names):
-            lower, upper = self.level.limits.lower[i], self.level.limits.upper[i]
-            if not lower - slack[i] <= u[i] <= upper + slack[i]:
-                return reason(StatusCode.INPUT_NEEDED, signal=name, value=float(u[i]),
-                              lower=float(lower), upper=float(upper))
-        states = model.states
-        x, half = states.to_physical(target.x), 0.5 * (states.upper - states.lower)
-        reach = (self.margin + _SLACK) * half
-        for i, name in enumerate(states.names):
-            if not states.lower[i] - reach[i] <= x[i] <= states.upper[i] + reach[i]:
-                return reason(StatusCode.STATE_LEAVES, signal=name, value=float(x[i]),
-                              lower=float(states.lower[i]), upper=float(states.upper[i]))
+        model, limits = self.level.model, self.level.limits
+        states, half = model.states, 0.5 * (model.states.upper - model.states.lower)
+        for names, value, lower, upper, slack, code in (
+                (model.inputs.names, model.inputs.to_physical(target.u), limits.lower,
+                 limits.upper, _SLACK * model.inputs.scale, StatusCode.INPUT_NEEDED),
+                (states.names, states.to_physical(target.x), states.lower, states.upper,
+                 (self.margin + _SLACK) * half, StatusCode.STATE_LEAVES)):
+            within = (lower - slack <= value) & (value <= upper + slack)
+            if not within.all():
+                i = int(np.argmin(within))
+                return reason(code, signal=names[i], value=float(value[i]),
+                              lower=float(lower[i]), upper=float(upper[i]))
         if self._too_few_inputs:
             nearest = nearest_steady_state(model, target, self.w)
             if nearest is None or not np.all(

@@ -9,8 +9,9 @@ import math
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.status import Reason, reason, StatusCode
+from koopman_ros.core.status import Reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.estimation.sensor_checks import out_of_range
 from koopman_ros.model import Coordinates
 
 # A stamp further ahead than this comes from another clock and is no schedule.
@@ -36,13 +37,8 @@ class Setpoint:
 
 def refusal(box: Coordinates, value: Array) -> Reason | None:
     """Return why a set-point (n,), in the units of the box, is outside of it, or None."""
-    for i, name in enumerate(box.names):
-        if not np.isfinite(value[i]):
-            return reason(StatusCode.SETPOINT_NOT_FINITE, signal=name, value=float(value[i]))
-        if not box.lower[i] <= value[i] <= box.upper[i]:
-            return reason(StatusCode.SETPOINT_OUTSIDE, signal=name, value=float(value[i]),
-                          lower=float(box.lower[i]), upper=float(box.upper[i]))
-    return None
+    return out_of_range(box.names, value, box.lower, box.upper, StatusCode.SETPOINT_OUTSIDE,
+                        StatusCode.SETPOINT_NOT_FINITE)
 
 
 def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | None) -> Setpoint:

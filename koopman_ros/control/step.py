@@ -186,12 +186,11 @@ class ControlStep(Configuration):
                 changes['target'] = read_only(np.concatenate((
                     self.model.states.to_physical(target.x),
                     self.model.inputs.to_physical(target.u))))
-        limited = limit(self.tuning.limits, wanted, state.command, time.counted)
-        done = replace(
-            done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
-            outside=self.model.inputs.violation(limited.u))
-        state = replace(state, **changes, command=limited.u, commanded_ns=time.command_ns)
-        return state, limited.u, self._report(state, why, measured, target, done)
+        u, at_range, at_rate = limit(self.tuning.limits, wanted, state.command, time.counted)
+        done = replace(done, at_range=done.at_range or at_range, at_rate=at_rate,
+                       outside=self.model.inputs.violation(u))
+        state = replace(state, **changes, command=u, commanded_ns=time.command_ns)
+        return state, u, self._report(state, why, measured, target, done)
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime
                 ) -> tuple[Supervisor, Target | None, LawResult | None]:

@@ -44,6 +44,17 @@ def _brief(value: object) -> str:
     return repr(value)
 
 
+def real(value: ArrayLike, name: str) -> Array:
+    """Return numbers as a float64 array; ValueError for complex ones and what is no number."""
+    array = np.asarray(value)
+    if np.iscomplexobj(array):
+        raise ValueError(f'{name} must be real, got complex numbers: pass their real part')
+    try:
+        return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'{name} must be numbers ({error})') from error
+
+
 def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite: bool = True
            ) -> Array:
     """
@@ -53,7 +64,7 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     :param finite: whether infinity is refused as well as what is not a number.
     :raises ValueError: naming both shapes, or the first entry that is refused.
     """
-    array = np.array(value, dtype=np.float64)
+    array = real(value, name).copy()
     fits = array.ndim == len(shape) and all(
         wanted in (None, length) for wanted, length in zip(shape, array.shape, strict=True))
     if not fits:

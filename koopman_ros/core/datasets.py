@@ -13,8 +13,8 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from koopman_ros.core.arrays import Array, frozen, short_repr
-from koopman_ros.core.units import check_time_unit
+from koopman_ros.core.arrays import Array, frozen, real, short_repr
+from koopman_ros.core.units import check_time_unit, check_unit
 
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
            'split_by_episode', 'within']
@@ -48,11 +48,17 @@ class PlantDescription:
     def __post_init__(self) -> None:
         check_time_unit(self.time_unit)
         for kind in ('state', 'input'):
+            for what in ('names', 'units'):
+                if isinstance(given := getattr(self, f'{kind}_{what}'), str):
+                    raise ValueError(f'{kind}_{what} is the text {given!r}: pass a sequence, '
+                                     f'({given!r},) for one {kind}')
             names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
+            for unit in units:
+                check_unit(unit)
             if len(units) != len(names) or len(set(names)) != len(names):
                 raise ValueError(f'incompatible {kind}_names and {kind}_units: expected different '
                                  f'names and as many units, got {list(names)} and {list(units)}')
-            nominal = np.array(getattr(self, f'nominal_{kind}'), dtype=np.float64)
+            nominal = real(getattr(self, f'nominal_{kind}'), f'nominal_{kind}').copy()
             if nominal.shape != (len(names),):
                 raise ValueError(f'incompatible nominal_{kind}: expected one number for each of '
                                  f'{list(names)}, got {nominal.tolist()}')
@@ -109,8 +115,14 @@ class Episode:
 
     def __post_init__(self) -> None:
         for times, values in (('time', 'x'), ('input_time', 'u')):
-            t = np.ascontiguousarray(getattr(self, times), dtype=np.float64)
-            v = np.ascontiguousarray(getattr(self, values), dtype=np.float64)
+            t = np.ascontiguousarray(real(getattr(self, times), times))
+            v = np.ascontiguousarray(real(getattr(self, values), values))
+            if (t.ndim, v.ndim) == (2, 1):
+                raise ValueError(f'{times} has shape {t.shape} and {values} {v.shape}: they are '
+                                 'exchanged; pass the times first')
+            if (t.ndim, v.ndim) == (1, 1):
+                raise ValueError(f'{values} has shape {v.shape}: pass one column for each signal, '
+                                 f'{values}[:, None] for one')
             if t.ndim != 1 or v.ndim != 2 or len(t) != len(v) or len(t) == 0:
                 raise ValueError(f'incompatible {times} and {values}: expected (n,) and (n, m) '
                                  f'with n > 0, got {t.shape} and {v.shape}')

@@ -81,18 +81,18 @@ def write_figures(path: Path, figures: Mapping[str, Any]) -> Path:
 
     An interrupt leaves the old file or the new one, never a part.
     """
-    text = json.dumps(_finite(figures), indent=2, allow_nan=False) + '\n'
+    text = json.dumps(finite(figures), indent=2, allow_nan=False) + '\n'
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, text.encode())
     return path
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Replace what JSON does not know by None, however deep it is nested."""
     if isinstance(value, Mapping):
-        return {name: _finite(entry) for name, entry in value.items()}
+        return {name: finite(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

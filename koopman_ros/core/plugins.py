@@ -44,7 +44,7 @@ def load_plugin(name: str, kind: str, known: Mapping[str, Callable[..., Any] | s
 def plugin_class(name: str, kind: str, known: Mapping[str, type[Any] | str], base: type[Base]
                ) -> type[Base]:
     """
-    Return the class of a plug-in, see :func:`plug`, which fulfils the contract of its base.
+    Return the class of a plug-in, see :func:`load_plugin`, which fulfils the contract of its base.
 
     :raises ValueError: for one that is no subclass, or lacks a method, naming it.
     """
@@ -65,7 +65,7 @@ def plug_in(name: str, kind: str, known: Mapping[str, type[Any] | str], base: ty
 
     Its own parameters in the tuning are the last argument of its constructor.
 
-    :raises ValueError: as :func:`plug_class`, and where it cannot be constructed.
+    :raises ValueError: as :func:`plugin_class`, and where it cannot be constructed.
     """
     found: Any = plugin_class(name, kind, known, base)
     try:

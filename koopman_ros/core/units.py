@@ -90,6 +90,9 @@ def check_unit(unit: str) -> None:
     """Raise ValueError for a unit that there is not."""
     if unit in _USUAL:
         return
+    if unit == 'pH':
+        # the registry takes it for picohenries
+        raise ValueError("'pH' is a number without unit: write 1, and name the signal pH")
     try:
         _check_form(unit)
         _registry().Quantity(1.0, unit)

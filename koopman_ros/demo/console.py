@@ -1,20 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The terminal of the demos: options, a live table, and the figures at the end."""
+"""The terminal of the demos: options, a table of the run, and the figures at the end."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 import sys
-from types import TracebackType
-
-from rich.console import Console
-from rich.live import Live
-from rich.markup import escape
-from rich.table import Table
 
 from koopman_ros.core.units import SECONDS_PER_MINUTE, shown, unit_label
 from koopman_ros.demo.loop import Row
@@ -36,7 +30,7 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
         parser.add_argument('--plant', default=plant, help='plant that is shipped, by the name '
                             'of its file in config/plants (default: %(default)s)')
         parser.add_argument('--panel', action='store_true', help='run until Ctrl-C, with the '
-                            'panel beside it, which says where to look in a browser')
+                            'panel, whose address is printed')
         parser.add_argument('--port', type=int, default=8080, help='of the panel, 0 for any free '
                             'one (default: %(default)s)')
     parser.add_argument('--speed', type=float, default=speed,
@@ -77,75 +71,35 @@ def run_demo(demo: Callable[[Path, float], Mapping[str, object]], options: argpa
 
 class LiveTable:
     """
-    Show a run as it happens.
+    Print a run as it happens: a title, the heads of the columns, and about twenty rows.
 
     :param signals: those of its loop.
-    :param duration: of the run in s of plant time, which twenty rows are for.
+    :param duration: of the run in s of plant time.
     """
 
     def __init__(self, title: str, signals: Signals, duration: float) -> None:
-        self._title = title
-        self._row_period = duration / _ROWS
-        minutes = duration >= _IN_MINUTES
-        self._time = SECONDS_PER_MINUTE if minutes else 1.0
-        self._signals = signals
-        self._columns = ['time [min]' if minutes else 'time [s]', *(
+        self._period, self._next, self._signals = duration / _ROWS, 0.0, signals
+        unit, self._time = ('min', SECONDS_PER_MINUTE) if duration >= _IN_MINUTES else ('s', 1.0)
+        heads = [f'time [{unit}]', *(
             f'{name} [{unit_label(unit)}]' for name, unit in signals.states.items()), *(
             f'{name} set-point [{unit_label(signals.states[name])}]'
             for name in signals.controlled), *(
             f'{name} [{unit_label(unit)}]' for name, unit in signals.inputs.items())]
-        self._console = Console()
-        self._rows: list[tuple[str, ...]] = []
-        self._next = 0.0
-        self._live = Live(self._table(None), console=self._console, refresh_per_second=10,
-                          transient=False) if self._console.is_terminal else None
+        self._widths = [max(8, len(head)) for head in heads]
+        print(title)
+        self._print(heads)
 
     def show(self, row: Row) -> None:
-        """Show an answered measurement; on a terminal the last line follows every one."""
-        cells = self._cells(row)
-        due = row.seconds >= self._next
-        if due:
-            self._next = row.seconds + self._row_period
-            self._rows.append(cells)
-        if self._live is not None:
-            self._live.update(self._table(None if due else cells))
-        elif due:
-            print('  '.join(map(' '.join, zip(self._columns, cells, strict=True))), flush=True)
-
-    def announce(self, text: str) -> None:
-        """Say what happens now."""
-        if self._live is not None:
-            self._rows.append((text, *[''] * (len(self._columns) - 1)))
-            self._live.update(self._table(None))
-        else:
-            print(text, flush=True)
-
-    def _table(self, present: tuple[str, ...] | None) -> Table:
-        table = Table(title=self._title, title_justify='left')
-        for column in self._columns:
-            table.add_column(escape(column), justify='right')
-        for cells in self._rows:
-            table.add_row(*cells)
-        if present is not None:
-            table.add_row(*present, style='bold')
-        return table
-
-    def __enter__(self) -> LiveTable:
-        if self._live is not None:
-            self._live.start()
-        else:
-            print(self._title, flush=True)
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def _cells(self, row: Row) -> tuple[str, ...]:
+        """Print an answered measurement where a row is due."""
+        if row.seconds < self._next:
+            return
+        self._next = row.seconds + self._period
         states, inputs = self._signals.states, self._signals.inputs
-        return (f'{row.seconds / self._time:.1f}', *(
+        self._print([f'{row.seconds / self._time:.1f}', *(
             f'{shown(row.measured[name], unit):.4f}' for name, unit in states.items()), *(
             f'{shown(row.setpoints[name], states[name]):.4f}' if name in row.setpoints else ''
             for name in self._signals.controlled), *(
-            f'{shown(row.commanded[name], unit):.4f}' for name, unit in inputs.items()))
+            f'{shown(row.commanded[name], unit):.4f}' for name, unit in inputs.items())])
+
+    def _print(self, cells: Sequence[str]) -> None:
+        print('  '.join(map(str.rjust, cells, self._widths)), flush=True)

@@ -75,13 +75,12 @@ class Operator:
     Raises HarnessError where the loop refuses a step, or stands still.
     """
 
-    def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None],
-                 announce: Callable[[str], None]) -> None:
+    def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None]
+                 ) -> None:
         self.scenario = scenario
         self.harness = harness
         self.phases: list[tuple[str, float]] = []  # name and start in s
         self._on_row = on_row
-        self._announce = announce
         # several topics: any message of those with one stamp may come first
         self._measured: dict[int, dict[str, float]] = {}
         self._commanded: dict[int, dict[str, float]] = {}
@@ -147,7 +146,7 @@ class Operator:
     def begin(self, name: str, text: str) -> None:
         """Begin a phase, and announce it."""
         self.phases.append((name, self.seconds))
-        self._announce(text)
+        print(text, flush=True)
 
     def switch(self, service: str, on: bool) -> None:
         """Call a service that switches something on or off."""
@@ -164,7 +163,7 @@ class Operator:
             if reason:
                 raise HarnessError(f'{node}: {reason}')
 
-    def record_anew(self, bag: Path) -> None:
+    def record_again(self, bag: Path) -> None:
         """End the recording, and begin another one."""
         self.switch('trainer/record', False)
         self.set('trainer', output=str(bag))
@@ -186,7 +185,7 @@ class Operator:
         """Let the trainer learn a model from its recording, and wait for it."""
         _check('trainer/train', self.harness.trigger('trainer/train'))
         status = self.wait_for('training', 'the new model', timeout)
-        self._announce(status.message)
+        print(status.message, flush=True)
         if not model.exists():
             raise HarnessError(status.message)
 
@@ -236,7 +235,6 @@ def foreign(harness: Harness, wiring: SignalTopics) -> str:
 @contextlib.contextmanager
 def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                  on_row: Callable[[Row], None] = lambda _: None,
-                 announce: Callable[[str], None] = print,
                  panel: Mapping[str, object] | None = None) -> Iterator[Operator]:
     """
     Run plant, controller and trainer in lock-step, the set-points requested, until it is left.
@@ -247,7 +245,6 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     :param logs: folder for what the processes print.
     :param trainer: parameters of the trainer, which records from its start.
     :param on_row: called at every command.
-    :param announce: called with a text at the begin of each phase.
     :param panel: parameters of a panel, None for no panel.
     :raises HarnessError: when other nodes of the domain use the loop's topics or names, before
         anything is commanded; when a process ends early or the loop stands still.
@@ -263,7 +260,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                 f'ROS domain {domain} has other nodes with the names or topics of the demo: '
                 f'{found}; end them, or start in another domain: '
                 f'ROS_DOMAIN_ID={(int(domain) + 1) % 102} make demo')
-        operator = Operator(scenario, harness, on_row, announce)
+        operator = Operator(scenario, harness, on_row)
         harness.start('controller', {'system': scenario.system, **scenario.controller})
         harness.start('trainer', {'system': scenario.system, **trainer})
         harness.wait_until(lambda: operator.found_loop,

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The demo of retraining: the plant drifts, and its controller learns it anew from its record.
+The demo of retraining: the plant drifts, and its controller is retrained from a new record.
 
 Plant, controller and trainer run as three processes in lock-step; none is stopped or restarted.
 The disturbance observer is off: it would remove the offset that shows an outdated model.
@@ -68,10 +68,10 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
                                 speed=speed, plant={'temperature.measurement_noise': NOISE})
     bags = [output / 'before.mcap', output / 'after.mcap']
     new_model = output / 'retrained.safetensors'
-    table = LiveTable('a controller without observer learns its plant anew',
+    table = LiveTable('retraining of a controller without observer',
                       scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
-    with table, running_loop(scenario, logs, trainer, table.show, table.announce) as operator:
+    with running_loop(scenario, logs, trainer, table.show) as operator:
         phases = _operate(operator, bags[1], new_model)
     history = read_run(scenario.wiring, *bags)
     learned = load(new_model)
@@ -121,7 +121,7 @@ def _operate(operator: Operator, second_bag: Path, new_model: Path) -> list[tupl
         FOULING * reactor.constant('heat_transfer_coefficient'))})
     operator.begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
     # a new bag, so that the plant as it was is not among the data
-    operator.record_anew(second_bag)
+    operator.record_again(second_bag)
     operator.run_until(_EXPERIMENT_TIME)
     operator.switch('controller/set_automatic', False)
     operator.switch('trainer/experiment', True)
@@ -154,8 +154,8 @@ def _draw(path: Path, history: DemoRun, phases: list[tuple[str, float]], setpoin
                 upper.axhline(to_celsius(float(bound)), **{**LIMIT, 'linestyle': style},
                               label=f'training range of the {name}' if i == 0 else None)
         draw_phases((upper, middle, lower), phases)
-        upper.set(ylabel='reactor temperature [°C]', title='The plant drifts, is recorded, and '
-                  'its controller learns it anew (disturbance observer off)')
+        upper.set(ylabel='reactor temperature [°C]', title='The plant drifts and is recorded, and '
+                  'its controller is retrained (disturbance observer off)')
         upper.legend(loc='lower right', ncols=2, fontsize=8)
         draw_limits(middle, reactor.coolant_limits(), 'coolant limits')
         middle.step(history.command_seconds / 60.0,

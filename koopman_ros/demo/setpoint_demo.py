@@ -96,9 +96,9 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     change = ', '.join(f'{signal} -> {plan.states[signal].setpoint:.4g}'
                        f' [{unit_label(signals.states[signal])}]'
                        for signal in setpoints)
-    with LiveTable(f'{system.name}: {change} after {plan.step_time:g} s', signals,
-                   plan.duration) as table:
-        run_loop(scenario, bag, logs, table.show)
+    table = LiveTable(f'{system.name}: {change} after {plan.step_time:g} s', signals,
+                      plan.duration)
+    run_loop(scenario, bag, logs, table.show)
 
     model = load(model_path(str(plant_defaults(name, 'controller')['model'])))
     tuning = table_of(model, {'system': name}).snapshot({}).tuning

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -95,17 +96,18 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     return Verdict(accepted, moved=moved)
 
 
-def out_of_range(names: Sequence[str], y: Array, lower: Array, upper: Array, code: StatusCode
-                 ) -> Reason | None:
+def out_of_range(names: Sequence[str], y: Array, lower: Array, upper: Array, code: StatusCode,
+                 not_finite: StatusCode = StatusCode.NOT_FINITE) -> Reason | None:
     """
-    Return which of the measurements (n_y,) is not finite or outside its range, or None.
+    Return which of some values (n,) is not finite or outside its range, or None.
 
-    :param code: of a measurement outside its range.
+    :param code: of a value outside its range.
+    :param not_finite: of one that is not finite.
     """
     for name, value, low, high in zip(
             names, y.tolist(), lower.tolist(), upper.tolist(), strict=True):
-        if not np.isfinite(value):
-            return reason(StatusCode.NOT_FINITE, signal=name, value=value)
+        if not math.isfinite(value):
+            return reason(not_finite, signal=name, value=value)
         if not low <= value <= high:
             return reason(code, signal=name, value=value, lower=low, upper=high)
     return None

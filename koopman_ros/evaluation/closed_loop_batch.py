@@ -66,19 +66,9 @@ class LoopBatch:
         """Return the law, the averaged one that knows the plant, and two linear ones."""
         model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
         own = self.law(model, self.tuning, self.law.Parameters())
-        return (_called(own, targets, inputs, seconds), self.informed(targets, inputs),
+        return (_called(own, targets, inputs, seconds), _informed(self, targets, inputs),
                 *(_constant(Linear(one, self.tuning, None), targets, inputs, seconds)
                   for one in (self.plant.linearised, model)))
-
-    def informed(self, targets: Array, inputs: Array) -> _Feedback:
-        """Return the averaged law that knows the plant."""
-        return _informed(self.plant, targets, inputs, self.weights, self.tuning, self.interval)
-
-    def run(self, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array], tell: Tell
-            ) -> tuple[Array, NDArray[np.bool_]] | None:
-        """Run loops under each of some laws, as :func:`_run`."""
-        return _run(self.plant, feedbacks, *cases, self.weights, self.interval,
-                    self.samples, self.steps, tell)
 
 
 def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
@@ -91,7 +81,7 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
     """
     starts, targets, inputs = cases
     limits, m = given.tuning.limits, given.plant.model.n_u
-    ended = given.run(given.laws(targets, inputs), cases, tell)
+    ended = _run(given, given.laws(targets, inputs), cases, tell)
     if ended is None:
         return None
     costs, no_gain = ended
@@ -99,8 +89,8 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
         # what the limits hide
         endless = np.full(m, np.inf)
         some = starts[hopeless], targets[hopeless], inputs[hopeless]
-        ended = given.run(
-            given.within(InputLimits(-endless, endless, endless)).laws(*some[1:]), some, tell)
+        free = given.within(InputLimits(-endless, endless, endless))
+        ended = _run(given, free.laws(*some[1:]), some, tell)
         if ended is None:
             return None
         costs[:, hopeless], no_gain[hopeless] = ended
@@ -108,7 +98,7 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
     ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
     if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
         some = starts[beaten], targets[beaten], inputs[beaten]
-        again = given.run([given.within(_narrowed(limits)).informed(*some[1:])], some, tell)
+        again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, tell)
         if again is None:
             return None
         excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
@@ -156,7 +146,7 @@ class DriftPlant:
                        readout=None, input_terms=None, pre_feedback=None, verified_loops=None)
 
 
-def target_of(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
+def _held_target(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
     """Return a target of a model with the disturbance under which this input holds it."""
     try:
         w = -model.rate_under(v)(x_ref)
@@ -168,7 +158,7 @@ def target_of(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
 def _called(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Feedback:
     """Return a law's inputs, found for one state after another."""
     model, limits = law.model, law.tuning.limits
-    targets = [target_of(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
+    targets = [_held_target(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
     memory: list[object] = [None] * len(targets)
 
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
@@ -210,9 +200,10 @@ def _narrowed(limits: InputLimits) -> InputLimits:
     return replace(limits, lower=limits.lower + margin, upper=limits.upper - margin)
 
 
-def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, weights: Weights,
-              tuning: Tuning, interval: float) -> _Feedback:
+def _informed(given: LoopBatch, setpoints: Array, inputs: Array) -> _Feedback:
     """Return the averaged law that knows the plant: no better model of it has a better one."""
+    plant, tuning, weights = given.plant, given.tuning, given.weights
+
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
         v = np.full(inputs.shape, np.nan)
         rows = np.flatnonzero(active)
@@ -223,7 +214,7 @@ def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, weights: Weigh
         B = plant.slope(x[rows], inputs[rows])[..., n:]
         for i, k in enumerate(rows):
             found = solve_riccati(A[i], B[i], weights.Q, weights.R,
-                                  interval=interval, max_gain=tuning.max_gain,
+                                  interval=given.interval, max_gain=tuning.max_gain,
                                   max_residual=tuning.max_riccati_residual)
             if found.status is RiccatiStatus.SOLVED:
                 u = plant.model.inputs.to_physical(inputs[k] - found.K @ e[i])
@@ -233,8 +224,7 @@ def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, weights: Weigh
     return act
 
 
-def _run(plant: DriftPlant, feedbacks: Sequence[_Feedback], starts: Array, setpoints: Array,
-         inputs: Array, weights: Weights, interval: float, samples: int, steps: int,
+def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array],
          watch: Callable[[float], bool]) -> tuple[Array, NDArray[np.bool_]] | None:
     """
     Run M loops under each of F laws; None where `watch` ended it.
@@ -242,6 +232,8 @@ def _run(plant: DriftPlant, feedbacks: Sequence[_Feedback], starts: Array, setpo
     :return: costs (F, M), infinite where a loop does not arrive, and whether (M,) the first law
         had no gain on the way.
     """
+    plant, weights, samples = given.plant, given.weights, given.samples
+    starts, setpoints, inputs = cases
     n, (M, m) = starts.shape[1], inputs.shape
     y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
     no_gain = np.zeros(M, dtype=bool)
@@ -277,8 +269,8 @@ def _run(plant: DriftPlant, feedbacks: Sequence[_Feedback], starts: Array, setpo
                 return np.concatenate([rate, cost[..., None]], axis=-1)
 
             ahead = y
-            for _ in range(steps):
-                ahead = runge_kutta_step(flow, ahead, interval / steps)
+            for _ in range(given.steps):
+                ahead = runge_kutta_step(flow, ahead, given.interval / given.steps)
             y = np.where(active[..., None], ahead, y)
         there = arrived()
     return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

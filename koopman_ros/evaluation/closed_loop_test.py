@@ -80,14 +80,12 @@ class ClosedLoopTest:
     @property
     def poor(self) -> NDArray[np.bool_]:
         """Tell which (N,) had no gain, did not arrive, or cost over 1.1 times a linear law."""
-        poor: NDArray[np.bool_] = ~(self.ratios <= MOST_COST)
-        return poor
+        return np.asarray(~(self.ratios <= MOST_COST))
 
     @property
     def failed(self) -> NDArray[np.bool_]:
         """Tell in which (N,) a perfect model would do clearly better, by 1.05 in the cost."""
-        failed: NDArray[np.bool_] = ~(self.excess <= MOST_EXCESS)
-        return failed
+        return np.asarray(~(self.excess <= MOST_EXCESS))
 
     @property
     def lost(self) -> NDArray[np.bool_]:

@@ -196,8 +196,7 @@ def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
 
 def rms(squares: Array) -> Array:
     """Return the root of the mean (n,) over windows of squares (M, n)."""
-    found: Array = np.sqrt(squares.mean(axis=0))
-    return found
+    return np.asarray(np.sqrt(squares.mean(axis=0)))
 
 
 @dataclass(frozen=True)
@@ -213,8 +212,7 @@ class ModelComparison:
     @property
     def allowance(self) -> Array:
         """What the candidate's errors (n_x,) are measured by, in units."""
-        found: Array = np.maximum(self.present, self.negligible)
-        return found
+        return np.asarray(np.maximum(self.present, self.negligible))
 
     @property
     def ratio(self) -> Array:

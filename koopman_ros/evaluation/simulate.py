@@ -197,7 +197,7 @@ def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[
         return C.dot
     if n != controller.model.n_x:
         raise ValueError(f'the plant has {n} states and the model {controller.model.n_x}: give C '
-                         f'({len(outputs.names)}, {n}), what is measured of the plant')
+                         f'({len(outputs.names)}, {n}), the measurement matrix of the plant')
     return outputs.of
 
 

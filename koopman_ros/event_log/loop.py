@@ -77,13 +77,13 @@ def replay(recorded: Iterable[records.EventRecord], find_model: FindModel, build
     answers the same measurements under the set-points that were tracked. Raises RecordError for
     records that cannot be replayed.
     """
-    found = Replay()
+    result = Replay()
     runs: dict[str, _ReplayRun] = {}
     for record in recorded:
         if record.run not in runs:
-            runs[record.run] = _ReplayRun(found, find_model, build, alternative)
-            found.runs += 1
-            found.begins_late += record.event != records.START
+            runs[record.run] = _ReplayRun(result, find_model, build, alternative)
+            result.runs += 1
+            result.begins_late += record.event != records.START
         try:
             runs[record.run].take(record)
         except records.RecordError:
@@ -93,15 +93,15 @@ def replay(recorded: Iterable[records.EventRecord], find_model: FindModel, build
             raise records.RecordError(
                 f'record {record.number} of run {record.run} cannot be replayed '
                 f'({type(error).__name__}: {error})') from error
-    return found
+    return result
 
 
 class _ReplayRun:
     """A run of a controller, and the alternative beside it."""
 
-    def __init__(self, found: Replay, find_model: FindModel, build: Build,
+    def __init__(self, result: Replay, find_model: FindModel, build: Build,
                  alternative: Alternative | None) -> None:
-        self._found, self._find_model, self._build = found, find_model, build
+        self._result, self._find_model, self._build = result, find_model, build
         self._other = alternative
         self._next: int | None = None  # number of the next record
         self._state: State | None = None  # None while it is not known
@@ -132,7 +132,7 @@ class _ReplayRun:
                 f'record {record.number} of run {record.run} comes again, or after record '
                 f'{self._next - 1}: the bag is not in order')
         if self._next is not None and record.number > self._next:
-            self._found.lost.append(Lost(record.run, self._next, record.number - 1))
+            self._result.lost.append(Lost(record.run, self._next, record.number - 1))
             self._state = None
         self._next = record.number + 1
 
@@ -163,11 +163,11 @@ class _ReplayRun:
         self._parameters |= record.fields.get('parameters', {})
         if model is None or 'model' in record.fields:
             name, digest = record.fields['model']['name'], record.fields['model']['digest']
-            if name not in self._found.models:
-                self._found.models.append(name)
+            if name not in self._result.models:
+                self._result.models.append(name)
             model = self._find_model(name, digest)
         self._controller = self._build(self._parameters, model)
-        self._found.controller, self._found.parameters = self._controller, self._parameters
+        self._result.controller, self._result.parameters = self._controller, self._parameters
         return self._controller
 
     def _tuned(self, model: LiftedModel) -> Controller:
@@ -178,7 +178,7 @@ class _ReplayRun:
         event = records.event_of(record)
         outcome = apply(self._controller, state, event)
         self._state = outcome.state
-        self._found.refused += outcome.refused is not None
+        self._result.refused += outcome.refused is not None
         target = None if outcome.report is None else outcome.report.target
         active = None if target is None else target.setpoint
         other = None
@@ -196,6 +196,6 @@ class _ReplayRun:
         """Keep the command of a record, where it has one."""
         if (command := record.fields.get('command')) is not None:
             measured = record.fields.get('measured')
-            self._found.samples.append(ReplayedSample(
+            self._result.samples.append(ReplayedSample(
                 record.stamp_ns, None if measured is None else records.float_array(measured),
                 setpoint, records.float_array(command), replayed, other))

@@ -5,6 +5,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 import enum
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -22,7 +23,7 @@ from koopman_ros.event_log.report import (
     verdict,
     write_report,
 )
-from koopman_ros.event_log.sources import lately, Models, read_records
+from koopman_ros.event_log.sources import find_model, lately, read_records
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.controller import built, ReplayParameters, table_of
 from koopman_ros.parameters.model_checks import load_suitable
@@ -104,8 +105,8 @@ def replay_records(records: Iterable[EventRecord], models: Sequence[Path] = (),
     :param models: files or folders in which models are looked for beside the shipped ones.
     :raises RecordError: for records that cannot be replayed.
     """
-    return replay(records, Models([*models, config_directory() / 'models']).find, _controller,
-                  alternative)
+    places = [*models, config_directory() / 'models']
+    return replay(records, partial(find_model, places), _controller, alternative)
 
 
 def tuning(model: LiftedModel, given: Mapping[str, Any]) -> dict[str, Any]:

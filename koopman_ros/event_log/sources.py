@@ -63,25 +63,22 @@ def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Ite
                                ) from error
 
 
-class Models:
-    """Models by the digest of their file, from files and from folders."""
+def find_model(places: Sequence[Path], name: str, digest: str) -> LiftedModel:
+    """
+    Return the model whose file has a SHA-256 digest.
 
-    def __init__(self, places: Sequence[Path]) -> None:
-        self._places = places
-
-    def find(self, name: str, digest: str) -> LiftedModel:
-        """Return the model of this SHA-256 digest, read anew; raise RecordError for none."""
-        for path in self._files(name):
-            with contextlib.suppress(ModelFileError, OSError):
-                model, found = load_with_digest(path)
-                if found == digest:
-                    return model
-        raise RecordError(
-            f'the controller ran with the model {name} (SHA-256 {digest[:12]}...), which is '
-            'neither shipped nor found: give its file, or the folder it is in, as model')
-
-    def _files(self, name: str) -> Iterator[Path]:
-        if name.endswith('.safetensors'):
-            yield Path(name).expanduser()
-        for place in self._places:
-            yield from sorted(place.glob('*.safetensors')) if place.is_dir() else (place,)
+    :param places: files and folders that are searched.
+    :param name: of the model, as recorded; first the file of that name, if it is one.
+    :raises RecordError: where no file has it.
+    """
+    files = [Path(name).expanduser()] if name.endswith('.safetensors') else []
+    for place in places:
+        files += sorted(place.glob('*.safetensors')) if place.is_dir() else [place]
+    for path in files:
+        with contextlib.suppress(ModelFileError, OSError):
+            model, found = load_with_digest(path)
+            if found == digest:
+                return model
+    raise RecordError(
+        f'the controller ran with the model {name} (SHA-256 {digest[:12]}...), which is '
+        'neither shipped nor found: give its file, or the folder it is in, as model')

@@ -21,7 +21,8 @@ from koopman_ros.process_entry import blocked_signals, command, ONE_THREAD
 _PATIENCE = 5.0  # s from the request to end until the process is killed
 _NICE = 10
 _MEMORY = 0.8  # of the machine's, which a child may use
-_TIME = 86400.0  # s of processor time that it may use
+_TIME = 86400  # s of processor time that it may use
+_LAST = 60  # s more, after which it is killed where it does not end by the signal for it
 _LINES = 20  # of its standard error that are kept
 
 
@@ -119,7 +120,7 @@ def _limit(pid: int) -> None:
     memory = int(_MEMORY * os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES'))
     with contextlib.suppress(OSError):
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
-        resource.prlimit(pid, resource.RLIMIT_CPU, (int(_TIME), int(_TIME)))
+        resource.prlimit(pid, resource.RLIMIT_CPU, (_TIME, _TIME + _LAST))
         os.setpriority(os.PRIO_PROCESS, pid, _NICE)
 
 

@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import Executor, FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
 from functools import lru_cache, partial
@@ -46,26 +46,12 @@ _JOIN = 30.0  # s for its first worker
 _STOP = 'stop'
 
 
-class _Channel(ABC):
-    """Progress messages of a task to the calling process; a copy goes to the worker."""
-
-    _last = -PERIOD
-
-    @abstractmethod
-    def send(self, number: int, value: Any) -> bool:
-        """Send the progress of a task, None at its start; return whether it should end."""
-
-    def tell(self, number: int, value: Any) -> bool:
-        """Send the progress at most once a period; return whether the task should end."""
-        if time.monotonic() - self._last < PERIOD:
-            return False
-        self._last = time.monotonic()
-        return self.send(number, value)
-
-
-# the channel, the source of the call for workers, and functions that return new messages and
+# Sends the progress of a task by its number, None at its start, to the calling process; returns
+# whether the task should end.
+_Send = Callable[[int, Any], bool]
+# that of the workers, the source of the call for them, and functions that return new messages and
 # request the end of all tasks
-_Messages = tuple[_Channel, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]
+_Messages = tuple[_Send, Any, Callable[[], list[tuple[int, Any]]], Callable[[], None]]
 
 
 class _Pool(Backend):
@@ -95,13 +81,13 @@ class _Pool(Backend):
         """Yield number and result, or exception, of the tasks as they end."""
         names, values = list(items), list(map(cloudpickle.dumps, items.values()))
         open_, losses, abandoned = set(range(len(names))), Counter[int](), float('inf')
-        with self._messages(call) as (channel, source, news, stop):
+        with self._messages(call) as (send, source, news, stop):
             futures: dict[Future[Any], int] = {}
             try:
                 while open_ and abandoned == float('inf'):
                     # tasks whose worker died before run alone, and last
                     batch = {n for n in open_ if not losses[n]} or {min(open_)}
-                    futures = {self._submit(_call, channel, source, n, values[n]): n
+                    futures = {self._workers().submit(_call, send, source, n, values[n]): n
                                for n in sorted(batch)}
                     lost, begun = set[int](), set[int]()
                     while futures:
@@ -138,11 +124,10 @@ class _Pool(Backend):
         """Open the channel of a run."""
 
     @abstractmethod
-    def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Send a task to a worker."""
+    def _workers(self) -> Executor:
+        """Return the executor of the workers, started."""
 
     def _outcome(self, future: Future[Any], _: str) -> Any:
-        """Return the result or the exception of a task."""
         return future.exception() or future.result()
 
     @abstractmethod
@@ -172,14 +157,13 @@ class Processes(_Pool):
             self._executor.shutdown(kill_workers=True)
             self._executor = None
 
-    def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def _workers(self) -> Executor:
         if self._executor is None:
             # the process that waits answers an interrupt of the terminal
             self._executor = ProcessPoolExecutor(
                 self._count, timeout=None, env={**ONE_THREAD, **os.environ},
                 initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN))
-        future: Future[Any] = self._executor.submit(function, *arguments)
-        return future
+        return self._executor
 
     def _abandon(self, _: object) -> None:
         self.close()
@@ -199,21 +183,15 @@ class Processes(_Pool):
                 seen.update(told)
                 return new
 
-            yield _Folder(folder), source, news, (folder / _STOP).touch
+            yield partial(_to_folder, folder), source, news, (folder / _STOP).touch
 
 
-class _Folder(_Channel):
-    """Messages by files of a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def send(self, number: int, value: Any) -> bool:
-        # a rename, so that no half is read
-        draft = self._folder / f'{number}.draft'
-        draft.write_bytes(pickle.dumps(value))
-        draft.replace(self._folder / str(number))
-        return (self._folder / _STOP).exists()
+def _to_folder(folder: Path, number: int, value: Any) -> bool:
+    # a rename, so that no half is read
+    draft = folder / f'{number}.draft'
+    draft.write_bytes(pickle.dumps(value))
+    draft.replace(folder / str(number))
+    return (folder / _STOP).exists()
 
 
 class Cluster(_Pool):
@@ -242,15 +220,14 @@ class Cluster(_Pool):
             self.close()
             raise WorkerLost(f'the scheduler at {address} has no worker: start one, `dask worker '
                              f'{address}`') from None
-        self._executor = self._client.get_executor(pure=False)
+        self._executor: Executor = self._client.get_executor(pure=False)
 
     def close(self) -> None:
         """Leave the cluster."""
         self._client.close(timeout=_PATIENCE)
 
-    def _submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        future: Future[Any] = self._executor.submit(function, *arguments)
-        return future
+    def _workers(self) -> Executor:
+        return self._executor
 
     def _outcome(self, future: Future[Any], name: str) -> Any:
         from distributed.scheduler import KilledWorker
@@ -285,24 +262,18 @@ class Cluster(_Pool):
         self._client.subscribe_topic(token, lambda message: told.put(message[1]))
         try:
             # not scattered: that would be lost with the worker that has it
-            yield _Topic(token), self._client.submit(bytes, call, pure=False), news, stop
+            source = self._client.submit(bytes, call, pure=False)
+            yield partial(_to_topic, token), source, news, stop
         finally:
             with contextlib.suppress(OSError, ValueError, RuntimeError):
                 self._client.unsubscribe_topic(token)
 
 
-class _Topic(_Channel):
-    """Messages by a topic and an event of the Dask scheduler."""
-
-    def __init__(self, token: str) -> None:
-        self._token = token
-
-    def send(self, number: int, value: Any) -> bool:
-        import distributed
-        worker = distributed.get_worker()
-        worker.log_event(self._token, (number, value))
-        stopped: bool = distributed.Event(self._token).is_set()
-        return stopped
+def _to_topic(token: str, number: int, value: Any) -> bool:
+    import distributed
+    distributed.get_worker().log_event(token, (number, value))
+    stopped: bool = distributed.Event(token).is_set()
+    return stopped
 
 
 class _NotBegun:
@@ -314,12 +285,21 @@ def _unpacked(source: Path | bytes) -> Any:
     return pickle.loads(source.read_bytes() if isinstance(source, Path) else source)
 
 
-def _call(channel: _Channel, source: Path | bytes, number: int, item: bytes) -> Any:
-    """Run a task on a worker."""
-    if channel.send(number, None):
+def _call(send: _Send, source: Path | bytes, number: int, item: bytes) -> Any:
+    """Run a task on a worker, which tells its progress at most once a period."""
+    if send(number, None):
         return _NotBegun()
     function, shared = _unpacked(source)
-    return function(shared, pickle.loads(item), partial(channel.tell, number))
+    last = -PERIOD
+
+    def tell(value: Any) -> bool:
+        nonlocal last
+        if time.monotonic() - last < PERIOD:
+            return False
+        last = time.monotonic()
+        return send(number, value)
+
+    return function(shared, pickle.loads(item), tell)
 
 
 def _worker_lost(name: str) -> WorkerLost:

@@ -104,8 +104,10 @@ class TrainingJob(Job):
             text = _CANCELLED
         elif code < 0:
             name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
-            text = (f'the training process was killed by {name}: see whether the memory '
-                    'suffices, and train again')
+            remedy = ('a day of processor time is its limit: train on fewer bags'
+                      if name == 'SIGXCPU' else
+                      'see whether the memory suffices, and train again')
+            text = f'the training process was killed by {name}: {remedy}'
         else:
             last = self.errors[-1] if self.errors else 'it said nothing'
             text = f'the training process ended with code {code}: {last}'

@@ -20,13 +20,12 @@ import threading
 import time
 from typing import Any
 
-from koopman_ros.learning import retrain, retrain_fleet, TrainingTask
-from koopman_ros.learning.fleet import error_text, EXPECTED
+from koopman_ros.learning import retrain, retrain_fleet, TrainingOutcome, TrainingTask
+from koopman_ros.learning.fleet import EXPECTED, failed
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.pipeline import OnProgress
 from koopman_ros.learning.report import reported
 
-_CODES = {True: 0, False: 2}  # by whether a lift is accepted
 _PERIOD = 0.2  # s between two lines of progress
 
 
@@ -52,19 +51,13 @@ def main() -> int:
         values = json.loads(line)
         if 'plants' in values:
             return _fleet(values, now_and_then)
-        retrained = retrain(TrainingTask.of(values), now_and_then)
+        outcome = TrainingOutcome(*reported(retrain(TrainingTask.of(values), now_and_then)))
     except BrokenPipeError:
         # the process that started it is gone
         return 1
-    except Stopped:
-        _print(stopped=True)
-        return 1
-    except EXPECTED as error:
-        _print(error=error_text(error))
-        return 1
-    summary, files = reported(retrained)
-    _print(summary=summary, files=files)
-    return _CODES[bool(summary['accepted'])]
+    except (Stopped, *EXPECTED) as error:
+        outcome = failed(error)
+    return _print_outcome(outcome)
 
 
 def _fleet(values: Mapping[str, Any], now_and_then: OnProgress) -> int:
@@ -80,15 +73,19 @@ def _fleet(values: Mapping[str, Any], now_and_then: OnProgress) -> int:
     codes = []
     for name, outcome in retrain_fleet(tasks, values.get('executor', ''), on_progress):
         shares[name] = 1.0
-        if outcome.summary is not None:
-            _print(plant=name, summary=outcome.summary, files=outcome.files)
-        else:
-            _print(plant=name, **({'stopped': True} if outcome.stopped else {
-                'error': outcome.error}))
-        codes.append(1 if outcome.summary is None else _CODES[outcome.accepted])
+        codes.append(_print_outcome(outcome, plant=name))
     _print(ended=True)
     # a failure says more than a refusal
     return 1 if 1 in codes else max(codes)
+
+
+def _print_outcome(outcome: TrainingOutcome, **of_plant: str) -> int:
+    """Print the last line of a training, and return its exit code."""
+    if outcome.summary is None:
+        _print(**of_plant, **({'stopped': True} if outcome.stopped else {'error': outcome.error}))
+        return 1
+    _print(**of_plant, summary=outcome.summary, files=outcome.files)
+    return 0 if outcome.accepted else 2
 
 
 def _wait_for_end_of_input(stop: threading.Event) -> None:

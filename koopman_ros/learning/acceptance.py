@@ -137,16 +137,14 @@ class AcceptanceResult:
 
 
 def evaluate_model(found: Identified, learned: Trained | ClassComparison,
-                   current: LiftedModel | None,
-                   thresholds: Thresholds, *, loops: int = LOOPS,
-                   watch: Callable[[float], bool] = lambda _: False) -> AcceptanceResult:
+                   current: LiftedModel | None, thresholds: Thresholds, *, loops: int = LOOPS
+                   ) -> AcceptanceResult:
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
     :param learned: what was trained, or compared by :func:`compare_classes`, of which the chosen
         model is judged, and whose closed loops are not run again.
-    :param loops: see :func:`evaluate_closed_loops`, as for `watch`.
-    :raises Stopped: when `watch` ended it.
+    :param loops: see :func:`evaluate_closed_loops`.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)
     rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
@@ -154,7 +152,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     chosen = learned.chosen if isinstance(learned, ClassComparison) else None
     law_check = chosen.law_check if chosen and chosen.excess is not None else None
     if law_check is None:
-        law_check = held_out.law_check(model, loops, watch)
+        law_check = held_out.law_check(model, loops, lambda _: False)
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
@@ -163,8 +161,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
-                            held_out.linear_rmse,
-                            found.noise, law_check)
+                            held_out.linear_rmse, found.noise, law_check)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:
@@ -191,9 +188,10 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
         if error[i] > noticeable and r > max(_LEAST_AUTOCORRELATION, _SIGMAS / np.sqrt(count)):
             warnings.append(
                 f'the noise of {name} is coloured (autocorrelation {r:.2f} from sample to sample '
-                'of what the best drift leaves): a filter before the record does that, or what '
-                f'is not measured; it tells as much as {100.0 * (1.0 - r) / (1.0 + r):.0f} % of '
-                'the samples would with white noise, so record longer, or without the filter')
+                'in the residuals of the best drift), because of a filter before the recording or '
+                'an unmeasured quantity. The record is worth '
+                f'{100.0 * (1.0 - r) / (1.0 + r):.0f} % of its samples with white noise: record '
+                'longer, or without the filter')
         noise = found.noise[i]
         excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
         # the mean square of `count` white errors strays by this share
@@ -201,9 +199,8 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
         if excess > max(chance, noticeable):
             warnings.append(
                 f'the best drift errs by {error[i]:.3g} {unit} in {name}, of which {excess:.3g} '
-                f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): something that '
-                'is not measured acts too, such as another state or a disturbance, and no lift '
-                'of what is measured can know it')
+                f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): an unmeasured '
+                'state or disturbance acts as well; measure it, or set unmeasured_states')
     return tuple(warnings)
 
 
@@ -222,8 +219,8 @@ def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float
             unit = Display(states.units[i], display_unit(states.units[i]), '.4g')
             found.append(
                 f'{name} was trained from {unit.text(lower)} to {unit.text(upper)}, set-points '
-                f'are wanted from {unit.text(low)} to {unit.text(high)}: those outside will be '
-                'refused, record what is missing or narrow setpoint_min and setpoint_max')
+                f'range from {unit.text(low)} to {unit.text(high)}: those outside will be '
+                'refused; record the missing range, or narrow setpoint_min and setpoint_max')
     return tuple(found)
 
 

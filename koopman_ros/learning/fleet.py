@@ -99,7 +99,7 @@ def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnP
         with contextlib.closing(backend.run(_retrained, now, watch=watch, apart=True)) as found:
             for name, outcome in found:
                 task = waiting.pop(name)
-                one = outcome if isinstance(outcome, TrainingOutcome) else _failed(outcome)
+                one = outcome if isinstance(outcome, TrainingOutcome) else failed(outcome)
                 if one.accepted and one.summary is not None:
                     first.setdefault(kind_of(task), str(one.summary['model_file']))
                 yield name, one
@@ -113,14 +113,17 @@ def _retrained(_: None, task: TrainingTask, tell: Tell) -> TrainingOutcome:
         replace(task, executor=''), lambda share, text: tell((share, text)))))
 
 
-def _failed(error: BaseException) -> TrainingOutcome:
+def failed(error: BaseException) -> TrainingOutcome:
+    """Return the outcome of a training that raised an exception."""
     if isinstance(error, Stopped):
         return TrainingOutcome(None, stopped=True)
-    return TrainingOutcome(None, error=error_text(error))
+    return TrainingOutcome(None, error=_error_text(error))
 
 
-def error_text(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     """Return the text of an error in a line; of an unexpected one with its class."""
+    if isinstance(error, MemoryError):
+        return 'the memory does not suffice: free some, or train on fewer bags'
     said = ' '.join(str(error).split())
     expected = isinstance(error, EXPECTED)
     return said if said and expected else ': '.join(filter(None, [type(error).__name__, said]))

@@ -13,23 +13,17 @@ import time
 
 import numpy as np
 
-from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
+from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, LOOPS
 from koopman_ros.execution import Backend
-from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
 from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import IncrementalTraining
-from koopman_ros.learning.lift.metrics import evaluate, fit, LiftMetrics, ROUNDING
+from koopman_ros.learning.lift.metrics import evaluate, LiftMetrics, ROUNDING
 from koopman_ros.learning.lift.multistart import MultistartProgress, Recipe, Watch
 from koopman_ros.learning.lift.neural_drift import NeuralDrift, with_readout, with_units_of
-from koopman_ros.learning.lift.training import (
-    reference_drift,
-    train,
-    training_states,
-    TrainingFailed,
-)
-from koopman_ros.model import Box, LiftedModel, model_file
+from koopman_ros.learning.lift.training import PreparedSamples, train, TrainingFailed
+from koopman_ros.model import LiftedModel, model_file
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
 
 DEGREES = (2, 3, 4, 5)
@@ -101,7 +95,7 @@ class ClassComparison:
         head = ['model', 'n_z', 'rx, validation', 'rx, test', *['beyond noise'] * recorded,
                 *(f'roll-out of {name}, {unit}' for name, unit in zip(
                     self.state_names, self.state_units, strict=True)),
-                'loops failed', 'cost beside linear', 's', 'remark']
+                'loops failed', 'cost relative to linear', 's', 'remark']
         rows = []
         for one in self.contenders:
             found = one.figures
@@ -132,7 +126,7 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
 def compare(plant: PlantDescription, samples: DriftSamples,
             recipes: Mapping[str, Recipe] | None = None, *,
             degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
-            seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
+            seed: int = 0, starts: int = 2, watch: Watch | None = None,
             loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
             backend: Backend | None = None, begin: LiftedModel | None = None) -> ClassComparison:
     """
@@ -171,8 +165,8 @@ def compare(plant: PlantDescription, samples: DriftSamples,
         raise ValueError(f'no class of {", ".join(names)} begins from a lift '
                          f'{"with" if begin.identity else "without"} identity coordinates: learn '
                          'a lift of its kind, or begin from nothing')
-    learner = _Learner(plant, samples, split_seed)
-    judge = judge or learner.judge(loops, backend)
+    prepared = PreparedSamples.of(plant, samples)
+    judge = judge or _judge(prepared, loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
     found: list[ModelCandidate] = []
     drift: LiftedModel | None = None
@@ -182,18 +176,22 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             if name in recipes:
                 trained = train(
                     plant, samples, recipes[name], seed=seed, starts=starts,
-                    split_seed=split_seed, loops=0, watch=_among(watch, name, counts),
+                    loops=0, watch=_among(watch, name, counts),
                     device=device, backend=backend,
                     begin=begin if name in continuing else None)
                 steps = trained.steps
-                model = trained.model if drift is None else learner.with_units_of(
-                    drift, trained.model)
+                model = trained.model if drift is None else _with_units_of(
+                    drift, trained.model, prepared)
                 if isinstance(recipes[name], NeuralDrift):
                     drift = model
             else:
-                model = learner.linear() if name == LINEAR else learner.polynomial(degrees)
-            found.append(replace(learner.contender(
-                name, model, time.perf_counter() - since, judge), steps=steps))
+                model = prepared.linear() if name == LINEAR else _polynomial(prepared, degrees)
+            seconds = time.perf_counter() - since
+            model = replace(model, training_states=prepared.states)
+            figures = evaluate(model, prepared.parts[2])
+            one = judge.judged(ModelCandidate(name, model, prepared.rx(model), figures, None,
+                                              seconds, steps=steps))
+            found.append(replace(one, model=_noted(model, one)))
         except (ValueError, np.linalg.LinAlgError) as refusal:
             if name == choose:
                 raise
@@ -249,73 +247,52 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
     return told
 
 
-class _Learner:
-    """The samples that all contenders are learned from, and judged by without a record."""
+def _noted(model: LiftedModel, one: ModelCandidate) -> LiftedModel:
+    """Return a model with the figures of its candidate in it."""
+    assert one.figures is not None
+    return replace(model, verified_loops=None if one.law_check is None else one.law_check.tried,
+                   provenance=replace(model.provenance,
+                                      metrics=one.figures.metrics(model.states.names)))
 
-    def __init__(self, plant: PlantDescription, samples: DriftSamples, split_seed: int) -> None:
-        self._plant = plant
-        self._parts = split_by_episode(samples, split_seed)
-        self._training, self._validation, self._test = self._parts
-        self._box = Box.of(plant, samples.x, samples.u)
-        # errors of the samples concern all classes
-        check_rates(plant, samples)
-        check_nominal_point(plant, samples, self._box)
-        self._known = training_states(self._box, samples)
 
-    def rx(self, model: LiftedModel) -> float:
-        """Return the error on the validation episodes."""
-        return fit(model, self._validation.x, self._validation.dxdt, self._validation.u).rx
-
-    def linear(self) -> LiftedModel:
-        """Return the linear model."""
-        return Edmd(degree=1).learn(self._plant, self._training, self._box)
-
-    def polynomial(self, degrees: Sequence[int]) -> LiftedModel:
-        """Choose the degree; those with too many monomials to tell apart or to save fall out."""
-        tried, refusal = [], 'no degree was to be tried'
-        for degree in degrees:
-            try:
-                model = Edmd(degree).learn(self._plant, self._training, self._box)
-                model_file.check(model)
-                tried.append(ModelCandidate(POLYNOMIAL, model, self.rx(model), None, None, 0.0))
-            except (ValueError, np.linalg.LinAlgError) as error:
-                refusal = str(error)
-        best = plainest(tried).model if tried else None
-        if best is None:
-            raise TrainingFailed(refusal)
-        return best
-
-    def with_units_of(self, drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
-        """Let a lift's read-out use a drift's units as well, where that is closer."""
+def _polynomial(prepared: PreparedSamples, degrees: Sequence[int]) -> LiftedModel:
+    """Choose the degree; those with too many monomials to tell apart or to save fall out."""
+    tried, refusal = [], 'no degree was to be tried'
+    for degree in degrees:
         try:
-            joined = with_readout(with_units_of(drift, lift), self._training)
-        except ValueError:
-            # of another kind
-            return lift
-        return min((lift, joined), key=self.rx)
+            model = Edmd(degree).learn(prepared.plant, prepared.parts[0], prepared.box)
+            model_file.check(model)
+            tried.append(ModelCandidate(POLYNOMIAL, model, prepared.rx(model), None, None, 0.0))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            refusal = str(error)
+    if not tried:
+        raise TrainingFailed(refusal)
+    best = plainest(tried).model
+    assert best is not None
+    return best
 
-    def contender(self, name: str, model: LiftedModel, seconds: float,
-                  judge: Judge) -> ModelCandidate:
-        """Judge a model, and note its figures in it."""
-        model = replace(model, training_states=self._known)
-        one = judge.judged(ModelCandidate(name, model, self.rx(model), evaluate(model, self._test),
-                                          None, seconds))
-        assert one.figures is not None
-        return replace(one, model=replace(
-            model, verified_loops=None if one.law_check is None else one.law_check.tried,
-            provenance=replace(
-                model.provenance, metrics=one.figures.metrics(model.states.names))))
 
-    def judge(self, loops: int, backend: Backend | None) -> Judge:
-        """Return the judge by closed loops on the drift that predicts validation episodes best."""
-        def judged(one: ModelCandidate) -> ModelCandidate:
-            model = one.model
-            if not loops or model is None or not model.n_u:
-                return one
-            law_check = evaluate_closed_loops(model, reference_drift(
-                self._plant, self._box, self._parts, model), loops=loops, backend=backend)
-            refused = law_check is not None and not law_check.accepted
-            return replace(one, law_check=law_check,
-                           refusal=f'no controller: {law_check}' if refused else '')
+def _with_units_of(drift: LiftedModel, lift: LiftedModel, prepared: PreparedSamples
+                   ) -> LiftedModel:
+    """Let a lift's read-out use a drift's units as well, where that is closer."""
+    try:
+        joined = with_readout(with_units_of(drift, lift), prepared.parts[0])
+    except ValueError:
+        # of another kind
+        return lift
+    return min((lift, joined), key=prepared.rx)
 
-        return Judge(judged, ROUNDING)
+
+def _judge(prepared: PreparedSamples, loops: int, backend: Backend | None) -> Judge:
+    """Return the judge by closed loops on the drift that predicts validation episodes best."""
+    def judged(one: ModelCandidate) -> ModelCandidate:
+        model = one.model
+        if not loops or model is None or not model.n_u:
+            return one
+        law_check = evaluate_closed_loops(model, prepared.reference_drift(model), loops=loops,
+                                          backend=backend)
+        refused = law_check is not None and not law_check.accepted
+        return replace(one, law_check=law_check,
+                       refusal=f'no controller: {law_check}' if refused else '')
+
+    return Judge(judged, ROUNDING)

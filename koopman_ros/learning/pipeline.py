@@ -17,6 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import backup_path
+from koopman_ros.core.plots import finite
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import (
@@ -47,7 +48,6 @@ from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport
-from koopman_ros.records.limits import bounded_reading
 
 # A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
@@ -92,8 +92,8 @@ class Retrained:
         states, inputs = box.states, box.inputs
         gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
 
-        def by_state(values: Array) -> dict[str, float | None]:
-            return {name: _finite(value) for name, value in zip(states.names, values, strict=True)}
+        def by_state(values: Array) -> dict[str, float]:
+            return dict(zip(states.names, map(float, values), strict=True))
 
         def of_class(one: ModelCandidate) -> dict[str, object]:
             said: dict[str, object] = {
@@ -101,14 +101,13 @@ class Retrained:
                 'refusal': one.refusal, 'seconds': one.seconds, 'steps': one.steps}
             if one.figures and one.law_check:
                 assert one.figures.rollout_rmse is not None
-                assert one.excess is not None
                 said |= {
-                    'heldout_rx': _finite(one.figures.fit.rx),
+                    'heldout_rx': one.figures.fit.rx,
                     'heldout_error': by_state(one.figures.rollout_rmse),
-                    'beyond_noise': _finite(one.excess),
+                    'beyond_noise': one.excess,
                     'closed_loops': one.law_check.loops,
                     'closed_loops_failed': int(np.sum(one.law_check.failed)),
-                    'closed_loop_cost_beside_linear': _finite(one.law_check.median_ratio)}
+                    'closed_loop_cost_beside_linear': one.law_check.median_ratio}
             return said
 
         figures: dict[str, object] = {
@@ -131,7 +130,7 @@ class Retrained:
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
             'constants': {one.name: {
-                'value': one.value, 'standard_error': _finite(one.standard_error),
+                'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
                 'standing': one.standing.name.lower(), 'text': str(one)}
                 for one in self.found.constants},
@@ -157,12 +156,8 @@ class Retrained:
                 'closed_loop_cost_beside_linear': check.median_ratio,
                 'worst_closed_loop_cost_beside_linear': check.worst_ratio,
             }
-        return {name: _finite(value) if isinstance(value, float) else value
-                for name, value in figures.items()}
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+        finite_figures: dict[str, object] = finite(figures)
+        return finite_figures
 
 
 def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
@@ -187,7 +182,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
 
 
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> Retrained:
-    thresholds = _checked(task)
+    progress, thresholds = _Progress(on_progress), _checked(task)
     current, sibling = (load(path) if path else None
                         for path in (task.model, task.warm_start_model))
     plant, states, inputs = resolve_signals(task, current)
@@ -197,11 +192,10 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     source = RecordSource(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    _stop_if(on_progress(0.0, 'reading bags'))
-    with bounded_reading(task.bags):
-        record = read_record(source, task.most_samples, task.seed,
-                             hidden=bool(task.unmeasured_states or task.physical_model),
-                             tick=_reading(on_progress, source), backend=backend)
+    progress('read', 0.0, 'reading bags')
+    record = read_record(source, task.most_samples, task.seed,
+                         hidden=bool(task.unmeasured_states or task.physical_model),
+                         tick=progress.reading(2 * source.size()), backend=backend)
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(record.account.lines()))
@@ -209,13 +203,12 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
-    found = _estimate(task, plant, episodes, methods, on_progress, backend)
+    found = _estimate(task, plant, episodes, methods, progress, backend)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
     box = found.drift.box
     if current is not None and (box.states.names, box.states.units) != (
             current.states.names, current.states.units):
-        # of other states
         current = None
     if current is None:
         # an input that keeps the plant somewhere in the middle is not far
@@ -225,7 +218,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
         plant = replace(current.plant, B=None)
     bare = Retrained(task, record.account, found, None, None, (), coverage(episodes, box),
                      plant, current, reduction=record.reduction)
-    learned, decision, reasons = _learn(bare, sibling, thresholds, on_progress, backend)
+    learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     decision = replace(decision, warnings=(
@@ -233,7 +226,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'it is not compared with the present model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
-    _stop_if(on_progress(_at('decide', 0.9), 'writing'))
+    progress('decide', 0.9, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes, learned.chosen.name)
     path = _place(Path(task.output), decision.accepted)
@@ -255,95 +248,85 @@ def _checked(task: TrainingTask) -> Thresholds:
     return Thresholds(task.margin, task.condition)
 
 
+class _Progress:
+    """Reports how far a training is; raises Stopped when it is asked to end."""
+
+    def __init__(self, on_progress: OnProgress) -> None:
+        self._on_progress, self.learned, self._read = on_progress, 0.0, 0
+
+    def __call__(self, stage: str, share: float, text: str) -> None:
+        begin, end = _STAGES[stage]
+        if self._on_progress(begin + share * (end - begin), text):
+            raise Stopped
+
+    def reading(self, total: int) -> Callable[[int], None]:
+        """Return a tick that is given the samples that were read, of so many in all."""
+        def tick(samples: int) -> None:
+            self._read += samples
+            self('read', min(1.0, self._read / total), 'reading bags')
+
+        return tick
+
+    def estimating(self, done: int, total: int, text: str) -> bool:
+        self('estimate', done / total, f'estimating: {text}')
+        return False
+
+    def learning(self, now: MultistartProgress) -> bool:
+        self.learned = now.finished / now.total
+        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
+        self('learn', self.learned, f'learning: {now.name}, n_z {now.n_z}, start '
+             f'{min(now.finished + 1, now.total)} of {now.total}{rw}')
+        return False
+
+    def judging(self, name: str, share: float) -> bool:
+        # the closed loops of the last class come after all starts
+        done = ('decide', _JUDGED * share) if self.learned == 1.0 else ('learn', self.learned)
+        self(*done, f'judging: {name}')
+        return False
+
+
 def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episode],
-              methods: Mapping[str, IdentificationMethod], on_progress: OnProgress,
+              methods: Mapping[str, IdentificationMethod], progress: _Progress,
               backend: Backend) -> Identified:
     """Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations."""
-    def watch(done: int, total: int, text: str) -> bool:
-        return on_progress(_at('estimate', done / total), f'estimating: {text}')
-
+    seed, watch = task.seed, progress.estimating
     if task.physical_model:
         return estimate_parameters(plant, episodes, plant_class(task.physical_model),
-                                   task.constants, seed=task.seed, watch=watch)
+                                   task.constants, seed=seed, watch=watch)
     if task.unmeasured_states:
-        return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=task.seed,
+        return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
                                    watch=watch, backend=backend)
-    return identify(plant, episodes, methods=methods, seed=task.seed, watch=watch,
-                    backend=backend)
+    return identify(plant, episodes, methods=methods, seed=seed, watch=watch, backend=backend)
 
 
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
-           on_progress: OnProgress, backend: Backend
+           progress: _Progress, backend: Backend
            ) -> tuple[ClassComparison | None, AcceptanceResult | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
     task, found = bare.task, bare.found
-    reasons: tuple[str, ...] = ()
-    warnings: list[str] = []
+    learned: ClassComparison | None = None
+    decision: AcceptanceResult | None = None
+    warnings: tuple[str, ...] = ()
     for begin in (None,) if sibling is None else (sibling, None):
-        course = _Course(on_progress)
-        learned: ClassComparison | None = None
-        decision: AcceptanceResult | None = None
+        learned, decision, progress.learned = None, None, 0.0
         try:
             learned = compare_classes(
                 found, bare.plant, thresholds, model_class=task.model_class,
-                n_z=task.coordinates, seed=task.seed, starts=task.starts, watch=course.learning,
-                judging=course.judging, device=task.device, backend=backend, begin=begin)
+                n_z=task.coordinates, seed=task.seed, starts=task.starts,
+                watch=progress.learning, judging=progress.judging, device=task.device,
+                backend=backend, begin=begin)
         except TrainingFailed as error:
-            reasons = (str(error),)
-        _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
+            reasons: tuple[str, ...] = (str(error),)
+        progress('decide', _JUDGED, 'judging')
         if learned is not None:
             decision = evaluate_model(found, learned, bare.present, thresholds)
             decision = replace(decision, warnings=(*decision.warnings, *warnings))
             reasons = decision.reasons
         if not reasons:
             break
-        warnings.append('it was learned from nothing, as what training made of '
-                        f'{task.warm_start_model} would be refused: {"; ".join(reasons)}')
+        warnings = ('it was learned from nothing, as what training made of '
+                    f'{task.warm_start_model} would be refused: {"; ".join(reasons)}',)
     return learned, decision, reasons
-
-
-def _at(stage: str, share: float) -> float:
-    begin, end = _STAGES[stage]
-    return begin + share * (end - begin)
-
-
-def _stop_if(stop: bool) -> None:
-    if stop:
-        raise Stopped
-
-
-def _reading(on_progress: OnProgress, source: RecordSource) -> Callable[[int], None]:
-    """Return a tick that reports the share read of a record, twice; it may raise Stopped."""
-    total, read = 2 * source.size(), 0
-
-    def tick(samples: int) -> None:
-        nonlocal read
-        read += samples
-        _stop_if(on_progress(_at('read', min(1.0, read / total)), 'reading bags'))
-
-    return tick
-
-
-class _Course:
-    """Reports how far learning and judging the classes have come; ends them by Stopped."""
-
-    def __init__(self, on_progress: OnProgress) -> None:
-        self._on_progress, self._share = on_progress, 0.0
-
-    def learning(self, now: MultistartProgress) -> bool:
-        """Report the starts, as :func:`learning.compare` tells of them."""
-        self._share = now.finished / now.total
-        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
-        _stop_if(self._on_progress(
-            _at('learn', self._share), f'learning: {now.name}, n_z {now.n_z}, start '
-            f'{min(now.finished + 1, now.total)} of {now.total}{rw}'))
-        return False
-
-    def judging(self, name: str, share: float) -> bool:
-        """Report the share of a class's closed loops; the last ones come after all starts."""
-        at = _at('decide', _JUDGED * share) if self._share == 1.0 else _at('learn', self._share)
-        _stop_if(self._on_progress(at, f'judging: {name}'))
-        return False
 
 
 def _with_provenance(model: LiftedModel, found: Identified, decision: AcceptanceResult,

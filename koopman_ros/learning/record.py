@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -33,6 +33,7 @@ _LONGER = 4
 _Numbered: TypeAlias = tuple[int, str]  # a bag, with its number in the record
 # Called with the samples that were read; it may raise to end the reading.
 Tick = Callable[[int], None]
+_Reader = Callable[[Any, _Numbered, Tell], Any]
 
 
 @dataclass(frozen=True)
@@ -101,9 +102,8 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
     account = ImportReport()
     bags = {str(bag): (number, str(bag))
             for number, bag in enumerate(distinct(source.bags, account))}
-    n_x, n_u = len(source.states), len(source.inputs)
 
-    def each(function: Callable[[_Numbered, Tick], Any]) -> Iterator[Any]:
+    def each(function: _Reader, given: Any) -> Iterator[Any]:
         done, under_way = 0, dict.fromkeys(bags, 0)
 
         def watch(name: str, read: int | None) -> bool:
@@ -117,62 +117,51 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
             return False
 
         with contextlib.closing((backend or Serial()).run(
-                _told, bags, shared=function, watch=watch)) as results:
+                function, bags, shared=given, watch=watch)) as results:
             for _, result in results:
                 yield result
 
-    survey = RecordStatistics.empty(n_x, n_u)
-    for part, own in each(partial(_surveyed, source)):
+    survey = RecordStatistics.empty(len(source.states), len(source.inputs))
+    for part, own in each(_surveyed, source):
         survey = survey.merged(part)
         account.add(own)
     if not survey.count:
         return TrainingRecord([], account)
     start = Selection(survey.lower, survey.upper, survey.group(most), most,
                       SEGMENT * (_LONGER if hidden else 1))
-    found = reduce(Selection.merged, each(partial(_selected, source, start, seed)))
+    found = reduce(Selection.merged, each(_selected, (source, start, seed)))
     episodes = found.episodes()
     return TrainingRecord(episodes, account, Reduction(
         survey.count, start.group, found.offered, len(episodes),
         start.group * sum(map(len, episodes))))
 
 
-def _told(function: Callable[[_Numbered, Tick], Any], bag: _Numbered, tell: Tell) -> Any:
-    """Read a bag on a worker, and report the samples so far."""
+def _streamed(source: RecordSource, bag: str, account: ImportReport, tell: Tell
+              ) -> Iterator[Episode]:
+    """Yield the episodes of a bag, and tell of the samples so far."""
     read = 0
-
-    def tick(samples: int) -> None:
-        nonlocal read
-        read += samples
-        tell(read)
-
-    return function(bag, tick)
-
-
-def _streamed(source: RecordSource, bag: str, account: ImportReport,
-              tick: Tick) -> Iterable[Episode]:
     for episode in stream_episodes([bag], source.states, source.inputs, account,
                                    tolerance_ns=source.tolerance_ns,
                                    least_jumps=source.least_jumps):
-        tick(len(episode))
+        read += len(episode)
+        tell(read)
         yield episode
 
 
-def _surveyed(source: RecordSource, numbered: _Numbered, tick: Tick) -> tuple[RecordStatistics,
-                                                                              ImportReport]:
-    """Look through one bag."""
-    account, survey = ImportReport(), RecordStatistics.empty(len(source.states),
-                                                             len(source.inputs))
-    for episode in _streamed(source, numbered[1], account, tick):
+def _surveyed(source: RecordSource, numbered: _Numbered, tell: Tell
+              ) -> tuple[RecordStatistics, ImportReport]:
+    account = ImportReport()
+    survey = RecordStatistics.empty(len(source.states), len(source.inputs))
+    for episode in _streamed(source, numbered[1], account, tell):
         survey.add(episode)
     return survey, account
 
 
-def _selected(source: RecordSource, start: Selection, seed: int, numbered: _Numbered,
-              tick: Tick) -> Selection:
-    """Choose segments of one bag."""
-    number, bag = numbered
+def _selected(given: tuple[RecordSource, Selection, int], numbered: _Numbered, tell: Tell
+              ) -> Selection:
+    (source, start, seed), (number, bag) = given, numbered
     rng = np.random.default_rng([seed, number])
     selection = start.empty()
-    for episode in _streamed(source, bag, ImportReport(), tick):
+    for episode in _streamed(source, bag, ImportReport(), tell):
         selection.offer(number, episode, rng)
     return selection

@@ -95,12 +95,12 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         return
     yield '## Classes of models'
     by_rule = retrained.task.model_class == BEST
-    yield ('Taken by the rule: the plainest of those not refused whose error beyond the noise is '
-           'at most twice the smallest, where what chance explains counts as equal.' if by_rule
-           else 'The one that was asked for.')
+    yield ('Selected: the simplest accepted class whose error beyond the noise is at most twice '
+           'the smallest; differences within chance count as equal.' if by_rule
+           else 'The class that model_class names.')
     yield str(learned)
-    yield ('rx is the relative mean-square error of the drift beside the estimated one; roll-outs '
-           'are predictions of the held-out measurements, with their noise; the errors beyond the '
+    yield ('rx is the relative mean-square difference from the estimated drift; roll-outs are '
+           'simulations of the held-out measurements, including their noise; errors beyond the '
            'noise are mean squares relative to the range.')
     yield '## On held-out segments'
     yield 'Root mean square errors of predictions of the measurements:'

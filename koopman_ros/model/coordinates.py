@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.core.arrays import Array, frozen, short_repr
+from koopman_ros.core.arrays import Array, frozen, real, short_repr
 from koopman_ros.core.datasets import PlantDescription
 
 
@@ -72,7 +72,7 @@ class Coordinates:
 
     def array(self, what: str, values: ArrayLike) -> Array:
         """Return values (..., n) of these coordinates as an array; ValueError for another size."""
-        array = np.asarray(values, dtype=np.float64)
+        array = real(values, what)
         if array.shape[-1:] != (len(self.names),):
             raise ValueError(f'incompatible {what}: expected one number for each of '
                              f'{", ".join(self.names)} in the last axis, got {array.shape}')

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
-from koopman_ros.core.units import check_time_unit, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import check_time_unit, display_unit, SECONDS_PER_TIME_UNIT, shown
 from koopman_ros.model.coordinates import Coordinates
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.observables import NetworkObservables, Observables
@@ -104,6 +105,25 @@ class LiftedModel:
     verified_loops: VerifiedLoops | None = None
 
     __repr__ = short_repr
+
+    def __str__(self) -> str:
+        """Show the plant, the trained ranges, the rates, the held-out figures and the verdict."""
+        about = self.provenance
+        lines = [f'{self.kind}; learned from {about.plant}']
+        for role, of in (('state', self.states), ('input', self.inputs)):
+            for name, unit, low, high in zip(
+                    of.names, of.units, of.lower.tolist(), of.upper.tolist(), strict=True):
+                lines.append(f'{role} {name}: trained from {shown(low, unit):.6g} to '
+                             f'{shown(high, unit):.6g} {display_unit(unit)}')
+        rates = self.eigenvalues.real
+        lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
+                  *(f'held-out {name}: {value:.3g}' for name, value in about.metrics.items()),
+                  f'acceptance: {about.acceptance}']
+        return '\n  '.join(lines)
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        # of notebooks
+        printer.text(str(self) if not cycle else repr(self))
 
     def __post_init__(self) -> None:
         n_x, n_u, n_z = self.n_x, self.n_u, self.observables.n_z

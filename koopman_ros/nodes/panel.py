@@ -34,6 +34,7 @@ from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, training_ranges
 from koopman_ros.panel.requests import Action, action_text, Answer, MANUAL, Requests, SETPOINT
 from koopman_ros.panel.snapshot import (
+    CONTROL,
     CONTROLLER,
     PLANT,
     RECORDING,
@@ -102,7 +103,7 @@ class PanelNode(LoopNode):
         self._actions: deque[tuple[Action, Future[Answer]]] = deque()
         self._repeated = RepeatedValues(self)
         self._training_ranges: dict[str, Range] = {}
-        self._model = ''
+        self._model: dict[str, str] = {}
         self._past: threading.Thread | None = None
         self._watch = LearningWatch(settings.system, wiring, self.get_namespace(),
                                     self.resolve_topic_name)
@@ -230,7 +231,9 @@ class PanelNode(LoopNode):
             self.view.conditions.take_status(status.name, status.level[0], status.message, values,
                                              time.time(), status.hardware_id)
             name = self.view.conditions.task(status.name)
-            if name == REQUESTS:
+            if name == CONTROL:
+                self._read_model(values)
+            elif name == REQUESTS:
                 self._requests.take_status(status.message)
             elif name == TRAINING:
                 self._watch.training(
@@ -262,13 +265,14 @@ class PanelNode(LoopNode):
 
     def _on_parameters(self, role: str, found: Mapping[str, ParameterDescription]) -> None:
         self.view.take_parameters(role, found)
-        if role == CONTROLLER and 'model' in found and (
-                name := str(found['model'].value)) != self._model:
-            self._model = name
-            self._read_model(name)
 
-    def _read_model(self, name: str) -> None:
+    def _read_model(self, status: Mapping[str, str]) -> None:
         """Show training range and origin of the active model if its file can be read here."""
+        in_force = {key: status.get(key, '') for key in ('model', 'model reloads')}
+        name = in_force['model']
+        if not name or in_force == self._model:
+            return
+        self._model = in_force
         try:
             model = load(model_path(name))
         except (OSError, ValueError) as error:

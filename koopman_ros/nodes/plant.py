@@ -99,7 +99,7 @@ class PlantNode(ManagedNode):
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
         self._counted = [publisher for publisher in self._states.publishers
                          if publisher.topic_name in map(self.resolve_topic_name, counted)]
-        self.diagnostics.hardware_id = self._plant.name
+        self.diagnostics.hardware_id = self._plant.process.system.name
         self._diagnostics = self.diagnostics.add('simulation', self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
         wall_period = parameters.sample_period / (parameters.speed or math.inf)
@@ -115,7 +115,7 @@ class PlantNode(ManagedNode):
         start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s on'
         lockstep = (f', in lock-step: it begins with {parameters.lockstep_subscribers} '
                     'subscribers and a controller') if parameters.lockstep else ''
-        self.get_logger().info(f'{self._plant.name} started: a measurement every '
+        self.get_logger().info(f'{self._plant.process.system.name} started: a measurement every '
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def activate(self) -> None:
@@ -180,7 +180,7 @@ class PlantNode(ManagedNode):
             self._missed += 1
             self._answered = self._waiting_in_vain = True
             self.get_logger().warning(
-                f'no command for the measurement at {seconds_text(self._plant.time_ns)} s '
+                f'no command for the measurement at {seconds_text(self._plant.process.time_ns)} s '
                 f'within {self._settings.lockstep_timeout} s: the last one is held',
                 throttle_duration_sec=10.0)
             self._continue_lockstep()
@@ -213,10 +213,10 @@ class PlantNode(ManagedNode):
 
     def _publish(self, sample: int) -> None:
         """Publish inputs, then states, to which the controller responds."""
-        stamp, frame_id = stamp_message(self._plant.time_ns), self._settings.frame_id
+        stamp, frame_id = stamp_message(self._plant.process.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
-        self._applied.send(self._plant.inputs, stamp, frame_id)
+        self._applied.send(self._plant.process.u, stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
         self._states.send(measured, stamp, frame_id, variance, resolution)
 
@@ -235,7 +235,7 @@ class PlantNode(ManagedNode):
         if not self.active:
             return
         lockstep = self._settings.lockstep
-        if lockstep and received.stamped and received.stamp_ns != self._plant.time_ns:
+        if lockstep and received.stamped and received.stamp_ns != self._plant.process.time_ns:
             # it answers no measurement that is open: late, or from somebody else
             self._foreign += 1
             return
@@ -249,7 +249,7 @@ class PlantNode(ManagedNode):
             self._rejection = ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
-                followed = dict(zip(self._signals.inputs, self._plant.commanded.tolist(),
+                followed = dict(zip(self._signals.inputs, self._plant.process.followed.tolist(),
                                     strict=True))
                 self._plant.command(np.array(list((followed | self._received).values())))
         else:
@@ -272,7 +272,7 @@ class PlantNode(ManagedNode):
             return False
         # never past the next sample, which is measured under the command of its time
         ahead = self._start_ns + self._sample * self._period_ns
-        now = self._now_ns() if self._settings.speed else self._plant.time_ns
+        now = self._now_ns() if self._settings.speed else self._plant.process.time_ns
         return self._advance(min(now, ahead))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -298,7 +298,7 @@ class PlantNode(ManagedNode):
             self._answered = True
             self._continue_lockstep()
             return
-        passed = self._now_ns() if self._settings.speed else self._plant.time_ns
+        passed = self._now_ns() if self._settings.speed else self._plant.process.time_ns
         self._sample = max(self._sample, -(-(passed - self._start_ns) // self._period_ns))
         self._plant.skip_to(passed)
 
@@ -327,11 +327,11 @@ class PlantNode(ManagedNode):
                 'running, but no command arrives: the last one is held; check that the controller '
                 'is active, and its topics and domain')
         return TaskReport(level, message, lambda: {
-            'time [s]': seconds_text(self._plant.time_ns),
+            'time [s]': seconds_text(self._plant.process.time_ns),
             **self._plant.figures(),
             **values_by_name({base_name(name, unit): unit
                               for name, unit in self._signals.inputs.items()},
-                             self._plant.commanded.tolist(), '{} command'),
+                             self._plant.process.followed.tolist(), '{} command'),
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,

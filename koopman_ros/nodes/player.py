@@ -107,8 +107,7 @@ class PlayerNode(LoopNode):
         except records.BagReadError as error:
             self._give_up(str(error))
         except MemoryError:
-            self._give_up('memory does not suffice for what is recorded within five seconds: play '
-                          'fewer topics')
+            self._give_up('the messages of five seconds do not fit into memory: play fewer topics')
 
     def _begin(self) -> None:
         """Start once all subscribers are there."""

@@ -4,6 +4,7 @@
 """The trainer node: records the loop, drives the plant through experiments, trains from bags."""
 
 import sys
+from typing import Any
 
 from koopman_ros.execution.training import JobState
 from koopman_ros.parameters.signal_topics import SIGNALS, SignalTopics
@@ -26,8 +27,8 @@ from koopman_ros.ros.training import present_lift, Training
 class TrainerNode(ManagedNode):
     """Compose what the trainer does; docs/reference/interfaces.md has its topics and services."""
 
-    def __init__(self) -> None:
-        super().__init__('trainer')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('trainer', **options)
         given = self.given()
         present = present_lift(given)
         table = trainer_table(present, given)

@@ -5,16 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 import math
-from typing import Any
 
 from nicegui import ui
 
 from koopman_ros.panel.layout import AnswerLine, box, card, label, PageLayout, show_if
 from koopman_ros.panel.model_card import status_card
 from koopman_ros.panel.report_cards import comparison_card, report_card
+from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
@@ -73,24 +73,26 @@ def _brief(value: str) -> str:
         return value
 
 
-class _Status:
-    """Message of a status, and a mark if it is a warning or an error."""
+class _Task:
+    """Status of a task: its message, a mark if it is a warning or an error, and its figures."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, columns: bool = False) -> None:
         self._message = label('div', '')
         self._mark = label('span', '', 'abnormal hidden')
+        self._figures = _Figures(columns=columns)
 
-    def show(self, status: TaskStatus) -> None:
-        """Show a status."""
+    def show(self, status: TaskStatus, figures: Mapping[str, str]) -> None:
+        """Show a status and its figures by their names."""
         self._message.set_text(status.message or 'no status received')
         self._mark.set_text({OK: '', WARN: '▲ WARNING'}.get(status.level, '■ ERROR'))
         show_if(self._mark, status.level > OK)
+        self._figures.show({key[:1].upper() + key[1:]: value for key, value in figures.items()})
 
 
 def _model(page: PageLayout) -> None:
     with card('active model', 'Model'):
         name = label('div', '', 'value')
-        status, figures, origin = _Status(), _Figures(columns=True), _Figures(columns=True)
+        task, origin = _Task(columns=True), _Figures(columns=True)
         trained = label('div', '', 'quiet')
 
         async def reload() -> None:
@@ -105,10 +107,9 @@ def _model(page: PageLayout) -> None:
                     now.status(TRAINING).message]):
                 return
             answer.set_text('sent …')
-            old = now.parameter(CONTROLLER, 'model')
-            answer.show(await (
-                page.act('reload', CONTROLLER) if old == new else
-                page.act('parameters', CONTROLLER, {'model': new}, {'model': old})))
+            # the controller reads the file again even where its name is the same
+            answer.show(await page.act('parameters', CONTROLLER, {'model': new},
+                                       {'model': now.parameter(CONTROLLER, 'model')}))
 
         def trained_model() -> str:
             values = page.source.snapshot.status(TRAINING).values
@@ -123,8 +124,7 @@ def _model(page: PageLayout) -> None:
     def show(now: Snapshot) -> None:
         control = now.status(CONTROL)
         name.set_text(control.values.get('model', '–'))
-        status.show(control)
-        figures.show(status_card(control.values))
+        task.show(control, status_card(control.values))
         origin.show(now.model)
         ranges = ', '.join(f'{face.label} {face.text(face.training[0])} to '
                            f'{face.text(face.training[1])} {face.unit}'
@@ -137,55 +137,50 @@ def _model(page: PageLayout) -> None:
     page.follow(show)
 
 
-def _buttons(page: PageLayout, actions: Mapping[str, tuple[Any, ...]]) -> None:
-    """Add buttons for actions of the trainer, and the line of their answers."""
-    async def send(action: tuple[Any, ...]) -> None:
-        answer.show(await page.act(action[0], TRAINER, *action[1:]))
+def _buttons(page: PageLayout, actions: Mapping[str, Callable[[], Awaitable[Answer | None]]]
+             ) -> None:
+    """Add buttons for actions, and the line of their answers."""
+    async def press(act: Callable[[], Awaitable[Answer | None]]) -> None:
+        if found := await act():
+            answer.show(found)
 
     with box('row1'):
-        for text, action in actions.items():
-            page.button(text, partial(send, action))
+        for text, act in actions.items():
+            page.button(text, partial(press, act))
     answer = AnswerLine()
 
 
 def _recording(page: PageLayout) -> None:
     with card('recording', 'Recording'):
-        status, figures = _Status(), _Figures()
-        _buttons(page, {'Record': ('record', True), 'Stop': ('record', False)})
+        task = _Task()
+        _buttons(page, {'Record': partial(page.act, 'record', TRAINER, True),
+                        'Stop': partial(page.act, 'record', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(RECORDING)
-        status.show(found)
-        figures.show({key.capitalize(): value for key, value in found.values.items()
-                      if not key.startswith('messages on') and value not in found.message})
+        task.show(found, {key: value for key, value in found.values.items()
+                          if not key.startswith('messages on') and value not in found.message})
 
     page.follow(show)
 
 
 def _experiment(page: PageLayout) -> None:
     with card('experiment', 'Experiment'):
-        status, figures = _Status(), _Figures()
+        task = _Task()
         limits = label('div', '', 'lines quiet')
 
-        async def start() -> None:
+        async def start() -> Answer | None:
             lines = experiment_limits(page.source.snapshot.parameters.get(TRAINER, {}))
-            if await page.confirm(
-                    'Start the experiment?', 'Start the experiment',
-                    ['The experiment applies random steps within these limits:', *lines]):
-                answer.show(await page.act('experiment', TRAINER, True))
+            return await page.act('experiment', TRAINER, True) if await page.confirm(
+                'Start the experiment?', 'Start the experiment',
+                ['The experiment applies random steps within these limits:', *lines]) else None
 
-        async def stop() -> None:
-            answer.show(await page.act('experiment', TRAINER, False))
-
-        with box('row1'):
-            page.button('Start …', start)
-            page.button('End', stop)
-        answer = AnswerLine()
+        _buttons(page, {'Start …': start,
+                        'End': partial(page.act, 'experiment', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
-        status.show(found)
-        figures.show({key.capitalize(): value for key, value in found.values.items()})
+        task.show(found, found.values)
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
 
     page.follow(show)
@@ -219,8 +214,9 @@ def _training(page: PageLayout) -> None:
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')
-        status, figures = _Status(), _Figures()
-        _buttons(page, {'Train': ('train',), 'Cancel': ('cancel',)})
+        task = _Task()
+        _buttons(page, {'Train': partial(page.act, 'train', TRAINER),
+                        'Cancel': partial(page.act, 'cancel', TRAINER)})
 
     def show(now: Snapshot) -> None:
         found = now.status(TRAINING)
@@ -230,8 +226,7 @@ def _training(page: PageLayout) -> None:
             done = math.nan
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)
         share.set_text('' if math.isnan(done) else f'{done:.0f} %')
-        status.show(found)
-        figures.show({key.replace('_', ' ').capitalize(): value
-                      for key, value in found.values.items() if key != _DONE})
+        task.show(found, {key.replace('_', ' '): value
+                          for key, value in found.values.items() if key != _DONE})
 
     page.follow(show)

@@ -11,6 +11,7 @@ import secrets
 import socket
 import ssl
 import threading
+import time
 from typing import Any
 from urllib.parse import parse_qs
 import zlib
@@ -34,6 +35,7 @@ from koopman_ros.panel.trend_page import trend_page
 from koopman_ros.panel.tuning_page import tuning_page
 
 _START = 10.0  # s until the server has started
+_POLL = 0.02  # s between two looks at a server that starts
 _STOP = 3.0  # s until it has ended
 _LOGS = ('uvicorn.error', 'asyncio', 'nicegui', 'engineio.server', 'socketio.server')
 _SOCKETS = '/_nicegui_ws/'
@@ -168,8 +170,8 @@ class PanelServer:
             ssl_certfile=certificate or None, ssl_keyfile=key or None, server_header=False,
             timeout_graceful_shutdown=1, ws_max_size=1024 * 1024, loop='asyncio',
             proxy_headers=False, backlog=BACKLOG))
-        self._thread = threading.Thread(target=self._serve, name='pages', daemon=True)
-        self._begun = threading.Event()
+        self._thread = threading.Thread(
+            target=self._server.run, args=([self._socket],), name='pages', daemon=True)
 
     @property
     def pages(self) -> int:
@@ -179,30 +181,16 @@ class PanelServer:
     def start(self) -> None:
         """Start to serve; raise OSError if that fails."""
         self._thread.start()
-        if not self._begun.wait(_START):
-            raise OSError(f'the pages are not served within {_START:g} s')
+        end = time.monotonic() + _START
+        while not self._server.started and self._thread.is_alive() and time.monotonic() < end:
+            time.sleep(_POLL)
         if not self._server.started:
-            raise OSError('the pages cannot be served')
+            raise OSError(f'the pages cannot be served, or not within {_START:g} s')
 
     def stop(self) -> None:
         """Stop to serve."""
         self._server.should_exit = True
         self._thread.join(_STOP)
-
-    def _serve(self) -> None:
-        started = self._server.startup
-
-        async def startup(sockets: Any = None) -> None:
-            try:
-                await started(sockets)
-            finally:
-                self._begun.set()
-
-        self._server.startup = startup  # type: ignore[method-assign]
-        try:
-            self._server.run([self._socket])
-        finally:
-            self._begun.set()
 
 
 def _check(host: str, file: str, users: Users | None, certificate: str, key: str,

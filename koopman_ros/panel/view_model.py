@@ -71,7 +71,8 @@ class LoopViewModel:
         self._parameters: dict[str, Mapping[str, ParameterDescription]] = {}
         self._marked = now  # time of the last alarm that is a mark in the trends
         self._about: Mapping[str, str] = MappingProxyType({})
-        self._previous_model = self._digest = ''
+        self._previous_model = ''
+        self._model: dict[str, Any] = {}
 
     # Messages.
 
@@ -186,20 +187,27 @@ class LoopViewModel:
                 self._mode = str(fields['mode'])
                 self._mark('mode', f'{self._mode} mode')
             case 'model':
-                name, before = str(fields['model']['name']), self._digest
-                self._mark('model', f'model {name}')
-                self._digest = str(fields['model']['digest'])
-                if self._digest != before and name.endswith('.safetensors'):
-                    # the file was read again, after another training has replaced it
-                    self._previous_model = str(backup_path(Path(name)))
+                self._mark('model', f'model {fields["model"]["name"]}')
+                self._replace_model(fields['model'])
             case 'parameters':
                 self._mark('model' if 'model' in fields else 'parameter',
                            ', '.join(map(str, fields['parameters'])))
                 if 'model' in fields:
-                    self._digest = str(fields['model']['digest'])
+                    self._replace_model(fields['model'])
             case 'start' | 'snapshot':
                 self._mode = str(fields['state']['mode']['name']).lower()
-                self._digest = str(fields['model']['digest'])
+                self._model = dict(fields['model'])
+
+    def _replace_model(self, model: Mapping[str, Any]) -> None:
+        before, self._model = self._model, dict(model)
+        if not before or before['digest'] == model['digest']:
+            return
+        name = str(before['name'])
+        if name != model['name']:
+            self._previous_model = name
+        elif name.endswith('.safetensors'):
+            # another training has replaced the file
+            self._previous_model = str(backup_path(Path(name)))
 
     def _mark(self, kind: str, text: str) -> None:
         if not math.isnan(self._time):
@@ -207,11 +215,7 @@ class LoopViewModel:
 
     def take_parameters(self, role: str, values: Mapping[str, ParameterDescription]) -> None:
         """Take all parameters of a node; none if it is gone."""
-        before = self._parameters.get(role, {}).get('model')
         self._parameters[role] = MappingProxyType(dict(values))
-        if role == CONTROLLER and before and 'model' in values and (
-                values['model'].value != before.value):
-            self._previous_model = str(before.value)
 
     def take_model(self, ranges: Mapping[str, Range], about: Mapping[str, str]) -> None:
         """

@@ -23,10 +23,10 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.estimation import Estimator, ESTIMATORS
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
+    box_defaults,
     DEFAULT_SYSTEM,
     InputPlaces,
     named_units,
@@ -169,16 +169,12 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))),
                          expected.states)
     defaults: dict[str, Any] = {**signals.defaults(), **_dynamics(model)}
-    for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):
-        if name in signals.states:
-            defaults[f'{name}.weight'] = 1.0 / scale ** 2
     box = model.inputs
-    for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
-        shown = conversion(unit, display_unit(unit))
-        defaults |= {f'{name}.weight': 1.0 / float(box.scale[i]) ** 2,
-                     f'{name}.min': shown(float(box.lower[i])),
-                     f'{name}.max': shown(float(box.upper[i])),
-                     f'{name}.safe_value': shown(float(box.center[i]))}
+    defaults |= box_defaults(box, min=box.lower, max=box.upper, safe_value=box.center)
+    for one in (model.states, box):
+        defaults |= {f'{name}.weight': 1.0 / scale ** 2
+                     for name, scale in zip(one.names, one.scale.tolist(), strict=True)
+                     if name in signals.units}
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),
@@ -195,28 +191,28 @@ class ReplayParameters:
     """Snapshot of the replay's parameters; a controller's may be given for the new model."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'plant that is shipped, whose topics are those of the bag; any other '
-        'name for none')
+        DEFAULT_SYSTEM, 'Bundled plant whose topics are those of the bag; any other name: no '
+        'defaults.')
     model: str = parameter(
-        '', 'where a recorded model is looked for beside the shipped ones: a name, a .safetensors '
-        'file or a folder of them')
+        '', 'Where to look for a recorded model that is not a bundled one: a .safetensors file, a '
+        'name, or a folder of such files.')
     bags: tuple[str, ...] = parameter(
-        ('run_1',), 'bags to replay, each a run of its own: .mcap files or bag folders')
+        ('run_1',), 'Bags to replay, each as a separate run: .mcap files or bag folders.')
     new_model: str = parameter(
-        '', 'model whose commands are compared with the recorded ones, by name or path, under the '
-        'recorded parameters but for those of a controller that are given here, too; empty only '
-        'checks that the recorded commands are reproduced')
+        '', 'Model, by name or path, whose commands are compared with the recorded ones. The '
+        'recorded parameters of the controller apply except those given here. Empty: only check '
+        'that the recorded commands are reproduced.')
     output: str = parameter(
-        'replay', 'folder for report.md, summary.json and the pictures; older ones in it are '
-        'replaced')
+        'replay', 'Folder for report.md, summary.json and the pictures; existing ones are '
+        'replaced.')
     tolerance: float = parameter(
-        0.1, 'difference of two commands, in the unit of the input, from which on it is counted '
-        'and marked', '', 0.0, 1e9)
+        0.1, 'Difference between two commands, in the unit of the input, above which it is '
+        'counted and marked.', '', 0.0, 1e9)
     recover: bool = parameter(
-        False, 'read bags that were not closed or are damaged as far as they are whole')
+        False, 'Read the intact part of bags that are damaged or were not closed.')
     last: float = parameter(
-        0.0, 'how much of the end of each bag is replayed, from the snapshot before it; 0 for all '
-        'of it', 's', 0.0, 1e9)
+        0.0, 'Length of the last part of each bag to replay, from the snapshot before it; 0: the '
+        'whole bag.', 's', 0.0, 1e9)
 
 
 def _check_replay(values: ReplayParameters) -> str:

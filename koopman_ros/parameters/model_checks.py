@@ -16,7 +16,7 @@ from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.status import StatusCode
-from koopman_ros.core.units import display_unit, NANOSECONDS, shown
+from koopman_ros.core.units import NANOSECONDS, quantity_text, shown
 from koopman_ros.evaluation import compare, PredictionWindows
 from koopman_ros.model import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
@@ -72,7 +72,7 @@ def ranges(model: LiftedModel) -> str:
     """Write the training range of each state for the operator."""
     states = model.states
     return ', '.join(
-        f'{name} {shown(low, unit):.6g} to {shown(high, unit):.6g} {display_unit(unit)}'
+        f'{name} {shown(low, unit):.6g} to {quantity_text(high, unit)}'
         for name, unit, low, high in zip(states.names, states.units, states.lower.tolist(),
                                          states.upper.tolist(), strict=True))
 
@@ -102,7 +102,7 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
                                     and signals.states.items() <= own.states.items()):
         raise ModelFileError(
             f'{path} has {own}, this controller was started for {signals}: choose a model of '
-            'the same signals, or start it anew')
+            'the same signals, or restart the controller')
     _refuse_slow(path, model)
     written = 'unknown'
     # the file may be gone since it was read
@@ -191,9 +191,8 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheck
 
 def listed(signals: Coordinates, values: Array) -> str:
     """Write values (n,) for the operator."""
-    return ', '.join(
-        f'{name} {shown(value, unit):.6g} {display_unit(unit)}' for name, unit, value in zip(
-            signals.names, signals.units, values.tolist(), strict=True))
+    return ', '.join(f'{name} {quantity_text(value, unit)}' for name, unit, value in zip(
+        signals.names, signals.units, values.tolist(), strict=True))
 
 
 def rests_outside(controller: Controller) -> str:
@@ -205,15 +204,12 @@ def rests_outside(controller: Controller) -> str:
     safe, holding = controller.safe_input, rest.holding
     where = 'does not come to rest' if np.isnan(rest.x).any() else (
         f'rests at about {listed(model.states, rest.x)} if one extrapolates')
+    inputs = model.inputs.names, model.inputs.units
     better = ', '.join(
-        f'{name}.safe_value = {shown(held, unit):.6g} {display_unit(unit)} or '
-        f'{"more" if held > now else "less"}'
-        for name, unit, now, held in zip(model.inputs.names, model.inputs.units, safe.tolist(),
-                                         holding.tolist(), strict=True))
-    under = ', '.join(
-        f'{name}.safe_value = {shown(now, unit):.6g} {display_unit(unit)}'
-        for name, unit, now in zip(model.inputs.names, model.inputs.units, safe.tolist(),
-                                   strict=True))
+        f'{name}.safe_value = {quantity_text(held, unit)} or {"more" if held > now else "less"}'
+        for name, unit, now, held in zip(*inputs, safe.tolist(), holding.tolist(), strict=True))
+    under = ', '.join(f'{name}.safe_value = {quantity_text(now, unit)}' for name, unit, now in zip(
+        *inputs, safe.tolist(), strict=True))
     return (f'under {under} the plant leaves the trained range, {ranges(model)}, and '
             f'{where}: no law can act there, and the way back is slow; record data from there and '
             f'train again, or set {better} if that is still safe')

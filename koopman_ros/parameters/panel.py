@@ -25,7 +25,7 @@ from koopman_ros.parameters.trainer import trainer_signals
 
 
 def _shown_unit() -> Any:
-    return parameter('', 'unit of this signal on the pages; empty for the unit of its parameters',
+    return parameter('', 'Unit of this signal on the pages; empty: the unit of its parameters.',
                      read_only=True)
 
 
@@ -48,45 +48,46 @@ class PanelParameters:
     """Parameters of the panel."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'name of a bundled plant, whose signals and topics become the defaults; '
-        'any other name: no defaults', read_only=True)
+        DEFAULT_SYSTEM, 'Bundled plant whose signals and topics are the defaults; any other '
+        'name: no defaults.', read_only=True)
     model: str = parameter(
-        '', 'model whose signals are shown if no other parameter names them: a bundled one by '
-        'name, or the path of a .safetensors file', read_only=True)
+        '', 'Model whose signals are shown if no other parameter names them: a bundled one by '
+        'name, or the path of a .safetensors file.', read_only=True)
     states_measured: tuple[str, ...] = parameter(
-        ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
-        'model', read_only=True)
+        ('',), 'Measured signals with their units, e.g. level [m]; an empty name: those of the '
+        'model.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'inputs with their units, e.g. pump [V]; an empty name for those of the model',
+        ('',), 'Inputs with their units, e.g. pump [V]; an empty name: those of the model.',
         read_only=True)
     controlled: tuple[str, ...] = parameter(
-        ('',), 'measured signals with a set-point; an empty name for all', read_only=True)
+        ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
     controller: str = parameter(
-        'controller', 'name of the controller node', read_only=True)
+        'controller', 'Name of the controller node.', read_only=True)
     trainer: str = parameter(
-        'trainer', 'name of the trainer node', read_only=True)
+        'trainer', 'Name of the trainer node.', read_only=True)
     title: str = parameter(
-        '', 'title of all pages; empty for the name of the plant', read_only=True)
+        '', 'Title of all pages; empty: the name of the plant.', read_only=True)
     host: str = parameter(
-        '127.0.0.1', 'address of the web server; one that other machines reach needs users',
+        '127.0.0.1', 'Address of the web server; users are required unless it is a loopback '
+        'address.',
         read_only=True)
     port: int = parameter(
-        8080, 'port of the web server; 0 for any free port', '', 0, 65535, read_only=True)
+        8080, 'Port of the web server; 0: any free port.', '', 0, 65535, read_only=True)
     users: str = parameter(
-        '', 'file of users with their roles and hashed passwords; empty: every user of this '
-        'machine is the operator', read_only=True)
+        '', 'File of users with their roles and hashed passwords; empty: every user of this '
+        'machine is the operator.', read_only=True)
     tls_certificate: str = parameter(
-        '', 'TLS certificate, as a PEM file; empty for no encryption', read_only=True)
+        '', 'TLS certificate, as a PEM file; empty: no encryption.', read_only=True)
     tls_key: str = parameter(
-        '', 'private key of the certificate, as a PEM file', read_only=True)
+        '', 'Private key of the certificate, as a PEM file.', read_only=True)
     trusted_proxy: tuple[str, ...] = parameter(
-        ('',), 'addresses or networks of reverse proxies, whose X-Forwarded-For and '
-        'X-Forwarded-Proto are trusted; an empty name for none; needs users', read_only=True)
+        ('',), 'Addresses or networks of reverse proxies whose X-Forwarded-For and '
+        'X-Forwarded-Proto are trusted; an empty name: none. Requires users.', read_only=True)
     alarm_file: str = parameter(
-        '', 'file that keeps alarms, shelving and the last 24 hours over a restart; empty for '
-        'none', read_only=True)
+        '', 'File that keeps alarms, shelving and the last 24 hours across a restart; empty: '
+        'none.', read_only=True)
     span: float = parameter(
-        28800.0, 'length of the trends', 's', 600.0, 604800.0, read_only=True)
+        28800.0, 'Length of the trends.', 's', 600.0, 604800.0, read_only=True)
     states: Mapping[str, ShownState] = per_signal(ShownState)
     inputs: Mapping[str, ShownInput] = per_signal(ShownInput)
 

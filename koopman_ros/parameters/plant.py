@@ -47,13 +47,13 @@ class StateParameters(MeasuredPlace):
     """How a state is measured."""
 
     measurement_noise: float = parameter(
-        0.0, 'standard deviation of its measurement', '{unit}', 0.0, 1e9)
+        0.0, 'Standard deviation of the measurement noise.', '{unit}', 0.0, 1e9)
     bias: float = parameter(
-        0.0, 'by how much it is measured too high', '{unit}', -UNBOUNDED, UNBOUNDED)
+        0.0, 'Offset of the measurement.', '{unit}', -UNBOUNDED, UNBOUNDED)
     resolution: float = parameter(
-        0.0, 'smallest difference that the measurement shows; 0 for all', '{unit}', 0.0, 1e9)
+        0.0, 'Resolution of the measurement; 0: unlimited.', '{unit}', 0.0, 1e9)
     initial_offset: float = parameter(
-        0.0, 'start this far from the steady state', '{unit}', -UNBOUNDED, UNBOUNDED,
+        0.0, 'Distance from the steady state at the start.', '{unit}', -UNBOUNDED, UNBOUNDED,
         read_only=True)
 
 
@@ -62,14 +62,13 @@ class InputParameters(CommandedPlaces):
     """The actuator of an input."""
 
     min: float = signal_value(
-        -UNBOUNDED, 'lowest value that the actuator reaches')
+        -UNBOUNDED, 'Lowest value that the actuator reaches.')
     max: float = signal_value(
-        UNBOUNDED, 'highest value that the actuator reaches')
+        UNBOUNDED, 'Highest value that the actuator reaches.')
     delay: float = parameter(
-        0.0, 'how much later a command takes effect; the sample_period for one sample', 's', 0.0,
-        3600.0)
+        0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
     lag: float = parameter(
-        0.0, 'time constant with which the input follows its command; 0 for at once', 's', 0.0,
+        0.0, 'Time constant with which the input follows its command; 0: at once.', 's', 0.0,
         3600.0)
 
 
@@ -78,37 +77,37 @@ class PlantParameters:
     """Snapshot of the plant's parameters, in the units that people read."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'what is simulated: a plant of the library, the name of an entry point of '
-        'the group koopman_ros.plants, or package.module:Class', read_only=True)
+        DEFAULT_SYSTEM, 'Plant to simulate: one of the library, an entry point of the group '
+        'koopman_ros.plants, or package.module:Class.', read_only=True)
     measured: tuple[str, ...] = parameter(
-        ('',), 'states that lock-step wants subscribers for; an empty name for all',
-        read_only=True)
+        ('',), 'States whose measurements must have subscribers before lock-step starts; an empty '
+        'name: all.', read_only=True)
     autostart: bool = parameter(
-        True, 'configure and activate itself at the start; false leaves that to a lifecycle '
-        'manager', read_only=True)
+        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        read_only=True)
     sample_period: float = parameter(
-        1.0, 'time between measurements', 's', 1e-3, 3600.0, read_only=True)
-    seed: int = parameter(0, 'seed of the measurement noise', '', 0, 2 ** 31, read_only=True)
+        1.0, 'Time between measurements.', 's', 1e-3, 3600.0, read_only=True)
+    seed: int = parameter(0, 'Seed of the measurement noise.', '', 0, 2 ** 31, read_only=True)
     speed: float = parameter(
-        1.0, 'simulated seconds per second; 0 for as fast as it can', '', 0.0, 1e6, smallest=1e-6,
+        1.0, 'Simulated seconds per second; 0: as fast as possible.', '', 0.0, 1e6, smallest=1e-6,
         read_only=True)
     lockstep: bool = parameter(
-        False, 'advance only when the command for the last measurement has arrived',
+        False, 'Wait for the command of each measurement before the next one.',
         read_only=True)
     lockstep_timeout: float = parameter(
-        5.0, 'wall time after which lock-step goes on with the command held', 's', 0.01, 3600.0,
+        5.0, 'Wall time after which lock-step continues with the last command.', 's', 0.01, 3600.0,
         read_only=True)
     lockstep_subscribers: int = parameter(
-        1, 'subscribers of the measurements that lock-step waits for before it starts', '', 1,
-        1000, read_only=True)
+        1, 'Number of subscribers of the measurements before lock-step starts.', '', 1, 1000,
+        read_only=True)
     duration: float = parameter(
-        0.0, 'simulated time after which the plant stands still; 0 for endless', 's', 0.0, 1e9,
+        0.0, 'Simulated time after which the simulation stops; 0: never.', 's', 0.0, 1e9,
         read_only=True)
     start_time: float = parameter(
-        1.0, 'time of the first measurement when not in real time', 's', 1e-3, LAST_STAMP_SECONDS,
+        1.0, 'Time of the first measurement when not in real time.', 's', 1e-3, LAST_STAMP_SECONDS,
         read_only=True)
-    publish_clock: bool = parameter(True, 'publish /clock when not in real time', read_only=True)
-    frame_id: str = parameter('plant', 'frame_id of the messages', read_only=True)
+    publish_clock: bool = parameter(True, 'Publish /clock when not in real time.', read_only=True)
+    frame_id: str = parameter('plant', 'frame_id of the messages.', read_only=True)
     states: Mapping[str, StateParameters] = per_signal(StateParameters)
     inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
     #: the plant's constants, in SI

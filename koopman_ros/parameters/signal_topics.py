@@ -14,12 +14,13 @@ import re
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import parameter
 from koopman_ros.core.message_fields import base_name, MessageField, place, SIGNAL_NAME
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.status import StatusFormatter
-from koopman_ros.core.units import check_unit, conversion, Display, Displays
-from koopman_ros.model import LiftedModel
+from koopman_ros.core.units import check_unit, conversion, Display, Displays, shown
+from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.parameters.table import ConfigurationError
 
 CONTROLLER_INTERNALS = 'controller_internals'
@@ -52,38 +53,40 @@ def _topic(description: str) -> Any:
 class MeasuredPlace:
     """Where a signal is measured."""
 
-    topic: str = _topic('topic of its measurements; of an input, of what really acts')
-    type: str = _topic('type of their messages as package/msg/Name; empty for the usual one of '
-                       'its unit')
-    field: str = _topic('where in them the number is, e.g. temperature, twist.linear.x, data[2] '
-                        'or position[shaft]; empty for the usual one of the type')
-    unit: str = _topic('unit of that number; empty for the usual one of the type')
+    topic: str = _topic('Topic of the measurements; for an input, of the applied value.')
+    type: str = _topic('Type of these messages as package/msg/Name; empty: the usual type for the '
+                       'unit.')
+    field: str = _topic('Field of the message that holds the value, e.g. temperature, '
+                        'twist.linear.x, data[2] or position[shaft]; empty: the usual field of '
+                        'the type.')
+    unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 
 @dataclass(frozen=True)
 class StatePlaces(MeasuredPlace):
     """Where a measured state is; its set-points and prediction have the same type and field."""
 
-    setpoint_topic: str = _topic('where its set-point is asked for, where it is controlled')
-    active_setpoint_topic: str = _topic('where the set-point that is tracked is published')
-    predicted_topic: str = _topic('where it is published what was expected of the measurement')
+    setpoint_topic: str = _topic('Topic on which set-points are requested.')
+    active_setpoint_topic: str = _topic('Topic of the set-point in use.')
+    predicted_topic: str = _topic('Topic of the predicted measurement.')
 
 
 @dataclass(frozen=True)
 class CommandedPlaces(MeasuredPlace):
     """Where an input is measured, and where it is commanded."""
 
-    command_topic: str = _topic('topic of its commands')
-    command_type: str = _topic('type of the commands; empty for that of the measurements')
-    command_field: str = _topic('where in them the number is; empty for the usual one of the type')
-    command_unit: str = _topic('unit of that number; empty for the usual one of the type')
+    command_topic: str = _topic('Topic of the commands.')
+    command_type: str = _topic('Type of the commands; empty: that of the measurements.')
+    command_field: str = _topic('Field of the command that holds the value; empty: the usual field '
+                                'of the type.')
+    command_unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 
 @dataclass(frozen=True)
 class InputPlaces(CommandedPlaces):
     """The same with an operator."""
 
-    manual_topic: str = _topic('where an operator commands it in manual mode')
+    manual_topic: str = _topic('Topic of the manual commands.')
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,12 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
                    {} if len(states) == len(every) else every)
+
+
+def box_defaults(box: Coordinates, **values: Array) -> dict[str, float]:
+    """Return values (n,) of the signals of a box as people read them, like ``pump.min``."""
+    return {f'{name}.{row}': shown(value, unit) for row, numbers in values.items()
+            for name, unit, value in zip(box.names, box.units, numbers.tolist(), strict=True)}
 
 
 def words_of(signals: Signals,

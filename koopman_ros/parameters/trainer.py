@@ -25,7 +25,7 @@ from koopman_ros.core.declaration import (
     value_column,
 )
 from koopman_ros.core.plugins import short_name
-from koopman_ros.core.units import conversion, display_unit
+from koopman_ros.core.units import display_unit
 from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
@@ -34,6 +34,7 @@ from koopman_ros.parameters.equations import named_ranges, refused
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
     AUDIT_LOG,
+    box_defaults,
     CONTROLLER_INTERNALS,
     DEFAULT_SYSTEM,
     DIAGNOSTICS,
@@ -60,140 +61,139 @@ class TrainerParameters:
     """Snapshot of the trainer's parameters, in the units that people read."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'plant that is shipped, whose signals, topics and bounds are the '
-        'defaults here; any other name for none', read_only=True)
+        DEFAULT_SYSTEM, 'Bundled plant whose signals, topics and limits are the defaults; any '
+        'other name: no defaults.', read_only=True)
     states_measured: tuple[str, ...] = parameter(
-        ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
-        'model', read_only=True)
+        ('',), 'Measured signals with their units, e.g. level [m]; an empty name: those of the '
+        'model.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'inputs with their units; an empty name for those of the model', read_only=True)
+        ('',), 'Inputs with their units, e.g. pump [V]; an empty name: those of the model.',
+        read_only=True)
     controlled: tuple[str, ...] = parameter(
-        ('',), 'measured signals that have a set-point; an empty name for all', read_only=True)
+        ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
     autostart: bool = parameter(
-        True, 'configure and activate itself at the start; false leaves that to a lifecycle '
-        'manager', read_only=True)
+        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        read_only=True)
     task: str = parameter(
-        'record', 'record: the node, which records, drives experiments and trains on request; '
-        'train: train from the bags, and end', choices=('record', 'train'), read_only=True)
+        'record', 'record: run as a node that records, runs experiments and trains on request; '
+        'train: train from the bags and exit.', choices=('record', 'train'), read_only=True)
     record_at_start: bool = parameter(
-        True, 'start recording when the node starts, without waiting for ~/record', read_only=True)
+        True, 'Start recording at the start, without waiting for ~/record.', read_only=True)
     output: str = parameter(
-        '', 'where to record: a file ending in .mcap, or the folder of a new bag; empty names a '
-        'folder after the date and time; never overwritten: where run exists, run_2 is taken')
+        '', 'Bag to record: a file ending in .mcap or a new folder; empty: a folder named after '
+        'date and time. Nothing is overwritten: where run exists, run_2 is written.')
     topics: tuple[str, ...] = parameter(
-        ('',), 'topics to record; those that are not part of the loop are subscribed when '
-        'somebody publishes them')
+        ('',), 'Topics to record. Those outside the loop are subscribed as soon as they have a '
+        'publisher.')
     compression: str = parameter(
-        'none', 'compression of the bag; none is readable even when damaged',
+        'none', 'Compression of the bag. Uncompressed bags can be read even when damaged.',
         choices=('none', 'zstd', 'lz4'))
     max_bag_size: float = parameter(
-        0.0, 'size from which the recording goes on in the next file of the folder; 0 for never',
-        'MB', 0.0, 1e9, smallest=1e-6)
+        0.0, 'File size at which the recording continues in the next file of the folder; 0: '
+        'one file.', 'MB', 0.0, 1e9, smallest=1e-6)
     max_bag_duration: float = parameter(
-        0.0, 'time after which the recording goes on in the next file of the folder; 0 for never',
-        's', 0.0, 1e9, smallest=1e-6)
+        0.0, 'Duration after which the recording continues in the next file of the folder; 0: '
+        'one file.', 's', 0.0, 1e9, smallest=1e-6)
     min_free_disk: float = parameter(
-        100.0, 'room that the disk must have; with less, recording does not start, or stops', 'MB',
+        100.0, 'Free disk space below which recording does not start, or stops.', 'MB',
         0.0, 1e12)
     experiment_signal: str = parameter(
-        COMMAND, 'what the experiment steps: the commands of the plant, those that a controller '
-        'in manual mode passes on, or the set-points of a controller in automatic mode',
-        choices=(COMMAND, MANUAL, SETPOINT))
+        COMMAND, 'Signals that the experiment steps: the commands of the plant, the manual '
+        'commands of a controller in manual mode, or the set-points of a controller in automatic '
+        'mode.', choices=(COMMAND, MANUAL, SETPOINT))
     experiment_length: float = parameter(
-        3600.0, 'length of the experiment', 's', 0.0, 1e6, open_minimum=True)
-    experiment_min_hold_time: float = parameter(30.0, 'shortest step', 's', 0.01, 1e6)
-    experiment_max_hold_time: float = parameter(120.0, 'longest step', 's', 0.01, 1e6)
+        3600.0, 'Duration of the experiment.', 's', 0.0, 1e6, open_minimum=True)
+    experiment_min_hold_time: float = parameter(30.0, 'Shortest step.', 's', 0.01, 1e6)
+    experiment_max_hold_time: float = parameter(120.0, 'Longest step.', 's', 0.01, 1e6)
     experiment_timeout: float = parameter(
-        10.0, 'wall time without a newer measurement after which the experiment is aborted', 's',
+        10.0, 'Wall time without a newer measurement after which the experiment is aborted.', 's',
         0.0, 86400.0, open_minimum=True)
     experiment_seed: int = parameter(
-        0, 'seed of the steps; the same seed gives the same steps', '', 0, 2 ** 31)
+        0, 'Seed of the steps; equal seeds give equal steps.', '', 0, 2 ** 31)
     bags: tuple[str, ...] = parameter(
-        ('',), 'what to train from: .mcap files or bag folders; an empty name for what this '
-        'trainer records')
+        ('',), 'Training data: .mcap files or bag folders; an empty name: the bag that this '
+        'trainer records.')
     model: str = parameter(
-        '', 'present lift, which a new one has to beat: name of a shipped model, or '
-        'path of a .safetensors model file; empty to learn the first one')
+        '', 'Present model, which a new one has to beat: a bundled model by name, or the path of '
+        'a .safetensors file; empty: train the first one.')
     model_output: str = parameter(
-        'retrained.safetensors', 'model file that an accepted lift is written to; the one before '
-        'it is kept as .previous.safetensors')
+        'retrained.safetensors', 'File to which an accepted model is written; its predecessor is '
+        'kept as .previous.safetensors.')
     model_class: str = parameter(
-        IDENTITY_LIFT, 'class of the new model; best learns all of them and takes one by the rule '
-        'of the comparison of classes', choices=(*CLASSES, BEST))
+        IDENTITY_LIFT, 'Class of the new model; best: train all of them and select one by '
+        'comparison.', choices=(*CLASSES, BEST))
     lifted_dimension: int = parameter(
-        3, 'coordinates n_z of a new identity lift', '', 2, 8)
+        3, 'Number of lifted coordinates n_z of a new identity lift.', '', 2, 8)
     restarts: int = parameter(
-        3, 'starts of which each coordinate keeps the best', '', 1, 100)
+        3, 'Random starts of the training of each coordinate; the best one is kept.', '', 1, 100)
     training_seed: int = parameter(
-        0, 'seed of the training, of what is held out, and of what is taken of a long record', '',
-        0, 2 ** 31)
+        0, 'Seed of the training, of the held-out selection, and of the selection from a long '
+        'record.', '', 0, 2 ** 31)
     training_samples: int = parameter(
-        20_000, 'samples that are learned from and judged by; a longer record is averaged, where '
-        'that loses nothing, and segments from all over its range are taken', '', 1000, 1_000_000)
+        20_000, 'Largest number of samples to train and test on. Longer records are averaged '
+        'where nothing is lost, then thinned to segments that cover their range.', '', 1000,
+        1_000_000)
     warm_start_model: str = parameter(
-        '', 'lift of a plant of the same kind that training begins from, instead of from nothing: '
-        'name of a shipped model, or path of a model file; first, with --loops, for the first '
-        'plant whose lift is accepted; empty for none')
+        '', 'Model of a similar plant from which the training starts: a bundled model by name, or '
+        'the path of a model file; first (with --loops): the first accepted model of the fleet; '
+        'empty: none.')
     executor: str = parameter(
-        '', 'where a training works: empty for a process of its own beside this node; joblib for '
-        'one on each core, joblib:N for N of them; tcp://host:port for the workers of a Dask '
-        'executor', read_only=True)
+        '', 'Where training runs. Empty: one process; joblib: one process per core; joblib:N: N '
+        'processes; tcp://host:port: the workers of a Dask scheduler.', read_only=True)
     device: str = parameter(
-        'cpu', 'what evaluates the residuals, on every worker: cpu, or a GPU as torch names it, '
-        'like cuda')
+        'cpu', 'Device that evaluates the residuals, on every worker: cpu, or a GPU as torch '
+        'names it, e.g. cuda.')
     input_matrix: tuple[float, ...] = parameter(
-        (0.0,), 'B where it is known, row by row: change of the rate of each state, in its unit '
-        'per second, with each input; a single 0 to learn it')
+        (0.0,), 'Known input matrix B, row by row: change of the rate of each state, in its unit '
+        'per second, for each input; a single 0: learn it.')
     input_matrix_degree: int = parameter(
-        0, 'degree of the polynomial in the states that a learned B is, where what an input does '
-        'depends on them; 0 for a constant B', '', 0, 5)
+        0, 'Degree of a learned B(x) as a polynomial in the states; 0: constant B.', '', 0, 5)
     identification_methods: tuple[str, ...] = parameter(
-        ('weak_form', 'total_variation'), 'methods that estimate the drift where all states are '
-        'measured, of which held-out segments choose: weak_form, total_variation, or module:Class',
-        code=True)
+        ('weak_form', 'total_variation'), 'Methods that estimate the drift where all states are '
+        'measured; held-out segments decide between them: weak_form, total_variation, or '
+        'module:Class.', code=True)
     methods: Mapping[str, Any] = plugin_parameters()
     unmeasured_states: int = parameter(
-        0, 'most states of the plant that are not measured, which a lift is learned with; 0 where '
-        'all are', '', 0, 4)
+        0, 'Largest number of unmeasured states to estimate with the model; 0: all states are '
+        'measured.', '', 0, 4)
     physical_model: str = parameter(
-        '', 'plant whose equations are fitted in place of a polynomial: one of the library, the '
-        'name of an entry point of the group koopman_ros.plants, or package.module:Class; empty '
-        'for none', code=True)
+        '', 'Plant whose equations are fitted in place of a black-box drift: a plant of the '
+        'library, an entry point of the group koopman_ros.plants, or package.module:Class; empty: '
+        'none.', code=True)
     estimated_constants: tuple[str, ...] = parameter(
-        ('',), 'constants of the equations that are estimated, in SI as the plant node has them, '
-        'with their ranges, e.g. friction [0.01, 0.5]; a name alone for the range that the class '
-        'gives, an empty name for those of which the class says that they are')
+        ('',), 'Constants of the equations to estimate, in SI units, with their ranges, e.g. '
+        'friction [0.01, 0.5]; a name alone: the range of the class; an empty name: the constants '
+        'that the class marks as estimated.')
     synchronisation_tolerance: float = parameter(
-        0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
+        0.0, 'Largest difference between the stamps of messages that are one measurement.', 's',
         0.0, 10.0)
     acceptance_margin: float = parameter(
-        0.1, 'share by which the held-out error of a new lift must be below those of the present '
-        'lift and of the best linear model', '', 0.0, 0.99)
+        0.1, 'A new model is accepted if its held-out error is smaller than those of the present '
+        'model and of the best linear model by at least this share.', '', 0.0, 0.99)
     max_condition_number: float = parameter(
-        1e4, 'largest condition number of the coordinates of a new lift', '', 1.0, 1e12,
+        1e4, 'Largest condition number of the lifted coordinates of a new model.', '', 1.0, 1e12,
         open_minimum=True)
 
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
     measured_min: Array = value_column(
-        'states', -UNBOUNDED, 'measurement below which the experiment is aborted',
+        'states', -UNBOUNDED, 'Measurement below which the experiment is aborted.',
         name='experiment_min', none=NO_LOWER)
     measured_max: Array = value_column(
-        'states', UNBOUNDED, 'measurement above which the experiment is aborted',
+        'states', UNBOUNDED, 'Measurement above which the experiment is aborted.',
         name='experiment_max', none=NO_UPPER)
     setpoint_min: Array = value_column(
-        'states', 0.0, 'lowest set-point of an experiment on set-points')
+        'states', 0.0, 'Lowest set-point of an experiment on set-points.')
     setpoint_max: Array = value_column(
-        'states', 0.0, 'highest set-point of an experiment on set-points')
+        'states', 0.0, 'Highest set-point of an experiment on set-points.')
     inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
-    experiment_min: Array = value_column('inputs', 0.0, 'lowest value of a step')
-    experiment_max: Array = value_column('inputs', 0.0, 'highest value of a step')
+    experiment_min: Array = value_column('inputs', 0.0, 'Lowest value of a step.')
+    experiment_max: Array = value_column('inputs', 0.0, 'Highest value of a step.')
     experiment_rate_limit: Array = column(
-        'inputs', 0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
+        'inputs', 0.0, 'Fastest change during the experiment; 0: any.', '{unit}/s', 0.0, 1e9)
     safe_value: Array = value_column(
-        'inputs', 0.0, 'what is safe whatever happened; the experiment starts and ends with it')
+        'inputs', 0.0, 'Safe value, at which the experiment starts and ends.')
     delay: Array = column(
-        'inputs', 0.0, 'dead time of the actuator: a command acts this long after it was given',
-        's', 0.0, 3600.0)
+        'inputs', 0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
@@ -272,16 +272,13 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
                           PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS, EVENT_LOG,
                           AUDIT_LOG, DIAGNOSTICS)
     if present is not None:
-        defaults['input_matrix_degree'] = present.input_matrix_degree
-        for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
-                               (present.states, 'setpoint_min', 'setpoint_max'),
-                               (present.inputs, 'experiment_min', 'experiment_max')):
-            for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
-                shown = conversion(unit, display_unit(unit))
-                defaults |= {f'{name}.{low}': shown(float(box.lower[i])),
-                             f'{name}.{high}': shown(float(box.upper[i]))}
-                if box is present.inputs:
-                    defaults[f'{name}.safe_value'] = shown(float(box.center[i]))
+        states, inputs = present.states, present.inputs
+        defaults |= {
+            'input_matrix_degree': present.input_matrix_degree,
+            **box_defaults(states, experiment_min=states.lower, experiment_max=states.upper,
+                           setpoint_min=states.lower, setpoint_max=states.upper),
+            **box_defaults(inputs, experiment_min=inputs.lower, experiment_max=inputs.upper,
+                           safe_value=inputs.center)}
     methods: dict[str, type[Any]] = {}
     for names in ((), given.get('identification_methods', ())):
         # what is no method, the check of the parameters refuses
@@ -299,8 +296,8 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
                       for name in ('states_measured', 'inputs_commanded'))
     if bool(states) != bool(inputs) or not (states or present):
         raise ConfigurationError(
-            f'what is measured and commanded is not known of the system '
-            f'{system_of(given)!r}: give states_measured and inputs_commanded, each '
+            f'the measured signals and inputs of the system {system_of(given)!r} are not known: '
+            f'give states_measured and inputs_commanded, each '
             "a list like ['level [m]'], or the model of the plant")
     controlled = tuple(filter(None, given.get('controlled', ())))
     if present is not None and not states:
@@ -347,7 +344,7 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
                 f'{n_u}, or a single 0 to learn it')
     if values.input_matrix != (0.0,) and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
-                'input_matrix is given, of which nothing is learned')
+                'input_matrix is given')
     if values.unmeasured_states and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
                 'unmeasured_states are learned, on which B would depend')
@@ -364,39 +361,38 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
 class PlayerParameters:
     """Snapshot of the player's parameters."""
 
-    bag: str = parameter('run_1', 'bag to play: a .mcap file or a bag folder', read_only=True)
+    bag: str = parameter('run_1', 'Bag to play: a .mcap file or a bag folder.', read_only=True)
     system: str = parameter(
-        DEFAULT_SYSTEM, 'plant that is shipped, whose topics are the defaults here; any '
-        'other name for none', read_only=True)
+        DEFAULT_SYSTEM, 'Bundled plant whose topics are the defaults; any other name: no '
+        'defaults.', read_only=True)
     topics: tuple[str, ...] = parameter(
-        ('',), 'topics to play; a relative name stands for that below / in the bag, and follows '
-        'namespaces and remaps when it is published', read_only=True)
+        ('',), 'Topics to play. A relative name is looked up below / in the bag and published '
+        'under the namespace and remaps of the player.', read_only=True)
     rate: float = parameter(
-        1.0, 'seconds of the recording, by the time of receipt, per second; 0 plays as fast as '
-        'the controller answers, in lock-step', '', 0.0, 10000.0, smallest=1e-6, read_only=True)
+        1.0, 'Recorded seconds per second, by time of receipt; 0: lock-step, as fast as the '
+        'controller answers.', '', 0.0, 10000.0, smallest=1e-6, read_only=True)
     measurement: tuple[str, ...] = parameter(
-        ('',), 'the topics among them whose messages together are answered', read_only=True)
+        ('',), 'Topics that carry one measurement together, which is answered.', read_only=True)
     answer: str = parameter(
-        '', 'where the answers are heard, which carry the stamps of the measurements',
-        read_only=True)
+        '', 'Topic of the answers, which carry the stamps of the measurements.', read_only=True)
     answer_type: str = parameter(
-        '', 'type of the answers, where the bag has none', read_only=True)
+        '', 'Type of the answers if the bag has none.', read_only=True)
     clock: bool = parameter(
-        False, 'publish the stamp of each measurement on /clock before it, as the plant does, for '
-        'nodes with use_sim_time', read_only=True)
+        False, 'Publish the stamp of each measurement on /clock first, for nodes with '
+        'use_sim_time.', read_only=True)
     start_offset: float = parameter(
-        0.0, 'time after the start of the bag from which on it is played', 's', 0.0, 1e9,
+        0.0, 'Time after the start of the bag at which playing begins.', 's', 0.0, 1e9,
         read_only=True)
     wait_for_subscribers: int = parameter(
-        1, 'how many subscribers each played topic must have before the first message', '', 0,
-        1000, read_only=True)
+        1, 'Number of subscribers of each topic before the first message.', '', 0, 1000,
+        read_only=True)
     wait_timeout: float = parameter(
-        30.0, 'longest wait for them', 's', 0.0, 86400.0, read_only=True)
+        30.0, 'Longest wait for these subscribers.', 's', 0.0, 86400.0, read_only=True)
     answer_timeout: float = parameter(
-        5.0, 'longest wait for an answer when rate is 0', 's', 0.0, 86400.0, open_minimum=True,
+        5.0, 'Longest wait for an answer where rate is 0.', 's', 0.0, 86400.0, open_minimum=True,
         read_only=True)
     recover: bool = parameter(
-        False, 'play a bag that was not closed or is damaged as far as it is whole',
+        False, 'Play the intact part of a bag that is damaged or was not closed.',
         read_only=True)
 
 

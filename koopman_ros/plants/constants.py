@@ -102,11 +102,11 @@ class Constant:
 def constants_of(plant: Any) -> tuple[Constant, ...]:
     """Return the constants of a plant's class in SI; none where it declares none."""
     return tuple(Constant(
-        row.name, _shown(row, row.default), row.metadata['si'],
-        _shown(row, row.metadata['lower']), _shown(row, row.metadata['upper']),
+        row.name, _to_si(row, row.default), row.metadata['si'],
+        _to_si(row, row.metadata['lower']), _to_si(row, row.metadata['upper']),
         row.metadata['description'],
         None if (ends := row.metadata['estimated']) is None else (
-            _shown(row, ends[0]), _shown(row, ends[1]))) for row in _rows(plant))
+            _to_si(row, ends[0]), _to_si(row, ends[1]))) for row in _rows(plant))
 
 
 def estimated_parameters_of(plant: Any, ranges: Mapping[str, tuple[float, float] | None]
@@ -150,22 +150,22 @@ def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:
     if unknown := values.keys() - rows.keys():
         raise ValueError(f'{min(unknown)} is no constant of {plant.__name__}: it has '
                          f'{", ".join(rows) or "none"}')
-    return {name: _given(rows[name], value) for name, value in values.items()}
+    return {name: _from_si(rows[name], value) for name, value in values.items()}
 
 
 def _rows(plant: Any) -> list[Any]:
     return [row for row in fields(plant) if 'si' in row.metadata] if is_dataclass(plant) else []
 
 
-def _shown(row: Any, value: float) -> float:
+def _to_si(row: Any, value: float) -> float:
     shown = (to_celsius(value) if row.metadata['si'] == 'degC'
              else value / row.metadata['factor'])
     # 76.85, and not 76.85000000000002
     return float(f'{shown:.15g}')
 
 
-def _given(row: Any, value: float) -> float:
+def _from_si(row: Any, value: float) -> float:
     for exact in (row.default, row.metadata['lower'], row.metadata['upper']):
-        if value == _shown(row, exact):
+        if value == _to_si(row, exact):
             return float(exact)
     return to_kelvin(value) if row.metadata['si'] == 'degC' else value * row.metadata['factor']

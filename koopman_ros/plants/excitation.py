@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import DriftSamples, Episode
@@ -166,8 +166,11 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
                 batch.append(random_steps(system, design, duration, step_seed, x0=x0))
         if keep_recoverable and batch:
             # from there back, all states on the way there are recoverable as well
-            ends = np.stack([episode.x[-1] for episode in batch])
-            batch = [batch[i] for i in np.flatnonzero(_recoverable(system, design, ends))]
+            levels, box = _bounds(system, design)
+            back = recoverable(system, np.stack([episode.x[-1] for episode in batch]),
+                               input_lower=levels[0], input_upper=levels[1],
+                               state_lower=box[0], state_upper=box[1])
+            batch = [batch[i] for i in np.flatnonzero(back)]
         found += batch
     if len(found) < episodes:
         raise ExcitationError(
@@ -175,13 +178,6 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
             f'the box for {duration} {system.time_unit}, {episodes} are wanted; shorten the '
             'episodes, widen the input bounds or the box')
     return sample_derivatives(system, found)
-
-
-def _recoverable(system: ControlAffineSystem, design: RandomStepDesign, x: Array
-                 ) -> NDArray[np.bool_]:
-    levels, box = _bounds(system, design)
-    return recoverable(system, x, input_lower=levels[0], input_upper=levels[1],
-                       state_lower=box[0], state_upper=box[1])
 
 
 def _bounds(system: ControlAffineSystem, design: RandomStepDesign

@@ -80,7 +80,7 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
             ) as error:
         raise BagReadError(
             f'{str(source)!r} is not the metadata of a bag ({reason(error)}): delete it and set '
-            'recover to true to read the files beside it') from error
+            'recover to true to read the other files of the folder') from error
     if storage != 'mcap' or compression not in (None, '', 'none', 'zstd'):
         kind = f'{storage} files' + (f' compressed with {compression}' if compression else '')
         raise BagReadError(

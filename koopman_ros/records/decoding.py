@@ -3,17 +3,18 @@
 
 """Messages decoded by the definition that their file brings along, by the library rosbags."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
+import warnings
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from koopman_ros.core.message_fields import full_type_name
-from koopman_ros.records.mcap_file import BagReadError, reason, StoredMessage
+from koopman_ros.records.mcap_file import BagReadError, reason, stored_messages, StoredMessage
 
 _Decode = Callable[[bytes], Any]
 
@@ -41,56 +42,57 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-class UndecodableError(BagReadError):
-    """A topic whose type or encoding is not decoded here; its messages may be complete."""
+def decoded_messages(files: Iterable[Path], topics: frozenset[str] | None, recover: bool
+                     ) -> Iterator[BagMessage]:
+    """
+    Yield the messages of some files; arguments and errors are those of ``read_messages``.
+
+    Where all topics are read, those that are not decoded here come as bytes, with a warning each.
+    """
+    undecoded: set[str] = set()
+    for file in files:
+        # of each file by itself: identifiers of channels are a file's own
+        decoders: dict[int, _Decode | None] = {}
+        for stored in stored_messages(file, recover=recover, topics=topics):
+            channel, fields = stored.channel, None
+            if channel.id not in decoders:
+                try:
+                    decoders[channel.id] = _channel_decoder(stored)
+                except BagReadError as error:
+                    sentence = f'{str(file)!r}: {error}: read the other topics by name'
+                    if topics is not None:
+                        raise BagReadError(sentence) from error
+                    decoders[channel.id] = None
+                    if channel.topic not in undecoded:
+                        undecoded.add(channel.topic)
+                        warnings.warn(f'messages on {channel.topic!r} are given as bytes alone: '
+                                      f'{sentence}', stacklevel=2)
+            if decode := decoders[channel.id]:
+                try:
+                    fields = decode(stored.data)
+                except Exception as error:
+                    # the decoder fails in as many ways as bytes of another program can be wrong
+                    raise BagReadError(
+                        f'{str(file)!r}: the message on {channel.topic!r} at '
+                        f'{stored.log_time_ns} ns does not decode ({reason(error)}): read the '
+                        'other topics by name') from error
+            yield BagMessage(channel.topic, type_name(stored), stored.log_time_ns,
+                             stored.publish_time_ns, fields, stored.data)
 
 
-class Decoders:
-    """Decode the messages of one file."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._by_channel: dict[int, tuple[str, _Decode | UndecodableError]] = {}
-
-    def decode(self, stored: StoredMessage) -> BagMessage:
-        """Return a message with its fields; raise BagReadError where that is impossible."""
-        type_name, decode = self._by_channel.get(stored.channel.id) or self._prepared(stored)
-        if isinstance(decode, UndecodableError):
-            raise decode.with_traceback(None)
-        try:
-            fields = decode(stored.data)
-        except Exception as error:
-            # the decoder walks over foreign bytes and fails in as many ways as they can be wrong
-            raise BagReadError(
-                f'{str(self._file)!r}: the message on {stored.channel.topic!r} at '
-                f'{stored.log_time_ns} ns does not decode ({reason(error)}): read the other '
-                'topics by name') from error
-        return BagMessage(stored.channel.topic, type_name, stored.log_time_ns,
-                          stored.publish_time_ns, fields, stored.data)
-
-    def undecoded(self, stored: StoredMessage) -> BagMessage:
-        """Return a message with its bytes alone."""
-        return BagMessage(stored.channel.topic, type_name(stored), stored.log_time_ns,
-                          stored.publish_time_ns, None, stored.data)
-
-    def _prepared(self, stored: StoredMessage) -> tuple[str, _Decode | UndecodableError]:
-        schema, channel = stored.schema, stored.channel
-        encodings = channel.message_encoding, schema.encoding if schema else 'no schema'
-        decode: _Decode | UndecodableError
-        if schema is None or encodings != (MessageEncoding.CDR, SchemaEncoding.ROS2):
-            decode = UndecodableError(
-                f'{str(self._file)!r}: topic {channel.topic!r} is encoded as {encodings[0]!r} '
-                f'with {encodings[1]!r}, only cdr with ros2msg is decoded here: read the other '
-                'topics by name')
-        else:
-            try:
-                decode = _decoder(type_name(stored), schema.data)
-            except Exception as error:
-                # the definition of another recorder meets the parser here
-                decode = UndecodableError(
-                    f'{str(self._file)!r}: the definition stored for {channel.topic!r} does not '
-                    f'parse ({reason(error)}): read the other topics by name')
-        return self._by_channel.setdefault(channel.id, (type_name(stored), decode))
+def _channel_decoder(stored: StoredMessage) -> _Decode:
+    """Return what decodes a channel; BagReadError for a type or an encoding not decoded here."""
+    schema, channel = stored.schema, stored.channel
+    encodings = channel.message_encoding, schema.encoding if schema else 'no schema'
+    if schema is None or encodings != (MessageEncoding.CDR, SchemaEncoding.ROS2):
+        raise BagReadError(f'topic {channel.topic!r} is encoded as {encodings[0]!r} with '
+                           f'{encodings[1]!r}, only cdr with ros2msg is decoded here')
+    try:
+        return _decoder(type_name(stored), schema.data)
+    except Exception as error:
+        # the parser fails in many ways on the definition of another recorder
+        raise BagReadError(f'the definition stored for {channel.topic!r} does not parse '
+                           f'({reason(error)})') from error
 
 
 def type_name(stored: StoredMessage) -> str:

@@ -3,6 +3,7 @@
 
 """A loop's measurements with the input that acted on them, cut from bags into episodes."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 import math
@@ -20,7 +21,7 @@ from koopman_ros.records.align import align_by_timestamp, AlignedSamples, named
 from koopman_ros.records.applied_inputs import Applied
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.import_spec import (
-    EpisodeBreaks,
+    break_notes,
     ImportReport,
     places_of,
     RecordedInput,
@@ -88,13 +89,13 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
         and for states without stamps whose receipts run at another pace than /clock in the bag.
     """
     for bag in distinct(bags, account):
-        loop = _Loop(os.fspath(bag), states, inputs, account, tolerance_ns,
-                     least_jumps or [0.0] * len(states))
-        for segment in loop.segments():
-            for episode in loop.episodes(segment):
+        imported = _BagImport(os.fspath(bag), states, inputs, account, tolerance_ns,
+                              least_jumps or [0.0] * len(states))
+        for segment in imported.segments():
+            for episode in imported.episodes(segment):
                 account.used += len(states) * len(episode)
                 yield episode
-        account.notes += loop.breaks.notes(loop.bag)
+        account.notes += break_notes(imported.bag, imported.breaks)
     account.dropped = +account.dropped
 
 
@@ -111,8 +112,8 @@ def distinct(bags: Sequence[str | os.PathLike[str]], account: ImportReport
 
 
 @dataclass
-class _Loop:
-    """One bag with the signals of a loop."""
+class _BagImport:
+    """The import of one bag: its signals aligned, and cut into episodes."""
 
     bag: str
     states: Sequence[RecordedState]
@@ -120,7 +121,9 @@ class _Loop:
     account: ImportReport
     tolerance_ns: int
     least_jumps: Sequence[float]
-    breaks: EpisodeBreaks = field(default_factory=EpisodeBreaks)
+    #: ends of episodes by reason: amount, and this in words
+    breaks: defaultdict[str, list[tuple[float, str]]] = field(
+        default_factory=lambda: defaultdict(list))
 
     def __post_init__(self) -> None:
         self.content: BagSummary = summary(self.bag)
@@ -163,12 +166,12 @@ class _Loop:
             read += 1
             for number, place, limits in topics[message.topic]:
                 self.account.measurements += number < n_x
-                if (found := self._accepted(message, place, *limits)) is None:
+                if (accepted := self._accepted(message, place, *limits)) is None:
                     continue
-                stamp_ns, value = found
+                stamp_ns, value = accepted
                 if back_ns := segment.set_back(number, stamp_ns):
                     back = back_ns / NANOSECONDS
-                    self.breaks.add('set back', f'{back:.3f} s', back)
+                    self.breaks['set back'].append((back, f'{back:.3f} s'))
                     yield segment
                     segment = Segment(places, n_x)
                 segment.add(number, stamp_ns, message.log_time_ns, value)
@@ -221,17 +224,17 @@ class _Loop:
         clock = segment.clock()
         samples = align_by_timestamp(segment, clock, self.states, self.tolerance_ns, dropped)
         stamps, x = samples.stamps, samples.x
-        heard = all(any(len(segment.of(place)) or place in segment.applied
-                        for place in places_of(signal)) for signal in self.inputs)
-        if len(stamps) < _SHORTEST or not heard:
+        has_inputs = all(any(len(segment.of(place)) or place in segment.applied
+                             for place in places_of(signal)) for signal in self.inputs)
+        if len(stamps) < _SHORTEST or not has_inputs:
             dropped['too short, or without any input'] += x.size
             return
         spike = self._leaps(x)[0]
-        odd = spike.any(axis=1)
+        spiked = spike.any(axis=1)
         for state, count in zip(self.states, spike.sum(axis=0).tolist(), strict=True):
             dropped[named(self.states, state, 'spike of a single sample')] += count
-        dropped['beside a spike'] += n_x * int(np.sum(odd)) - int(np.sum(spike))
-        stamps, x = stamps[~odd], x[~odd]
+        dropped['in a sample with a spike'] += n_x * int(np.sum(spiked)) - int(np.sum(spike))
+        stamps, x = stamps[~spiked], x[~spiked]
         period = float(np.median(np.diff(stamps)))
         ends = self._ends(stamps, x, period)
         recorded = [(self._commands(segment, signal, samples, clock, period),
@@ -240,11 +243,11 @@ class _Loop:
             times = stamps[rows]
             applied = [self._applied(signal.name, *both, times, period)
                        for signal, both in zip(self.inputs, recorded, strict=True)]
-            known = times >= max(start for start, _ in map(applied_inputs.span, applied))
+            started = times >= max(start for start, _ in map(applied_inputs.span, applied))
             within = times <= min(end for _, end in map(applied_inputs.span, applied))
-            dropped['before the first input'] += n_x * int(np.sum(~known))
+            dropped['before the first input'] += n_x * int(np.sum(~started))
             dropped['after the last input'] += n_x * int(np.sum(~within))
-            rows = rows[known & within]
+            rows = rows[started & within]
             if len(rows) < _SHORTEST:
                 dropped[f'in a segment of fewer than {_SHORTEST}'] += n_x * len(rows)
                 continue
@@ -259,12 +262,12 @@ class _Loop:
             at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
             if gap[end]:
                 seconds = (stamps[end] - stamps[end - 1]) / NANOSECONDS
-                self.breaks.add('gap', f'{seconds:.3f} s {at}', seconds)
+                self.breaks['gap'].append((seconds, f'{seconds:.3f} s {at}'))
             else:
                 j = int(np.argmax(jump[end]))
                 state = self.states[j]
                 level = named(self.states, state, f'{x[end, j]:.6g} {state.place.unit}')
-                self.breaks.add('jump', f'{level} {at}', float(x[end, j]))
+                self.breaks['jump'].append((float(x[end, j]), f'{level} {at}'))
         return ends
 
     def _episode(self, stamps: Times, x: Array, applied: Sequence[Applied]) -> Episode:

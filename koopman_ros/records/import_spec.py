@@ -4,8 +4,9 @@
 """The signals to import from bags, and the account of an import."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 from koopman_ros.core.message_fields import MessageField
 
@@ -70,25 +71,16 @@ def places_of(signal: RecordedState | RecordedInput) -> list[MessageField]:
     return [signal.command] if signal.measured is None else [signal.command, signal.measured]
 
 
-@dataclass
-class EpisodeBreaks:
-    """The ends of episodes in a bag by reason: how often, the first and the largest."""
+#: The ends of episodes in a bag: by reason, each with its amount and this in words.
+EpisodeBreaks = Mapping[str, Sequence[tuple[float, str]]]
 
-    _found: dict[str, tuple[int, str, str, float]] = field(default_factory=dict)
 
-    def add(self, kind: str, words: str, amount: float) -> None:
-        """Take one in, with its amount in words."""
-        count, first, largest, most = self._found.get(kind, (0, words, words, amount))
-        self._found[kind] = (count + 1, first, *((words, amount) if amount > most
-                                                 else (largest, most)))
-
-    def notes(self, bag: str) -> Iterator[str]:
-        """Yield one sentence for each kind, however often it happened."""
-        for kind, (words, most) in _ENDS.items():
-            if kind not in self._found:
-                continue
-            count, first, largest, _ = self._found[kind]
-            happened = f'{bag}: {words.format(first)}'
-            yield f'{happened}, a new episode begins' if count == 1 else (
-                f'{happened}, the first of {count}, {most.format(largest)}; a new episode begins '
-                'at each')
+def break_notes(bag: str, breaks: EpisodeBreaks) -> Iterator[str]:
+    """Yield one sentence for each reason, however often it ended an episode."""
+    for kind, (words, most) in _ENDS.items():
+        if found := breaks.get(kind):
+            _, first = found[0]
+            _, largest = max(found, key=itemgetter(0))
+            yield f'{bag}: {words.format(first)}, ' + (
+                'a new episode begins' if len(found) == 1 else
+                f'the first of {len(found)}, {most.format(largest)}; a new episode begins at each')

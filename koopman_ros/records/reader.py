@@ -10,14 +10,13 @@ import heapq
 import os
 from pathlib import Path
 from typing import NamedTuple
-import warnings
 
 from mcap.records import Channel, Schema
 from rosbags.interfaces import Qos
 
 from koopman_ros.core.message_fields import full_type_name
 from koopman_ros.records.bag_files import locate
-from koopman_ros.records.decoding import BagMessage, Decoders, UndecodableError
+from koopman_ros.records.decoding import BagMessage, decoded_messages
 from koopman_ros.records.mcap_file import BagReadError, opened, stored_messages, summary_section
 from koopman_ros.records.metadata import parse_offered_qos
 
@@ -66,7 +65,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     if isinstance(topics, str):
         raise TypeError(f'topics must be a collection of names: pass [{topics!r}]')
     files, _ = locate(path, recover=recover)
-    return _decoded(files, None if topics is None else frozenset(topics), recover)
+    return decoded_messages(files, None if topics is None else frozenset(topics), recover)
 
 
 def in_log_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
@@ -114,25 +113,6 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
                 offers[channel.topic] = offered
     return BagSummary(dict(counts), types, offers, min(times_ns, default=None),
                       max(times_ns, default=None), complete)
-
-
-def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
-             ) -> Iterator[BagMessage]:
-    undecoded: set[str] = set()
-    for file in files:
-        # of each file by itself: identifiers of channels are a file's own
-        decoders = Decoders(file)
-        for stored in stored_messages(file, recover=recover, topics=topics):
-            try:
-                yield decoders.decode(stored)
-            except UndecodableError as error:
-                if topics is not None:
-                    raise
-                if stored.channel.topic not in undecoded:
-                    undecoded.add(stored.channel.topic)
-                    warnings.warn(f'messages on {stored.channel.topic!r} are given as bytes '
-                                  f'alone: {error}', stacklevel=2)
-                yield decoders.undecoded(stored)
 
 
 class _Content(NamedTuple):

@@ -10,7 +10,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.message_fields import KNOWN_TYPES, MessageField
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.mcap_file import BagReadError, reason
@@ -36,37 +36,24 @@ class Series:
     unit: str  #: of the numbers
 
 
-def read_series(path: str | os.PathLike[str], place: MessageField | str, *, recover: bool = False
+def read_series(path: str | os.PathLike[str], place: MessageField, *, recover: bool = False
                 ) -> Series:
     """
     Return a signal of a bag as arrays; `recover` is that of `read_messages`.
 
-    :param place: of the number, or the name of its topic where the type alone tells field and
-        unit, as a temperature does. Messages without the number are left out.
+    Messages without the number are left out.
+
     :raises BagReadError: as `read_messages` does, and for a topic that the bag does not hold or
         that is of another type.
     """
-    topic = place if isinstance(place, str) else place.topic
-    # first, for what it says of a bag that is none
-    messages = read_messages(path, [topic], recover=recover)
-    content = summary(path)
-    if isinstance(place, str):
-        place = _usual(path, content, place)
-    check_places(path, content, [place])
+    # before the summary, which tolerates damage
+    messages = read_messages(path, [place.topic], recover=recover)
+    check_places(path, summary(path), [place])
     found = [(entry, stamped_number(path, entry, place)) for entry in messages]
     numbers = [(entry.log_time_ns if stamp is None else stamp, value)
                for entry, (stamp, value) in found if value is not None]
     return Series(np.array([stamp for stamp, _ in numbers], dtype=np.int64),
                   np.array([value for _, value in numbers], dtype=np.float64), place.unit)
-
-
-def _usual(path: str | os.PathLike[str], content: BagSummary, topic: str) -> MessageField:
-    """Return where the number is in messages of a topic whose type tells it."""
-    known = {name: row for name, row in KNOWN_TYPES.items() if row.unit}
-    kind = content.types.get(topic, next(iter(known)))
-    if kind not in known:
-        raise _other_type(path, topic, kind, ' or '.join(known))
-    return MessageField(topic, kind, known[kind].field, known[kind].unit)
 
 
 def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iterable[MessageField]

@@ -40,13 +40,18 @@ from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerPar
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.signals import MeasuredInputs, SignalPublisher, SignalSample, SignalSubscriber
+from koopman_ros.ros.signals import (
+    InputWait,
+    MeasuredInputs,
+    SignalPublisher,
+    SignalSample,
+    SignalSubscriber,
+)
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _TICK = 0.1  # s
 _DEVIATIONS = 10  # commands of a controller, and
 _DEVIATION_TIME = 1.0  # s, after which it is said not to follow
-_INPUT_WAIT = 0.5  # s that the first measurement waits for the present inputs
 _RETURN_TIME = 2.0  # s for the way back at the end of the process
 _ACKNOWLEDGE_TIME = 0.2  # s for the last command to arrive
 
@@ -89,9 +94,8 @@ class ExperimentRun:
         self._timeout, self._on_end = settings.experiment_timeout, on_end
         self._commanded = commanded
         self._applied = MeasuredInputs(self._units)
-        # the first measurement, while the present inputs are not known, and when it came
-        self._first: tuple[int, Array, str] | None = None
-        self._first_at = math.inf
+        self._wait = InputWait[tuple[int, Array, str]](
+            node, self._inputs_missing, lambda sample: self._answer(*sample))
         self._frame_id, self._received_at = '', time.monotonic()
         self._sent: Array | None = None
         self._monitors = [TrackingMonitor(span)
@@ -117,6 +121,7 @@ class ExperimentRun:
 
     def destroy(self) -> None:
         """Command no more."""
+        self._wait.clear()
         self._node.destroy_timer(self._timer)
         for publisher in self._publisher.publishers:
             self._node.destroy_publisher(publisher)
@@ -159,14 +164,11 @@ class ExperimentRun:
             f'{self._label(name)} {preposition} {quantity_text(value, unit)}'
             for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True))
 
-    @property
     def _inputs_missing(self) -> bool:
-        """Whether to wait for messages with the present inputs."""
-        if self._inputs is None or time.monotonic() - self._first_at > _INPUT_WAIT:
-            return False
         # a controller answers the first measurement, too
-        return (self._answers is not None and not self._commanded) or (
-            not self._applied.complete and self._inputs.published())
+        return self.progress is None and self._inputs is not None and (
+            (self._answers is not None and not self._commanded)
+            or (not self._applied.complete and self._inputs.published()))
 
     def _present(self, stamp_ns: int) -> Array:
         """
@@ -190,13 +192,7 @@ class ExperimentRun:
 
     def _on_applied(self, received: SignalSample) -> None:
         self._applied.take(received)
-        self._answer_first()
-
-    def _answer_first(self) -> None:
-        """Answer the first measurement once the present inputs are known, or after 0.5 s."""
-        if self._first is not None and not self._inputs_missing:
-            first, self._first = self._first, None
-            self._answer(*first)
+        self._wait.look()
 
     def _label(self, name: str) -> str:
         return name if self._on_setpoints else base_name(name, self._units[name])
@@ -247,10 +243,10 @@ class ExperimentRun:
 
     def _on_measurement(self, received: SignalSample) -> None:
         if (whole := self._assembler.take(received.stamp_ns, received.values)) is not None:
-            self._answer(*whole, received.frame_id)
+            self._wait.take((*whole, received.frame_id))
 
     def _answer(self, stamp_ns: int, measured: Array, frame_id: str) -> None:
-        if self.progress is None and not self._started(stamp_ns, measured, frame_id):
+        if self.progress is None and not self._started(stamp_ns, measured):
             return
         assert self.progress is not None
         newest_ns, was_running = self.progress.time_ns, self.running
@@ -265,13 +261,9 @@ class ExperimentRun:
         if was_running and not self.running:
             self._on_end(None)
 
-    def _started(self, stamp_ns: int, measured: Array, frame_id: str) -> bool:
-        """Start if set-points and inputs are known; return whether the run has started."""
+    def _started(self, stamp_ns: int, measured: Array) -> bool:
+        """Start if the set-points are known; return whether the run has started."""
         if self.started.done() or self._setpoints_missing:
-            return False
-        self._first_at = min(self._first_at, time.monotonic())
-        if self._inputs_missing:
-            self._first = stamp_ns, measured, frame_id
             return False
         if self._on_setpoints:
             self.plan = self._settings.experiment(
@@ -293,7 +285,7 @@ class ExperimentRun:
 
     def _on_command(self, received: SignalSample) -> None:
         """Check that the controller follows the manual commands."""
-        self._answer_first()
+        self._wait.look()
         if self.progress is not None and not self._on_setpoints:
             self._is_followed(received.values, StatusCode.NOT_FOLLOWED)
 
@@ -325,7 +317,7 @@ class ExperimentRun:
 
     def _on_tick(self) -> None:
         """Check for other publishers and for missing measurements."""
-        self._answer_first()
+        self._wait.look()
         why = None
         for topic in dict.fromkeys(self._topics):
             if others := other_publishers(self._node, topic, own=1):

@@ -6,19 +6,15 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from rclpy.timer import Timer
-
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, SignalTopics
 from koopman_ros.ros import topics
-from koopman_ros.ros.hosted import HostedNode, wall_timer
-from koopman_ros.ros.signals import MeasuredInputs, SignalSample, SignalSubscriber
+from koopman_ros.ros.hosted import HostedNode
+from koopman_ros.ros.signals import InputWait, MeasuredInputs, SignalSample, SignalSubscriber
 from koopman_ros.ros.timing import Timing
-
-_PATIENCE = 0.5  # s that the first measurement waits for the measured inputs
 
 
 class Sample(NamedTuple):
@@ -42,17 +38,18 @@ class Measurements:
                  exclusive: Mapping[str, str], tolerance: float,
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals
-        self._node, self._endpoints, self._answer = node, endpoints, answer
+        self._endpoints = endpoints
         self.assembler = SampleSynchronizer(tuple(signals.states), round(tolerance * NANOSECONDS))
         self.applied = MeasuredInputs(signals.inputs)
         self.frame_id, self._frame_length = '', 0
         # by topic of the measurements with one publisher: the numbers of its messages
         self._sources = {place.topic: TimeBase(late=-1) for place in wiring.measured.values()
                          if place.topic in exclusive}
-        self._waiting: list[Sample] = []  # that came before the measured inputs
-        self._patience: Timer | None = None
         self._inputs = SignalSubscriber(
             node, endpoints.subscribe, wiring.applied, signals.inputs, self._on_applied)
+        # the first command begins from them
+        self._wait = InputWait[Sample](node, lambda: (
+            not self._begun() and not self.applied.complete and self._inputs.published()), answer)
         measured = SignalSubscriber(
             node, endpoints.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:
@@ -71,19 +68,19 @@ class Measurements:
         """
         self._timing, self._window, self._begun, self._active = timing, window, begun, True
         self._sources = {topic: TimeBase(late=-1) for topic in self._sources}
-        self._waiting.clear()
+        self._wait.clear()
 
     def end(self) -> None:
         """Hand over no measurement, not even one that waits."""
         self._active = False
-        self._waiting.clear()
+        self._wait.clear()
 
     @property
     def complaint(self) -> str:
         """What is wrong with the messages, or an empty string."""
         return '' if self._frame_length <= LONGEST_FRAME_ID else (
-            f'the frame_id of the measurement has {self._frame_length} characters, of which '
-            f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
+            f'the frame_id of the measurement has {self._frame_length} characters; only '
+            f'the first {LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
 
     def _on_measurement(self, received: SignalSample) -> None:
         self.frame_id = received.frame_id[:LONGEST_FRAME_ID]
@@ -102,23 +99,8 @@ class Measurements:
         sample = Sample(*complete, two_sources=any(
             one.conflict or (one.newest is None and self._endpoints.shared(topic))
             for topic, one in self._sources.items()))
-        # whether the measured inputs will be known in a moment
-        if self._waiting or (not self._begun() and not self.applied.complete
-                             and self._patience is None and self._inputs.published()):
-            self._waiting.append(sample)
-            if self._patience is None:
-                self._patience = wall_timer(self._node, _PATIENCE, self._answer_waiting)
-            return
-        self._answer(sample)
+        self._wait.take(sample)
 
     def _on_applied(self, received: SignalSample) -> None:
         self.applied.take(received)
-        if self._waiting and self.applied.complete:
-            self._answer_waiting()
-
-    def _answer_waiting(self) -> None:
-        if self._patience is not None:
-            self._patience.cancel()
-        waiting, self._waiting = self._waiting, []
-        for sample in waiting:
-            self._answer(sample)
+        self._wait.look()

@@ -76,8 +76,8 @@ class LoopNode(HostedNode):
                 return
             self._clocks_refused += 1
             self.get_logger().warning(
-                f'/clock told sec {told.sec}, nanosec {told.nanosec}, which is no time: ignored '
-                f'({self._clocks_refused} so far); check who publishes /clock',
+                f'/clock has sec {told.sec}, nanosec {told.nanosec}, which is no valid time: '
+                f'ignored ({self._clocks_refused} so far); check who publishes /clock',
                 throttle_duration_sec=10.0)
 
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin

@@ -8,20 +8,25 @@ from dataclasses import dataclass
 from functools import partial
 import inspect
 import math
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import Conversion, conversion, in_steps
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
+from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
+
+_PATIENCE = 0.5  # s that the first samples wait for the measured inputs
+T = TypeVar('T')
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +167,51 @@ class MeasuredInputs:
         """Return the last values (n_u,) if all are of about a time, else None."""
         near = all(abs(self.get(name)[0] - stamp_ns) <= tolerance_ns for name in self._names)
         return self.latest if near else None
+
+
+class InputWait(Generic[T]):
+    """
+    Hold samples back until the measured inputs are known, for at most 0.5 s.
+
+    :param missing: whether inputs that are expected are not known yet.
+    :param answer: called with each sample, at once where nothing is missing.
+    """
+
+    def __init__(self, node: HostedNode, missing: Callable[[], bool],
+                 answer: Callable[[T], None]) -> None:
+        self._node, self._missing, self._answer = node, missing, answer
+        self._waiting: list[T] = []
+        self._timer: Timer | None = None
+        self._waited = False
+
+    def take(self, sample: T) -> None:
+        """Answer a sample, now or later; only the first ones wait."""
+        if not self._waiting and (self._waited or not self._missing()):
+            self._answer(sample)
+            return
+        self._waiting.append(sample)
+        if not self._waited:
+            self._waited = True
+            self._timer = wall_timer(self._node, _PATIENCE, self.release)
+
+    def look(self) -> None:
+        """Answer the samples that wait if nothing is missing any more."""
+        if self._waiting and not self._missing():
+            self.release()
+
+    def release(self) -> None:
+        """Answer the samples that wait."""
+        waiting, self._waiting = self._waiting, []
+        self.clear()
+        for sample in waiting:
+            self._answer(sample)
+
+    def clear(self) -> None:
+        """Forget the samples that wait."""
+        self._waiting.clear()
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
 
 
 class SignalPublisher:

@@ -18,6 +18,7 @@ class SimulatedPlant:
     """
     A plant at its initial state, in its units.
 
+    :ivar process: the simulation in its present state.
     :ivar note: why it does not start from a steady state of its own, or an empty string.
     """
 
@@ -30,7 +31,7 @@ class SimulatedPlant:
             nominal = table.system(table.snapshot({})).nominal_state
             system = table.system(parameters, nominal)
             self.note = f'{error}; the plant starts at {system.describe_state(nominal)} instead'
-        self._process = self._initial(system, time_ns)
+        self.process = self._initial(system, time_ns)
 
     def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
         x = system.nominal_state + self._column('initial_offset')
@@ -42,51 +43,31 @@ class SimulatedPlant:
         return np.array([getattr(self._parameters.states[name], attribute)
                          for name in self.signals.states])
 
-    @property
-    def name(self) -> str:
-        """The name of the plant."""
-        return self._process.system.name
-
-    @property
-    def time_ns(self) -> int:
-        """Its time."""
-        return self._process.time_ns
-
-    @property
-    def inputs(self) -> Array:
-        """(n_u,) applied inputs."""
-        return self._process.u
-
-    @property
-    def commanded(self) -> Array:
-        """(n_u,) commands that the actuators follow."""
-        return self._process.followed
-
     def advance(self, time_ns: int) -> None:
         """Simulate up to an instant; raise IntegrationError for a plant that runs away."""
-        self._process = self._process.until(time_ns)
+        self.process = self.process.until(time_ns)
 
     def skip_to(self, time_ns: int) -> None:
         """Set its time, which stood still."""
-        self._process = replace(self._process, time_ns=max(time_ns, self.time_ns))
+        self.process = replace(self.process, time_ns=max(time_ns, self.process.time_ns))
 
     def command(self, values: Array) -> None:
         """Command the inputs (n_u,)."""
-        self._process = self._process.commanded(values, self.time_ns)
+        self.process = self.process.commanded(values, self.process.time_ns)
 
     def reset(self) -> None:
         """Put it back to its initial state; time goes on."""
-        self._process = self._initial(self._process.system, self.time_ns)
+        self.process = self._initial(self.process.system, self.process.time_ns)
 
     def tune(self, parameters: PlantParameters) -> None:
         """Take over other parameters; the nominal point stays the same, for :meth:`reset`."""
-        self._parameters, before = parameters, self._process.system
+        self._parameters, before = parameters, self.process.system
         try:
             system = self._table.system(parameters)
         except plants.EquilibriumError:
             system = self._table.system(parameters, before.nominal_state)
-        self._process = replace(
-            self._process, actuator=self._table.actuator(parameters), system=replace(
+        self.process = replace(
+            self.process, actuator=self._table.actuator(parameters), system=replace(
                 system, nominal_state=before.nominal_state, nominal_input=before.nominal_input))
 
     def measure(self, sample: int) -> tuple[Array, Array, Array]:
@@ -96,10 +77,10 @@ class SimulatedPlant:
                           for i, one in enumerate(noise.tolist())])
         # the steps of the scale have the variance of a uniform error
         variance = noise ** 2 + resolution ** 2 / 12.0
-        return self._process.x + drawn + self._column('bias'), variance, resolution
+        return self.process.x + drawn + self._column('bias'), variance, resolution
 
     def figures(self) -> dict[str, float]:
         """Return states and inputs with their names and units."""
         inputs = {base_name(name, unit): unit for name, unit in self.signals.inputs.items()}
-        return {**values_by_name(self.signals.states, self._process.x.tolist()),
-                **values_by_name(inputs, self._process.u.tolist())}
+        return {**values_by_name(self.signals.states, self.process.x.tolist()),
+                **values_by_name(inputs, self.process.u.tolist())}

@@ -202,13 +202,20 @@ _PROCESSES = (
                processes.starved, plant=processes.RUNNING, largest_step=processes.RUNNING_STEP,
                settle=100.0, afterwards=100.0, recovery=100.0))
 
-_BAD: tuple[dict[str, Any], ...] = (
-    {'temperature.weight': math.nan}, {'temperature.weight': -1.0}, {'temperature.weight': 1},
-    {f'{_COOLANT}.weight': 0.0}, {f'{_COOLANT}.weight': math.inf}, {f'{_COOLANT}.weight': 'much'},
-    {f'{_COOLANT}.min': 60.0}, {f'{_COOLANT}.max': -10.0}, {f'{_COOLANT}.max': math.nan},
-    {f'{_COOLANT}.rate_limit': -1.0}, {'temperature.setpoint_ramp': -math.inf}, {'max_gain': 0.0},
-    {'max_riccati_residual': -1.0}, {'measurement_timeout': math.nan},
-    {'model': ''}, {'model': '/nowhere/lift.safetensors'}, {'model': 3.0})
+def refused_values(on: FaultPlant) -> list[dict[str, Any]]:
+    """Return parameter values that the controller of a plant must refuse."""
+    common = {'': (('max_gain', 0.0), ('max_riccati_residual', -1.0),
+                   ('measurement_timeout', math.nan), ('model', ''),
+                   ('model', '/nowhere/lift.safetensors'), ('model', 3.0))}
+    states = {f'{name}.': (('weight', math.nan), ('weight', -1.0), ('weight', 1),
+                           ('sensor_min', 1e8)) for name in on.states}
+    setpoints = {f'{name}.': (('setpoint_ramp', -1.0), ('setpoint_ramp', -math.inf))
+                 for name in on.controlled}
+    inputs = {f'{name}.': (('weight', 0.0), ('weight', math.inf), ('weight', 'much'),
+                           ('min', 1e6), ('max', -1e6), ('max', math.nan), ('rate_limit', -1.0),
+                           ('safe_value', math.inf)) for name in on.inputs}
+    return [{prefix + item: wrong} for part in (common, states, setpoints, inputs)
+            for prefix, wrongs in part.items() for item, wrong in wrongs]
 
 
 def _cycled(changes: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -241,7 +248,8 @@ _OPERATORS = (
                              f'{_COOLANT}.rate_limit': (0.02, 1.0)})),
     _parameters('ramps-storm', 'changes of the ramp of the set-point', partial(
         operators.drawn, 2, {'temperature.setpoint_ramp': (-5.0, 1.0)}, True)),
-    _parameters('bad-values-storm', 'parameters that cannot be', partial(_cycled, _BAD), True),
+    _parameters('bad-values-storm', 'parameters that cannot be',
+                lambda: _cycled(refused_values(REACTOR)), True),
     _setpoints('setpoint-storm', ', all the same', *REACTOR.setpoint),
     _setpoints('setpoint-storm-nan', ': NaN', math.nan, code=StatusCode.SETPOINT_NOT_FINITE),
     _setpoints('setpoint-storm-outside', ': 500 and -1e308 degC', 500.0, -1e308,
@@ -326,15 +334,6 @@ def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
               group='clocks')
 
 
-def _refused(on: FaultPlant) -> list[dict[str, Any]]:
-    """Return values that no signal can have."""
-    return [*({f'{name}.{item}': wrong} for name in on.states for item, wrong in (
-        ('weight', math.nan), ('weight', -1.0), ('setpoint_ramp', -1.0), ('sensor_min', 1e8))),
-        *({f'{name}.{item}': wrong} for name in on.inputs for item, wrong in (
-            ('weight', 0.0), ('min', 1e6), ('max', math.nan), ('rate_limit', -1.0),
-            ('safe', math.inf)))]
-
-
 def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
     case = partial(_on, on, 'operators')
 
@@ -363,7 +362,7 @@ def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
         operators.storm_of_parameters,
         make=lambda: itertools.islice(operators.drawn(0, weights, True), 100)))
     yield case('bad-values-storm', f'{REQUESTS} parameters that cannot be, of each signal',
-               partial(operators.storm_of_parameters, make=lambda: _cycled(_refused(on)),
+               partial(operators.storm_of_parameters, make=lambda: _cycled(refused_values(on)),
                        refused=True))
 
 

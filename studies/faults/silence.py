@@ -201,7 +201,7 @@ def hosted(loop: FaultHarness) -> None:
     site.write_text(
         f'/**:\n  ros__parameters: {{system: {loop.on.system}}}\n'
         '/bad/controller:\n'
-        "  ros__parameters: {levels: ['sdre', 'unittest.__main__:main']}\n")
+        "  ros__parameters: {fallback_order: ['sdre', 'unittest.__main__:main']}\n")
     with loop.fault():
         loop.start('host', command=(
             sys.executable, '-m', 'koopman_ros.nodes.controller', '--loops', str(names),

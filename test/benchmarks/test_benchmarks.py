@@ -40,7 +40,7 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> Any:
             ((100, 8),), 0.8, 10.0, 4e3, 1, ('one-state reactor',)))
         patch.setattr(training, 'SOLVERS', {
             name: training.SOLVERS[name] for name in ('ours', 'ipopt', 'adam')})
-        patch.setitem(loop.PLANS, 'quick', loop.LoopPlan(1, 1, 50.0, 12, False))
+        patch.setitem(loop.PLANS, 'quick', loop.LoopPlan(12, False))
         patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
         patch.setitem(recording.PLANS, 'quick', recording.RecordingPlan(1.0, 3000, 1))
         assert main(['--quick', '--output', str(folder)]) == 0
@@ -56,8 +56,6 @@ def test_every_part_leaves_its_figures(figures: dict[str, Any]) -> None:
         assert plan['agreement'][side] < planning.TOLERANCE[side]
         assert found[f'plan_ratio_to_{side}']['pendulum']['median'] == pytest.approx(
             plan[f'{side}_cpu_median_us'] / plan['law_cpu_median_us'])
-    assert found['latency_ratio']['echo'] == {'median': 1.0, 'p99': 1.0}
-    assert min(found['speedup_over_real_time'].values()) > 1.0
     steady = figures['recording']['steady']
     assert (steady['sent'], steady['recorded'], steady['lost']) == (1000, 1000, 0)
     assert steady['in_order']

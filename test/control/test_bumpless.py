@@ -42,10 +42,9 @@ from support.closed_loops import (
     (-1.0, 4.0, 1e-9, np.inf, 4.0, False, False), (-1.0, 4.0, 0.0, np.inf, 4.0, False, False)])
 def test_limits(previous, wanted, seconds, rate, u, at_range, at_rate):
     bounds = InputLimits(np.array([-1.0]), np.array([5.0]), np.array([rate]))
-    limited = limit(bounds, np.array([wanted]), None if previous is None else np.array([previous]),
-                    seconds)
-    assert (limited.u[0], limited.at_range, limited.at_rate) == (
-        pytest.approx(u, rel=1e-15), at_range, at_rate)
+    command, *active = limit(
+        bounds, np.array([wanted]), None if previous is None else np.array([previous]), seconds)
+    assert (command[0], *active) == (pytest.approx(u, rel=1e-15), at_range, at_rate)
 
 
 def step(size: float) -> BumplessTransfer:

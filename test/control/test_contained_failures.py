@@ -30,12 +30,14 @@ from koopman_ros.estimation import (
     ExtendedKalmanFilter,
     UnscentedKalmanFilter,
 )
+from koopman_ros.event_log import records
+from koopman_ros.event_log.loop import replay
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.signal_topics import plant_defaults
 from support.closed_loops import SECOND
 
-SYSTEMS = ('reactor', 'two_state', 'quadruple_tank', 'pendulum')
+SYSTEMS = ('reactor', 'two_state', 'two_tanks', 'quadruple_tank', 'pendulum')
 LEVELS = (('sdre', 'linear'), ('mpc', 'sdre', 'linear'), ('linear',))
 ESTIMATORS = ('disturbance_observer', 'measured_state', 'extended_kalman_filter',
               'unscented_kalman_filter')
@@ -92,7 +94,8 @@ def plugin(monkeypatch):
     return known
 
 
-def tuned(system, measured=None, **parameters):
+def values_of(system, measured=None, **parameters):
+    """Return the parameters of a shipped plant's controller, with some changed, and its model."""
     model = load(model_path(plant_defaults(system, 'controller')['model']))
     given = {'system': system}
     if measured is not None:
@@ -102,7 +105,15 @@ def tuned(system, measured=None, **parameters):
     table = table_of(model, given)
     settings = table.amended(table.snapshot({}), **parameters)
     assert table.check(settings) == ''
-    return built(settings, model)
+    return table.values(settings), model
+
+
+def build(values, model):
+    return built(table_of(model, values).snapshot(values), model)
+
+
+def tuned(system, measured=None, **parameters):
+    return build(*values_of(system, measured, **parameters))
 
 
 class Checked:
@@ -166,7 +177,7 @@ def random_events(controller, rng, count):
                                86400 * SECOND, 0, -period // 2, -3600 * SECOND]))
         now = max(now, SECOND)
         match rng.choice(['usual'] * 6 + ['wild', 'applied', 'wild applied', 'silence',
-                                          'set-point', 'scheduled', 'manual', 'mode',
+                                          'set-point', 'one', 'scheduled', 'manual', 'mode',
                                           'restart']):
             case 'usual':
                 yield Measurement(now, y + rng.uniform(-1.2, 1.2) * half + 0.01 * half
@@ -187,6 +198,9 @@ def random_events(controller, rng, count):
                     model.states.half_widths * model.states.scale)
                 yield SetpointRequest(0, x[controlled] if rng.random() < 0.8 else wild(
                     x[controlled]))
+            case 'one':
+                yield SetpointRequest(0, model.states.center[controlled[:1]],
+                                      controller.controlled.names[:1])
             case 'scheduled':
                 yield SetpointRequest(now + 3 * period, model.states.center[controlled])
             case 'restart':
@@ -204,22 +218,42 @@ CASES = [(system, None, levels, estimator) for system, levels, estimator in iter
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
-def test_random_events_on_every_law_and_estimator_end_in_a_command(system):
+def test_random_events_on_every_law_and_estimator_end_in_a_command_that_a_replay_finds(system):
     """Seeds are the places in the table."""
     for seed, (name, measured, levels, estimator) in enumerate(CASES):
         if name != system:
             continue
-        controller = tuned(system, measured, fallback_order=levels, estimator=estimator)
-        run, rng = Checked(controller), np.random.default_rng(seed)
-        others = [tuned(name, measured, fallback_order=other, estimator=estimator)
-                  for other in LEVELS]
-        for event in random_events(controller, rng, 25):
-            run.do(event)
+        inputs = values_of(name)[1].inputs
+        # some inputs take ten seconds from one limit to the other
+        rates = {f'{one}.rate_limit': width / 10.0 for one, width in zip(
+            inputs.names, (inputs.upper - inputs.lower).tolist(), strict=True) if seed % 2}
+        options = [values_of(name, measured, fallback_order=order, estimator=estimator, **rates)
+                   for order in (levels, *LEVELS)]
+        (values, model), *others = options
+        run, rng = Checked(build(values, model)), np.random.default_rng(seed)
+        texts, commands = [], []
+
+        def write(event, fields, texts=texts):
+            texts.append(records.EventRecord('run', len(texts), event, fields).text())
+
+        write(records.START, records.snapshot(
+            run.state, values, {'name': name, 'digest': 'of the model'}))
+        for event in random_events(run.controller, rng, 25):
+            outcome = run.do(event)
+            if outcome.command is not None:
+                commands.append(outcome.command.tobytes())
+            if not isinstance(event, Silence) or outcome.command is not None:
+                write(*records.fields_of(event, outcome))
             if rng.random() < 0.05:
-                before, run.controller = run.controller, others[rng.integers(len(others))]
+                changed = others[rng.integers(len(others))][0]
+                before, run.controller = run.controller, build(changed, model)
                 run.state = run.controller.switch_to(before, run.state)
+                write(records.PARAMETERS, {'parameters': changed})
         # what is contained should be rare: a numerical cause is mended where it arises
         assert StatusCode.CALCULATION_FAILED not in run.codes, (measured, levels, estimator)
+        found = replay(map(records.parse, texts), lambda *_, model=model: model, build)
+        assert found.lost == []
+        assert [sample.replayed.tobytes() for sample in found.samples] == commands
 
 
 @pytest.mark.parametrize('failure', [*FAILURES, *RESULTS], ids=lambda _: '')

@@ -214,37 +214,22 @@ def test_the_averaged_law_takes_over():
 
 @pytest.mark.parametrize('x', [1.3, -0.8, 1e-3])
 @pytest.mark.parametrize('reference', [0.0, 0.4])
-def test_recentred_law_of_a_free_lift_by_hand(x, reference):
-    model = change_of_variable(gain=0.7)
-    q, r = 2.0, 0.3
-    target = steady_state_target(model, np.array([reference]))
-    t, t_ref = np.tanh(x), np.tanh(reference)
-    J, J_ref = 1.0 - t * t, 1.0 - t_ref * t_ref
-    assert target.u[0] == pytest.approx(t_ref / (0.7 * J_ref), rel=1e-13, abs=1e-15)
-    # e' = -e + (J - J_ref) B u_ref + J B v with e = t - t_ref, and (x - x_ref) = C e
-    C = (x - reference) / (t - t_ref)
-    a = -1.0 + (J - J_ref) * 0.7 * target.u[0] / (t - t_ref)
-    b = 0.7 * J
-    p = r / b ** 2 * (a + np.sqrt(a * a + b * b * q * C * C / r))
-    found = recentred(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
-    assert found.solved
-    assert found.u[0] == pytest.approx(target.u[0] - p * b / r * (t - t_ref), rel=1e-10)
-
-
-@pytest.mark.parametrize('x', [1.3, -0.8])
-def test_recentred_law_of_a_free_lift_under_a_pre_feedback_by_hand(x):
-    """Here dz/dt = -z + J(x) B (u - k x): open loop it has k of the linear drift less."""
-    k, q, r, b, reference = -2.0, 2.0, 0.3, 0.7, 0.4
-    model = replace(change_of_variable(gain=b), pre_feedback=np.array([[k]]))
+@pytest.mark.parametrize('k', [0.0, -2.0])
+def test_recentred_law_of_a_free_lift_by_hand(x, reference, k):
+    """Under a pre-feedback dz/dt = -z + J(x) B (u - k x)."""
+    q, r, b = 2.0, 0.3, 0.7
+    model = replace(change_of_variable(gain=b), pre_feedback=np.array([[k]]) if k else None)
     target = steady_state_target(model, np.array([reference]))
     t, t_ref = np.tanh(x), np.tanh(reference)
     J, J_ref = 1.0 - t * t, 1.0 - t_ref * t_ref
     v_ref = t_ref / (b * J_ref)
-    assert target.u[0] == pytest.approx(v_ref + k * reference, rel=1e-13)
+    assert target.u[0] == pytest.approx(v_ref + k * reference, rel=1e-13, abs=1e-15)
+    # e' = -e + (J - J_ref) B v_ref + J B v with e = t - t_ref, and (x - x_ref) = C e
     C = (x - reference) / (t - t_ref)
     a = -1.0 + (J - J_ref) * b * v_ref / (t - t_ref) - J * b * k * C
     p = r / (b * J) ** 2 * (a + np.sqrt(a * a + (b * J) ** 2 * q * C * C / r))
     found = recentred(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
+    assert found.solved
     assert found.u[0] == pytest.approx(target.u[0] - p * b * J / r * (t - t_ref), rel=1e-10)
     assert found.drift[0, 0] * (x - reference) == pytest.approx(
         model.drift(np.array([x]))[0] - model.drift(np.array([reference]))[0], rel=1e-10)

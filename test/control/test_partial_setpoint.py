@@ -4,7 +4,6 @@
 """Set-points for some of the states: tanks, and other models, whose steady states are known."""
 
 from dataclasses import replace
-import json
 import math
 
 import numpy as np
@@ -13,14 +12,12 @@ from scipy.linalg import expm
 from scipy.optimize import lsq_linear
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
-from koopman_ros.control.events import EventOutcome
 from koopman_ros.control.steady_state import reachable_target
 from koopman_ros.core.status import StatusCode, StatusFormatter
 from koopman_ros.core.units import Displays
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, run_closed_loop, simulate
-from koopman_ros.event_log.records import event_of, EventRecord, fields_of
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.model.observables import PolynomialObservables
 from koopman_ros.plants import Actuator, Process
@@ -414,21 +411,6 @@ def test_a_continuous_loop_goes_to_the_steady_state_of_its_setpoint():
     with pytest.raises(ValueError, match=r'no steady state with y at \[-0\.5\]'):
         run_closed_loop(parabola().model, rate, np.ones(2), np.array([-0.5]), weights, 1.0,
                         controlled=('y',))
-
-
-def test_the_records_of_requests():
-    def written(event):
-        name, fields = fields_of(event, EventOutcome(State()))
-        return json.loads(json.dumps(fields)), event_of(
-            EventRecord('run', 1, name, json.loads(json.dumps(fields))))
-
-    fields, again = written(SetpointRequest(7, np.array([1.5])))
-    assert fields['signals'] is None
-    assert again.signals is None
-    fields, again = written(SetpointRequest(7, np.array([1.5]), ('h3',)))
-    assert fields['signals'] == ['h3']
-    assert (again.stamp_ns, again.value.tolist(), again.signals) == (7, [1.5], ('h3',))
-
 
 
 @pytest.mark.parametrize(('model', 'controlled', 'asked', 'w'), [

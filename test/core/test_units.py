@@ -24,20 +24,9 @@ def test_values_are_converted(unit: str, wanted: str, value: float, converted: f
     np.testing.assert_allclose(conversion(unit, wanted)(np.full(2, value)), converted, rtol=1e-12)
 
 
-def test_differences_have_no_offset() -> None:
+def test_differences_have_no_offset_and_a_value_without_conversion_keeps_its_bits() -> None:
     assert conversion('degC', 'K').factor == 1.0
     assert conversion('degF', 'K').factor == pytest.approx(5.0 / 9.0, rel=1e-12)
-
-
-@pytest.mark.parametrize(('unit', 'wanted'), [('K', 'degC'), ('degC', 'K')])
-def test_what_is_at_hand_is_what_the_library_says(
-        unit: str, wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    at_hand = conversion(unit, wanted)
-    monkeypatch.setattr('koopman_ros.core.units._AT_HAND', {})
-    assert conversion.__wrapped__(unit, wanted) == at_hand
-
-
-def test_what_is_not_converted_keeps_its_bits() -> None:
     assert math.copysign(1.0, Conversion()(-0.0)) == -1.0
 
 

@@ -237,11 +237,10 @@ def test_what_is_slow_and_cheap_has_not_failed():
 
 
 def test_a_model_keeps_the_loops_in_which_its_law_is_lost():
-    model = too_steady()
-    found = evaluate_closed_loops(model, linear_rate(1.0))
+    found = too_steady_on_its_plant()
     tried = found.tried
     assert tried is not None
-    model = replace(model, verified_loops=tried)
+    model = replace(too_steady(), verified_loops=tried)
     for start, setpoint, lost in zip(found.starts, found.setpoints, found.lost, strict=True):
         assert model.failed_near(start, setpoint) == lost
     assert model.linearised.verified_loops is None

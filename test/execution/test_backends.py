@@ -87,15 +87,13 @@ def test_failures_name_their_task_and_leave_the_place_usable(place):
     assert isinstance(found['zero'], ZeroDivisionError)
     with contextlib.closing(place.run(work, {'a': 1, 'b': 2, 'c': 3})) as closed_early:
         assert next(closed_early) == ('a', 6)
-    assert list(place.run(work, {'next': 1})) == [('next', 6)]
 
-
-def test_an_exception_of_a_watch_is_raised(place):
     def watch(*_):
         raise KeyError
 
     with pytest.raises(KeyError):
         list(place.run(lambda _, __, tell: tell(0), {'a': 0}, watch=watch))
+    assert list(place.run(work, {'next': 1})) == [('next', 6)]
 
 
 def test_a_task_whose_process_dies_is_repeated_and_given_up_at_last(places, tmp_path):

@@ -22,9 +22,7 @@ from koopman_ros.learning.identification import (
     DriftModel,
     identify,
     longest_step,
-    prediction_error,
     Segments,
-    Stopped,
 )
 from koopman_ros.learning.identification.drift import steady_point
 from koopman_ros.learning.lift.metrics import lifted_rate
@@ -63,12 +61,6 @@ def no_loops(monkeypatch, shipped):
                         **__: passed)
 
 
-def linear_lift(model, slope, input_matrix):
-    """Return the lift N(x) = x with the names and boxes of a model."""
-    return linearised_model(np.array([[slope]]), np.array([[input_matrix]]), model.states,
-                            model.inputs, model.time_unit, Provenance(model.provenance.plant))
-
-
 @pytest.mark.parametrize(('unit', 'seconds'), [('s', 1.0), ('min', 60.0)])
 def test_rate_of_a_lift_in_units(unit, seconds):
     lift = replace(random_lift(n_u=2), time_unit=unit)
@@ -93,27 +85,16 @@ def test_rate_of_a_state_that_has_diverged(shipped):
         rates[[0, 4]], lifted_rate(shipped, 60.0)(x[[0, 4]], u[[0, 4]]), rtol=1e-13)
 
 
-def test_the_shipped_lift_predicts_its_own_plant():
-    shipped = load(model_path('reactor_nz4'))
-    run = driven(reactor(), 8.0, coolant=(281.33, 300.55)).episode()
-    segments = Segments.of([run], longest_step([run]))
-    error = prediction_error(lifted_rate(shipped, 60.0), segments, shipped.states.scale)
-    assert error == pytest.approx([NOISE], rel=0.15)
-
-
-def test_nominal_input_that_is_not_known_is_the_one_that_holds_the_nominal_state(
-        found, trained, shipped):
-    states, inputs = trained.model.states, trained.model.inputs
-    assert states.center == shipped.states.center
-    assert found.drift.rate(states.center, inputs.center) == pytest.approx([0.0], abs=1e-9)
-
-
 def test_a_better_lift_is_accepted(found, trained, shipped):
     decision = evaluate_model(found, trained, shipped, Thresholds())
     assert decision.accepted
     assert (decision.reasons, decision.warnings) == ((), ())
     assert decision.law_check.arrived == decision.law_check.loops == 128
     assert decision.law_check.worst_ratio < 1.01
+    # the nominal input, which was not given, holds the nominal state
+    states, inputs = trained.model.states, trained.model.inputs
+    assert states.center == shipped.states.center
+    assert found.drift.rate(states.center, inputs.center) == pytest.approx([0.0], abs=1e-9)
     # nothing but noise is left of its error, and kelvins of the present one's
     assert decision.rmse == pytest.approx([NOISE], rel=0.15)
     assert decision.noise == pytest.approx([NOISE], rel=0.15)
@@ -133,23 +114,19 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
 
 
 @pytest.mark.usefixtures('no_loops')
-@pytest.mark.parametrize('share', [-1.5, -1.01, -0.99, 0.0, 0.99, 1.01, 4.0])
-def test_what_is_accepted_can_be_loaded_and_what_cannot_is_refused(
-        found, trained, tmp_path, share):
+@pytest.mark.parametrize('share', [-1.01, -0.99, 0.99, 1.01])
+def test_a_model_is_accepted_where_its_file_can_be_loaded(found, trained, tmp_path, share):
     """The nominal input from below all that was recorded to above it, as steady_point gives it."""
     inputs, path = trained.model.inputs, tmp_path / 'lift.safetensors'
     center = 0.5 * (inputs.lower + inputs.upper) + share * 0.5 * (inputs.upper - inputs.lower)
     model = replace(trained.model, inputs=replace(inputs, center=center))
     decision = evaluate_model(found, replace(trained, model=model), None, Thresholds())
-    reasons = [reason for reason in decision.reasons if 'nominal coolant_temperature' in reason]
     save(model, path)
     if abs(share) < 1.0:
-        assert not reasons
+        assert not any('nominal' in reason for reason in decision.reasons)
         load_suitable(str(path))
         return
-    assert not decision.accepted
-    assert re.search(f'record coolant_temperature {"up" if share > 0.0 else "down"} to '
-                     rf'{center[0] - 273.15:.4g} degC', reasons[0])
+    assert f'to {center[0] - 273.15:.4g} degC' in ' '.join(decision.reasons)
     with pytest.raises(ModelFileError, match='the nominal coolant_temperature'):
         load_suitable(str(path))
 
@@ -177,37 +154,27 @@ def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     decision = evaluate_model(found, wrong, shipped, Thresholds(), loops=16)
     assert decision.law_check.share_failed == 1.0
     (reason,) = (reason for reason in decision.reasons if 'controller' in reason)
-    assert reason.startswith('it is no controller of the estimated drift: the law fails in 16 of '
-                             '16 closed loops over the box (')
-    assert 'not arriving' in reason
+    assert 'the law fails in 16 of 16 closed loops' in reason
     assert f'{decision.law_check.region}' in reason
-
-
-def test_loops_that_are_ended_leave_no_decision(found, trained, shipped):
-    with pytest.raises(Stopped):
-        evaluate_model(found, trained, shipped, Thresholds(), watch=lambda share: share > 0.5)
 
 
 @pytest.mark.usefixtures('no_loops')
 def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, trained):
-    diverging = linear_lift(trained.model, 1e4, 1.0)
+    model = trained.model
+    diverging = linearised_model(np.array([[1e4]]), np.array([[1.0]]), model.states, model.inputs,
+                                 model.time_unit, Provenance(model.provenance.plant))
     decision = evaluate_model(found, trained, diverging, Thresholds())
     assert decision.current_rmse == [np.inf]
     assert decision.accepted
     decision = evaluate_model(found, replace(trained, model=diverging), diverging, Thresholds())
-    assert 'its error on held-out records, inf K, is not 10 % below that of the present model' in (
-        ' '.join(decision.reasons))
+    assert 'inf K, is not 10 % below that of the present model' in ' '.join(decision.reasons)
 
 
-@pytest.mark.parametrize(('values', 'words'), [
-    ({'margin': 1.0}, r'margin = 1.0 must be in \[0, 1\)'),
-    ({'margin': -0.1}, 'margin = -0.1'),
-    ({'margin': float('nan')}, 'margin = nan'),
-    ({'condition': 1.0}, 'condition = 1.0 must be above 1'),
-    ({'condition': float('nan')}, 'condition = nan'),
-])
-def test_thresholds_out_of_range(values, words):
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize('values', [
+    {'margin': 1.0}, {'margin': -0.1}, {'margin': float('nan')}, {'condition': 1.0},
+    {'condition': float('nan')}], ids=str)
+def test_thresholds_out_of_range(values):
+    with pytest.raises(ValueError, match='must be'):
         Thresholds(**values)
 
 
@@ -218,56 +185,47 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     found = identify(shipped.plant, [run.episode()], degrees=(1, 2), methods=methods(20))
     decision = evaluate_model(found, trained, shipped, Thresholds())
     coloured, warning = decision.warnings
-    # what is not measured moves slowly
-    assert coloured.startswith('the noise of temperature is coloured (autocorrelation 0.')
-    assert warning.startswith(
-        f'the best drift errs by {decision.drift_rmse[0]:.3g} K in temperature, of which ')
-    assert 'something that is not measured acts too' in warning
+    assert coloured.startswith('the noise of temperature is coloured')
+    assert f'errs by {decision.drift_rmse[0]:.3g} K in temperature' in warning
     # the noise is told apart from it
     assert decision.noise == pytest.approx([0.03], rel=0.15)
     assert decision.drift_rmse > 1.5 * decision.noise
-    # it is judged by what it does, not by the warning
-    assert warning not in decision.reasons
+    assert not {coloured, warning} & set(decision.reasons)
 
 
 @pytest.mark.usefixtures('no_loops')
-def test_noise_that_is_coloured_is_named(found, trained, shipped):
+@pytest.mark.parametrize('colour', [0.0, 0.8])
+def test_noise_that_is_coloured_is_named(found, trained, shipped, colour):
     """The autocorrelation of n_k = 0.8 n_(k-1) + e_k is 0.8."""
-    rng = np.random.default_rng(0)
-
-    def noisy(colour):
-        episodes = []
-        for clean in found.held_out:
-            n = rng.standard_normal(len(clean))
-            for k in range(1, len(n)):
-                n[k] = colour * n[k - 1] + np.sqrt(1.0 - colour ** 2) * n[k]
-            segments = Segments.of([clean], longest_step([clean]))
-            path = segments.path(found.drift.rate, clean.x[:1])[segments.measured[:, 0], 0]
-            episodes.append(replace(clean, x=path + NOISE * n[:, None]))
-        return evaluate_model(replace(found, held_out=tuple(episodes)), trained, shipped,
+    rng, episodes = np.random.default_rng(0), []
+    for clean in found.held_out:
+        n = rng.standard_normal(len(clean))
+        for k in range(1, len(n)):
+            n[k] = colour * n[k - 1] + np.sqrt(1.0 - colour ** 2) * n[k]
+        segments = Segments.of([clean], longest_step([clean]))
+        path = segments.path(found.drift.rate, clean.x[:1])[segments.measured[:, 0], 0]
+        episodes.append(replace(clean, x=path + NOISE * n[:, None]))
+    decision = evaluate_model(replace(found, held_out=tuple(episodes)), trained, shipped,
                               Thresholds())
-
-    assert noisy(0.0).warnings == ()
-    (said, *_) = noisy(0.8).warnings
-    match = re.match(r'the noise of temperature is coloured \(autocorrelation (0\.\d\d) from '
-                     r'sample to sample .*it tells as much as (\d+) % of the samples', said)
+    if not colour:
+        assert decision.warnings == ()
+        return
+    match = re.search(r'temperature is coloured \(autocorrelation (0\.\d\d).* (\d+) % of its '
+                      'samples', decision.warnings[0])
     # of three segments of 60 samples, whose starts are fitted
     r = float(match[1])
     assert r == pytest.approx(0.8, abs=0.2)
     assert float(match[2]) == pytest.approx(100.0 * (1.0 - r) / (1.0 + r), abs=1.0)
 
 
-@pytest.mark.parametrize(('wanted', 'words'), [
-    ({}, ()), ({'temperature': (306.0, 326.0)}, ()),
-    # by less than a twentieth of 20 K
-    ({'temperature': (306.0, 327.9)}, ()),
-    ({'temperature': (306.0, 329.5)}, ('temperature was trained from 31.85 degC to 53.85 degC, '
-                                       'set-points are wanted from 32.85 degC to 56.35 degC',)),
-    ({'temperature': (290.0, 326.0)}, ('temperature was trained from',))])
-def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, words):
-    said = uncovered_setpoints(shipped.states, wanted)
-    assert len(said) == len(words)
-    assert all(text.startswith(word) for text, word in zip(said, words, strict=True))
+@pytest.mark.parametrize(('wanted', 'said'), [
+    # the second by less than a twentieth of 20 K
+    ((306.0, 326.0), ''), ((306.0, 327.9), ''), ((306.0, 329.5), '32.85 degC to 56.35 degC'),
+    ((290.0, 326.0), '16.85 degC to 52.85 degC')])
+def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, said):
+    warnings = uncovered_setpoints(shipped.states, {'temperature': wanted})
+    assert len(warnings) == bool(said)
+    assert said in ''.join(warnings)
 
 
 # The steady point and the samples of a drift.
@@ -275,15 +233,17 @@ def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, words):
 BOX = box([-1.0], [3.0], [-2.0], [2.0])
 
 
-def cubic(c0=0.5):
-    """Return dx/dt = c0 - x + 0.3 x^2 - 0.2 x^3 + 1.5 u as a drift model."""
-    middle, half = BOX.states.center, BOX.states.scale
-    xi = np.linspace(-1.0, 1.0, 4)
-    x = middle + half * xi
-    f = c0 - x + 0.3 * x ** 2 - 0.2 * x ** 3
-    rest = 1.5 * BOX.inputs.center
-    coefficients = np.polynomial.polynomial.polyfit(xi, (f + rest) / half, 3)
-    return DriftModel(BOX, 3, coefficients[:, None], BOX.input_matrix(np.array([[1.5]])))
+def drift_model(within, degree, f, input_matrix):
+    """Return the drift model of f(x) + B u, with f a polynomial of the states in units."""
+    model = DriftModel(within, degree, np.empty(0), within.input_matrix(np.array(input_matrix)))
+    xi = np.random.default_rng(0).uniform(-1.0, 1.0, (50, len(within.states)))
+    rate = f(within.states.to_physical(xi)) + within.inputs.center @ np.array(input_matrix).T
+    return replace(model, coefficients=np.linalg.lstsq(
+        model.features(xi), rate / within.states.scale, rcond=None)[0])
+
+
+def bent(x):
+    return 0.5 - x + 0.3 * x ** 2 - 0.2 * x ** 3
 
 
 def held(drift, x0, u, count=60, period=0.1):
@@ -295,25 +255,16 @@ def held(drift, x0, u, count=60, period=0.1):
 
 
 def test_steady_point_keeps_a_state_that_an_input_can_hold():
-    drift = cubic()
-    x, u = steady_point(drift, np.array([1.2]), np.array([0.0]))
+    x, u = steady_point(drift_model(BOX, 3, bent, [[1.5]]), np.array([1.2]), np.array([0.0]))
     assert x == pytest.approx([1.2], abs=1e-12)
-    f = 0.5 - 1.2 + 0.3 * 1.2 ** 2 - 0.2 * 1.2 ** 3
-    assert u == pytest.approx([-f / 1.5], abs=1e-12)
+    assert u == pytest.approx([-bent(1.2) / 1.5], abs=1e-11)
 
 
 def test_steady_point_of_two_states_and_one_input():
-    # dx1/dt = -x1 + x2, dx2/dt = -x2 - x1^2 + u on a box of halves of the width 2 and 4
-    wide = box([-2.0, -4.0], [2.0, 4.0], [-5.0], [5.0])
-    drift = DriftModel(wide, 2, np.zeros((6, 2)), wide.input_matrix(np.array([[0.], [1.]])))
-    # each monomial is known by its values at three points: x1, x2 and x1^2
-    orders = {tuple(row): k for k, row in enumerate(
-        np.round(drift.features(np.array([[0.5, 1.0], [1.0, 0.5], [0.5, 0.5]])), 12).T)}
-    for (values, row, value) in (((0.5, 1.0, 0.5), 0, -1.0), ((1.0, 0.5, 0.5), 0, 2.0),
-                                 ((1.0, 0.5, 0.5), 1, -1.0), ((0.25, 1.0, 0.25), 1, -1.0)):
-        drift.coefficients[orders[values], row] = value
-    probe = np.array([1.5, -2.0])
-    assert drift.rate(probe, np.array([0.7])) == pytest.approx([-3.5, 2.0 - 2.25 + 0.7])
+    """Of dx1/dt = -x1 + x2 and dx2/dt = -x2 - x1^2 + u, on a box of half-widths 2 and 4."""
+    drift = drift_model(
+        box([-2.0, -4.0], [2.0, 4.0], [-5.0], [5.0]), 2,
+        lambda x: np.stack([x[:, 1] - x[:, 0], -x[:, 1] - x[:, 0] ** 2], 1), [[0.0], [1.0]])
     x, u = steady_point(drift, np.array([1.0, 1.6]), np.array([2.0]))
     assert x[0] == pytest.approx(x[1], abs=1e-9)
     assert u == pytest.approx(x[1:] + x[0] ** 2, abs=1e-8)
@@ -322,12 +273,8 @@ def test_steady_point_of_two_states_and_one_input():
 
 
 def test_steady_point_finds_the_root_where_the_input_does_nothing():
-    # with one state and an input without effect only the state can move
-    drift = cubic()
-    still = DriftModel(BOX, 3, drift.coefficients, np.zeros((1, 1)))
-    x, u = steady_point(still, np.array([1.0]), np.array([0.3]))
-    root = brentq(lambda x: 0.5 - x + 0.3 * x ** 2 - 0.2 * x ** 3, -1.0, 3.0, xtol=1e-14)
-    assert x == pytest.approx([root], abs=1e-9)
+    x, u = steady_point(drift_model(BOX, 3, bent, [[0.0]]), np.array([1.0]), np.array([0.3]))
+    assert x == pytest.approx([brentq(bent, -1.0, 3.0, xtol=1e-14)], abs=1e-9)
     assert u == pytest.approx([0.3])
 
 
@@ -340,16 +287,15 @@ def test_no_steady_point(coefficients):
 
 
 def test_samples_lie_on_the_paths_of_the_drift():
-    drift = cubic()
-    records = tuple(held(drift, x0, u) for x0, u in ((2.5, -1.0), (-0.5, 1.5), (0.3, 0.2)))
-    noisy = tuple(Episode(r.time, r.x + 0.05 * np.random.default_rng(k).standard_normal(r.x.shape),
-                          r.input_time, r.u) for k, r in enumerate(records))
+    drift = drift_model(BOX, 3, bent, [[1.5]])
+    records = [held(drift, x0, u) for x0, u in ((2.5, -1.0), (-0.5, 1.5), (0.3, 0.2))]
+    noisy = tuple(replace(r, x=r.x + 0.05 * np.random.default_rng(k).standard_normal(r.x.shape))
+                  for k, r in enumerate(records))
     samples = drift_samples(drift, noisy)
     assert len(samples) == 3 * 59
     assert np.array_equal(samples.dxdt, drift.rate(samples.x, samples.u))
     # free of the noise: the start of each path is fitted to 60 measurements of it
-    true = np.concatenate([r.x[:-1] for r in records])
-    error = samples.x - true
+    error = samples.x - np.concatenate([r.x[:-1] for r in records])
     assert np.sqrt(np.mean(error ** 2)) < 0.05 / 4.0
     # shares take part in turn, so that each covers the range
     assert np.array_equal(samples.episode[:12], [*range(10), 0, 1])
@@ -375,14 +321,9 @@ def test_samples_fill_the_range_and_few_are_all_kept():
                          np.linspace(-1.0, 1.0, 40)])[:, None]
     kept = _spread(xi)
     assert len(kept) <= 2000
-    assert np.all(np.diff(kept) > 0)
     # all that is rare is kept
     assert set(kept) >= {i for i in range(5000, 5040) if abs(xi[i, 0]) > 0.15}
-    counts = np.histogram(xi[kept, 0], bins=20, range=(-1.0, 1.0))[0]
-    assert counts.min() == 2
-    assert counts.max() <= 1000
-    xi = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 2))
-    assert np.array_equal(_spread(xi), np.arange(300))
+    xi = np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 4))
+    assert np.array_equal(_spread(xi[:300, :2]), np.arange(300))
     # of four states nearly every sample has a cell of its own
-    kept = _spread(np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 4)))
-    assert 1000 < len(kept) <= 2000
+    assert 1000 < len(_spread(xi)) <= 2000

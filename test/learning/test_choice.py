@@ -55,12 +55,11 @@ class Given:
 def test_the_best_start_wins_and_is_what_the_next_round_extends():
     recorded, everything = Recorded(RECIPE), unforced_samples()
     trained = train(UNFORCED, everything, recorded, starts=4, seed=3)
-    seeds = [seed for n_z in (2, 3) for seed, _, _ in recorded.found[n_z]]
-    assert len(set(seeds)) == 8
+    assert len({seed for n_z in (2, 3) for seed, _, _ in recorded.found[n_z]}) == 8
     assert all(parent is None for _, parent, _ in recorded.found[2])
     parents = {id(parent) for _, parent, _ in recorded.found[3]}
-    winner = [grown for _, _, grown in recorded.found[2] if id(grown) in parents]
-    assert len(parents) == len(winner) == 1
+    assert parents < {id(grown) for _, _, grown in recorded.found[2]}
+    assert len(parents) == 1
     validation = split_by_episode(everything, 0)[1]
 
     def score(model):
@@ -83,8 +82,6 @@ def test_a_start_without_a_result_is_no_candidate(change, words):
         recorded = Recorded(replace(SMALL, max_iterations=5))
         train(UNFORCED, unforced_samples(), recorded, starts=1)
         given = replace(recorded.found[2][0][2], **change)
-    # a ValueError to whoever does not know it
-    assert issubclass(TrainingFailed, ValueError)
     with pytest.raises(TrainingFailed, match=f'no start gave a usable lift with n_z = 2: {words}'):
         train(UNFORCED, unforced_samples(), Given(given), starts=2)
 
@@ -92,10 +89,7 @@ def test_a_start_without_a_result_is_no_candidate(change, words):
 def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    with pytest.raises(TrainingFailed, match=r'the lift with n_z = 2 does not predict the motion '
-                       r'better than a linear model \(relative error rx = '
-                       r'[0-9.e-]+ against [0-9.e-]+ on validation .*wider '
-                       r'range$'):
+    with pytest.raises(TrainingFailed, match='n_z = 2 does not predict the motion better'):
         train(BENT, linear, SMALL, starts=1)
     trained = train(BENT, linear, SMALL, starts=1, refuse=False)
     # both are exact, to rounding: which has less of it depends on the processor
@@ -103,40 +97,27 @@ def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
     assert trained.law_check is None
 
 
-def test_a_held_out_episode_at_rest():
-    at_rest = bent_samples(5)
-    x = np.array(at_rest.x)
-    x[at_rest.episode == split_by_episode(at_rest, 0)[1].episode[0]] = 3.3
-    with pytest.raises(ValueError, match='30 samples do not tell 2 coordinates apart'):
-        train(BENT, replace(at_rest, x=x), SMALL)
-
-
 def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     """Two free coordinates can be x1 and x1^2, whose rw is 0 and which do not hold x2."""
     plant, samples = small_plants.TWO_STATE, small_plants.two_state_samples(400)
     exact = IncrementalTraining(3, identity=False, decoder=0, max_iterations=150)
-    with pytest.raises(TrainingFailed,
-                       match=r'does not predict the motion better than a linear .*, '
-                       r'or use identity coordinates$'):
+    with pytest.raises(TrainingFailed, match='or use identity coordinates'):
         train(plant, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
     kept = train(plant, samples, replace(exact, identity=True), starts=1, loops=0)
     assert kept.figures.fit.rx < 1e-6
 
 
-def test_a_lift_whose_law_goes_nowhere_is_no_controller():
+@pytest.mark.parametrize(('recipe', 'remedies'), [
+    (RECIPE, 'a smaller n_z, more'), (
+        replace(SMALL, identity=False), 'identity coordinates, a smaller n_z, more')])
+def test_a_lift_whose_law_goes_nowhere_is_no_controller(recipe, remedies):
     """The drift x + 0.3 x^2 runs away, and the input does nothing to it."""
     samples = bent_samples()
     x = samples.x - 3.0
     runaway = replace(samples, dxdt=x + 0.3 * x * x)
-    plant = replace(BENT, B=np.zeros((1, 1)))
-    for recipe, more in ((SMALL, 'more starts'), (RECIPE, 'a smaller n_z, more starts'), (
-            replace(SMALL, identity=False), 'identity coordinates, a smaller n_z, more starts')):
-        # what is so already is not advised
-        with pytest.raises(TrainingFailed, match=(
-                rf'the lift with n_z = {recipe.n_z} is no controller: no law arrives in any of '
-                rf'\d+ closed loops over the box.*: use {more}, or a narrower range$')):
-            train(plant, runaway, recipe, starts=1, loops=16)
+    with pytest.raises(TrainingFailed, match=f'n_z = {recipe.n_z} is no controller: .*{remedies}'):
+        train(replace(BENT, B=np.zeros((1, 1))), runaway, recipe, starts=1, loops=16)
 
 
 # Watching, and interrupting.
@@ -155,22 +136,19 @@ def watched(stop=lambda now: False, recipe=RECIPE, starts=2):
 
 def test_the_watch_sees_rounds_starts_steps_and_the_best_so_far():
     trained, seen = watched()
-    assert {now.total for now in seen} == {4}
-    steps = [now for now in seen if now.iteration]
+    assert {now.total for now in seen} == {trained.starts} == {4}
+    steps, ends = ([now for now in seen if bool(now.iteration) is under_way]
+                   for under_way in (True, False))
     for finished, here in itertools.groupby(steps, lambda now: now.finished):
         iterations = [now.iteration for now in here]
         assert iterations == list(range(1, len(iterations) + 1)), finished
     assert all(now.residual > 0.0 for now in steps)
-    ends = [now for now in seen if not now.iteration]
     assert [(now.n_z, now.finished) for now in ends] == [(2, 1), (2, 2), (3, 3), (3, 4)]
-    assert all(math.isnan(now.residual) for now in ends)
     assert ends[1].rw <= ends[0].rw
     assert ends[3].rw <= ends[2].rw
-    assert trained.starts == 4
-    # before the first start has finished there is none
-    assert all(math.isnan(now.rw) for now in seen[:seen.index(ends[0])])
-    between = seen[seen.index(ends[0]) + 1:seen.index(ends[1])]
-    assert {(now.n_z, now.rw) for now in between} == {(2, ends[0].rw)}
+    # there is no best one before the first start has finished
+    assert all(math.isnan(now.rw) for now in steps if not now.finished)
+    assert {now.rw for now in steps if now.finished == 1} == {ends[0].rw}
 
 
 def press_interrupt(now):
@@ -181,11 +159,13 @@ def press_interrupt(now):
         signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize('act', [lambda now: True, press_interrupt],
-                         ids=['the watch', 'the keyboard'])
+interrupts = pytest.mark.parametrize('act', [lambda now: True, press_interrupt],
+                                     ids=['the watch', 'the keyboard'])
+
+
+@interrupts
 @pytest.mark.parametrize(('place', 'n_z', 'starts'), [
-    ((2, 0, 30), 2, 1), ((2, 1, 0), 2, 1), ((2, 1, 5), 2, 2), ((2, 2, 0), 2, 2),
-    ((3, 2, 39), 3, 3), ((3, 3, 0), 3, 3)], ids=str)
+    ((2, 0, 30), 2, 1), ((2, 1, 0), 2, 1), ((2, 1, 5), 2, 2), ((3, 2, 39), 3, 3)], ids=str)
 def test_an_interrupt_keeps_the_best_so_far(act, place, n_z, starts):
     def stop(now):
         return (now.n_z, now.finished, now.iteration) == place and act(now)
@@ -200,8 +180,7 @@ def test_an_interrupt_keeps_the_best_so_far(act, place, n_z, starts):
     assert last == place or (act is press_interrupt and last[:2] <= (place[0], place[1] + 1))
 
 
-@pytest.mark.parametrize('act', [lambda now: True, press_interrupt],
-                         ids=['the watch', 'the keyboard'])
+@interrupts
 def test_an_interrupt_of_the_closed_loops_keeps_the_model(act):
     seen = []
 
@@ -214,13 +193,6 @@ def test_an_interrupt_of_the_closed_loops_keeps_the_model(act):
     assert trained.status == MinimumStatus.INTERRUPTED.value
     assert seen == sorted(seen)
     assert 0.3 < seen[-1] < 0.5
-
-
-def test_an_interrupt_keeps_the_bits_of_the_starts_that_finished():
-    one = train(UNFORCED, unforced_samples(), SMALL, starts=1)
-    kept, _ = watched(lambda now: now.finished == 1, SMALL, starts=3)
-    assert bits(kept.model) == bits(one.model)
-    assert kept.model.provenance == one.model.provenance
 
 
 class Useless:
@@ -247,4 +219,4 @@ def test_an_interrupt_before_there_is_anything_of_use():
         train(UNFORCED, unforced_samples(), Given(KeyboardInterrupt()), starts=3)
     assert torch.get_num_threads() == threads
     with pytest.raises(TrainingFailed):
-        watched(lambda now: True, replace(SMALL, hidden_first=1, ridge=1e6))
+        train(UNFORCED, unforced_samples(), Given(Useless()), starts=1)

@@ -24,7 +24,7 @@ from koopman_ros.learning import (
 )
 from koopman_ros.learning.lift.neural_drift import with_units_of
 from koopman_ros.learning.model_selection import plainest
-from koopman_ros.model import Box, load, save
+from koopman_ros.model import Box
 from support.random_lifts import random_lift
 from support.small_plants import (
     BENT,
@@ -62,10 +62,9 @@ def bent():
     return compare(BENT, bent_samples(), RECIPES, starts=1, loops=16)
 
 
-def test_a_polynomial_drift_is_found_and_taken(bent, tmp_path):
+def test_a_polynomial_drift_is_found_and_taken(bent):
     linear, polynomial, drift, lift = bent.contenders
-    assert [one.name for one in bent.contenders] == [
-        'linear', 'polynomial', 'neural drift', 'identity lift']
+    assert [one.name for one in bent.contenders] == ['linear', 'polynomial', *RECIPES]
     assert bent.chosen is polynomial
     assert bent.model is polynomial.model
     # the smallest of the degrees that are exact
@@ -77,44 +76,34 @@ def test_a_polynomial_drift_is_found_and_taken(bent, tmp_path):
         assert one.figures.fit == evaluate(one.model, test).fit
         assert one.rx == fit(one.model, validation.x, validation.dxdt, validation.u).rx
         assert one.model.provenance.metrics == one.figures.metrics(('level',))
-    for one in bent.contenders:
         assert one.law_check.loops == 16
         assert one.law_check.accepted or one is linear
     box = Box.of(BENT, bent_samples().x, bent_samples().u)
     np.testing.assert_array_equal(linear.model.A, Edmd(1).learn(BENT, training, box).A)
-    save(bent.model, tmp_path / 'best.safetensors')
-    x = np.array([0.4])
-    np.testing.assert_array_equal(load(tmp_path / 'best.safetensors').drift(x),
-                                  bent.model.drift(x))
 
 
 def test_the_table_has_a_row_for_each(bent):
     head, _, *rows = str(bent).splitlines()
-    assert head.startswith('| model | n_z | rx, validation | rx, test | roll-out of level, m |')
-    assert [row.split(' | ')[0] for row in rows] == [
-        '| linear', '| polynomial', '| neural drift', '| identity lift']
+    assert '| rx, test | roll-out of level, m |' in head
+    assert [row.split(' | ')[0][2:] for row in rows] == ['linear', 'polynomial', *RECIPES]
     assert [row.endswith('| chosen |') for row in rows] == [False, True, False, False]
 
 
-def test_progress_is_that_of_all_classes():
-    told = []
-    compare(BENT, bent_samples(), RECIPES, starts=2, loops=0,
-            watch=lambda now: bool(told.append(now)))
-    assert list(dict.fromkeys(now.name for now in told)) == ['neural drift', 'identity lift']
-    counts = [now.finished for now in told]
-    assert counts == sorted(counts)
-    assert {now.total for now in told} == {4}
-    assert counts[-1] == 4
+@pytest.mark.parametrize(('asked', 'words'), [
+    ({'alone': True}, 'choose must be one of .*, got None'),
+    ({'choose': 'lift'}, "choose must be one of linear, .*, identity lift, got 'lift'"),
+    ({'starts': 0}, 'starts must be at least 1, got 0')])
+def test_what_cannot_be_compared(asked, words):
+    with pytest.raises(ValueError, match=words):
+        compare(BENT, bent_samples(), RECIPES, **asked)
 
 
-def test_a_class_may_be_learned_alone():
+def test_a_class_may_be_asked_for_and_learned_alone():
     alone = compare(BENT, bent_samples(), RECIPES, choose='polynomial', alone=True, loops=0)
     assert [one.name for one in alone.contenders] == ['polynomial']
-    assert alone.model is alone.chosen.model
-    with pytest.raises(ValueError, match=r'choose must be one of .*, got None'):
-        compare(BENT, bent_samples(), RECIPES, alone=True)
-    with pytest.raises(ValueError, match='starts must be at least 1, got 0'):
-        compare(BENT, bent_samples(), RECIPES, starts=0)
+    asked = compare(BENT, bent_samples(), {'lift': SMALL}, starts=1, choose='lift', loops=0)
+    assert asked.chosen.name == 'lift'
+    assert len(asked.contenders) == 3
 
 
 def test_a_class_that_cannot_be_learned_has_its_reason():
@@ -122,18 +111,9 @@ def test_a_class_that_cannot_be_learned_has_its_reason():
                     starts=1, loops=0)
     assert found.chosen.name == 'linear'
     assert [one.model is None for one in found.contenders] == [False, True, True]
-    assert found.contenders[2].refusal.startswith('n_z = 1 is too small for 1 states')
-    none = [contender(name, math.inf, 'is none') for name in ('a', 'b')]
+    assert 'is too small for 1 states' in found.contenders[2].refusal
     with pytest.raises(TrainingFailed, match='no class has a model: a: is none; b: is none'):
-        plainest(none)
-
-
-def test_a_class_may_be_asked_for():
-    asked = compare(BENT, bent_samples(), RECIPES, starts=1, choose='identity lift', loops=0)
-    assert asked.chosen.name == 'identity lift'
-    with pytest.raises(ValueError, match='choose must be one of linear, polynomial, neural drift, '
-                                         "identity lift, got 'lift'"):
-        compare(BENT, bent_samples(), RECIPES, choose='lift')
+        plainest([contender(name, math.inf, 'is none') for name in ('a', 'b')])
 
 
 def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
@@ -160,9 +140,7 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     monkeypatch.setattr(model_selection, 'evaluate_closed_loops', fails)
     found = compare(BENT, bent_samples(), {}, loops=16)
     assert found.chosen.name == chosen
-    refusal = f'no controller: the law fails in {failing[2]} of 16'
-    assert found.contenders[1].refusal.startswith(refusal)
-    assert f'{"chosen; " * (chosen == "polynomial")}{refusal}' in str(found)
+    assert f'the law fails in {failing[2]} of 16' in found.contenders[1].refusal
 
 
 def test_all_laws_are_tried_where_the_data_are(monkeypatch):
@@ -180,10 +158,7 @@ def test_all_laws_are_tried_where_the_data_are(monkeypatch):
         assert one.model.training_states is known
 
 
-def test_a_plant_without_inputs_and_degrees_that_cannot_be():
-    found = compare(UNFORCED, unforced_samples(), {}, degrees=(40,))
-    assert found.chosen.name == 'linear'
-    assert found.contenders[1].refusal
+def test_a_plant_without_inputs_has_no_law():
     assert compare(UNFORCED, unforced_samples(), {}).chosen.law_check is None
 
 

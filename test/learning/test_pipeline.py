@@ -86,24 +86,15 @@ def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
     assert sorted(path.name for path in folder.iterdir()) == [
         'new.previous.safetensors', 'new.safetensors']
     assert (folder / 'new.previous.safetensors').read_bytes() == Path(SHIPPED).read_bytes()
-
-
-def test_file_says_where_it_comes_from(accepted):
-    retrained, _, folder = accepted
-    origin, found = load(folder / 'new.safetensors').provenance, retrained.found
+    model, found = load(folder / 'new.safetensors'), retrained.found
+    origin = model.provenance
     assert (origin.plant, origin.seed) == (load(SHIPPED).provenance.plant, 0)
-    assert len(origin.data_digest) == 64
     assert origin.method == f'{found.method}, drift of degree {found.drift.degree}'
     assert origin.metrics['noise'] == float(found.noise[0]) == pytest.approx(NOISE, rel=0.1)
     assert origin.metrics['rollout_rmse'] == float(retrained.decision.rmse[0])
     assert {('temperature', 'coolant_temperature'): origin.metrics['coverage']} == (
         retrained.coverage)
     assert 0.2 < origin.metrics['coverage'] < 1.0
-    assert {'rw', 'rx', 'cond'} < set(origin.metrics)
-
-
-def test_learned_lift_predicts_the_plant(accepted):
-    model = load(accepted[2] / 'new.safetensors')
     # over the middle of the box, where twenty minutes tell enough
     x, u = np.linspace(310.0, 322.0, 25)[:, None], np.full((25, 1), 288.0)
     rate = model.states.scale * (model.drift(model.states.to_deviation(x))
@@ -151,15 +142,13 @@ def test_report(accepted):
     gain = figures['input_gain']['temperature']['coolant_temperature']
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
-    for words in ('is accepted.**', '1201 of 1201 measurements used',
-                  f'| the present model | {retrained.decision.current_rmse[0]:.5g} |',
-                  '![Data, drift and prediction](new.png)'):
+    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)',
+                  f'| the present model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
-    figures = json.loads(json.dumps(diverging.summary(), allow_nan=False))
-    assert figures['heldout_error_of_present_lift'] == {'temperature': None}
+    assert diverging.summary()['heldout_error_of_present_lift'] == {'temperature': None}
 
 
 @pytest.mark.usefixtures('learned')
@@ -168,9 +157,7 @@ def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypa
     monkeypatch.setattr(task_module, 'evaluate_model', lambda *arguments, **named: replace(
         original(*arguments, **named), rmse=np.array([np.inf]), reasons=('it diverges',)))
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
-    metrics = load(retrained.model_file).provenance.metrics
-    assert 'rollout_rmse' not in metrics
-    assert 'noise' in metrics
+    assert 'rollout_rmse' not in load(retrained.model_file).provenance.metrics
 
 
 def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkeypatch):
@@ -193,36 +180,25 @@ def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
     save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'), seconds)
     gain = {'temperature': {'coolant_temperature': 1.0 / 60.0}}
     retrained = retrain(small(bag, tmp_path / 'new.safetensors', seconds, input_gain=gain))
-    (reason,) = retrained.reasons
-    assert 'does not predict the motion better than a linear model' in reason
+    assert 'does not predict the motion better than a linear model' in retrained.reasons[0]
     assert (retrained.learned, retrained.decision, retrained.model_file) == (None, None, '')
     assert list(tmp_path.glob('*.safetensors')) == [seconds]
     # dT/dt = -(T - 315) / 2 + (Tc - 288), in minutes
     assert retrained.found.drift.degree == 1
     assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
-    assert retrained.summary()['input_gain'] == {
-        'temperature': {'coolant_temperature': pytest.approx(1.0 / 60.0, rel=1e-12)}}
-    files = write_report(retrained)
-    assert 'is refused.**' in files[1].read_text()
-    assert json.loads(files[0].read_text())['accepted'] is False
+    assert retrained.summary()['input_gain']['temperature'] == {
+        'coolant_temperature': pytest.approx(1.0 / 60.0, rel=1e-12)}
+    assert 'is refused.**' in page_of(retrained)
 
 
 @pytest.mark.parametrize(('stage', 'done_before'), [
     ('reading bags', 'bag'), ('estimating: drift of degree 3', 'bag'),
     ('learning: identity lift, n_z 2', 'estimated'), ('judging: id', 'estimated'),
-    ('judging', 'learned'), ('writing', 'learned')])
+    ('writing', 'learned')])
 def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, done_before):
     request.getfixturevalue(done_before)
-    stopped = False
-
-    def tell(_, text):
-        nonlocal stopped
-        # whoever asked goes on asking
-        stopped = stopped or text.startswith(stage)
-        return stopped
-
     with pytest.raises(Stopped):
-        retrain(small(bag, tmp_path / 'new.safetensors'), tell)
+        retrain(small(bag, tmp_path / 'new.safetensors'), lambda _, text: text.startswith(stage))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -258,6 +234,8 @@ def test_a_task_survives_json():
     ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
      BagReadError, "has no topic '/other', it has /coolant_se"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),
+    ({'model': '', 'input_gain': {'temperature': {'steam': 1.0}}}, ValueError,
+     'names steam acting on temperature: the lift has the st'),
 ])
 def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, error, words):
     monkeypatch.chdir(tmp_path)
@@ -272,33 +250,26 @@ def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, e
 BOX = box([0.0], [10.0], [100.0], [200.0])
 
 
-def record(x, u):
-    times = np.arange(float(len(x)))
-    return Episode(times, np.array(x)[:, None], times, np.array(u)[:, None])
-
-
-# inputs are those that held at the samples
-HELD = Episode(np.arange(3.0), np.full((3, 1), 0.5), np.array([-1.0, 0.5]),
-               np.array([[105.0], [195.0]]))
-TWO_STATES = Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.zeros(1),
-                     np.array([[0.35]]))
-
-
-@pytest.mark.parametrize(('episodes', 'within', 'cells'), [
-    ([record([0.0, 0.5, 9.9, 10.0], [100.0, 105.0, 199.0, 200.0]),
-      record([0.2, 5.0], [101.0, 150.0])], BOX, [[0, 0], [5, 5], [9, 9]]),
+@pytest.mark.parametrize(('x', 'u', 'cells'), [
+    ([0.0, 0.2, 0.5, 5.0, 9.9, 10.0], [100.0, 101.0, 105.0, 150.0, 199.0, 200.0],
+     [[0, 0], [5, 5], [9, 9]]),
     # outside counts for the border
-    ([record([-3.0, 40.0], [90.0, 150.0])], BOX, [[0, 0], [9, 5]]),
-    ([HELD], BOX, [[0, 0], [0, 9]]),
-    ([TWO_STATES], box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0]), [[0, 9, 3], [5, 4, 3]])])
-def test_visited_cells_and_their_share_of_all(episodes, within, cells):
-    assert visited_cells(episodes, within).tolist() == cells
-    shares = coverage(episodes, within)
-    if len(cells[0]) == 2:
-        assert shares == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
-    else:
-        # no two of these cells share a pair of states, or of a state and the input
-        assert shares == dict.fromkeys([('x1', 'x2'), ('x1', 'u1'), ('x2', 'u1')], 0.02)
+    ([-3.0, 40.0], [90.0, 150.0], [[0, 0], [9, 5]])])
+def test_visited_cells_and_their_share_of_all(x, u, cells):
+    times = np.arange(float(len(x)))
+    episodes = [Episode(times, np.array(x)[:, None], times, np.array(u)[:, None])]
+    assert visited_cells(episodes, BOX).tolist() == cells
+    assert coverage(episodes, BOX) == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
+
+
+def test_cells_of_two_states_under_an_input_that_is_held():
+    episodes = [Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]),
+                        np.array([-1.0, 0.5]), np.array([[0.35], [0.95]]))]
+    within = box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0])
+    assert visited_cells(episodes, within).tolist() == [[0, 9, 3], [5, 4, 9]]
+    # no two of these cells share a pair of states, or of a state and the input
+    assert coverage(episodes, within) == dict.fromkeys(
+        [('x1', 'x2'), ('x1', 'u1'), ('x2', 'u1')], 0.02)
 
 
 def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
@@ -324,9 +295,3 @@ def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
     assert figures['heldout_error']['temperature'] < 0.9 * figures[
         'heldout_error_of_linear_model']['temperature']
     assert 'present model' not in page_of(retrained)
-
-
-def test_input_gain_of_a_first_lift_names_its_signals(bag, tmp_path):
-    with pytest.raises(ValueError, match='names steam acting on temperature: the lift has the st'):
-        retrain(small(bag, tmp_path / 'new.safetensors', '',
-                      input_gain={'temperature': {'steam': 1.0}}))

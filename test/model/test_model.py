@@ -273,6 +273,19 @@ def test_eigenvalues_come_slowest_first_and_every_mode_has_to_decay(A, slowest_f
     assert model.is_hurwitz is hurwitz
 
 
+def test_a_printed_model_shows_its_ranges_rates_and_verdict():
+    model = exact_two_state_model()
+    model = replace(model, provenance=replace(
+        model.provenance, metrics={'rx': 0.25}, accepted=False, reasons=('too few loops',)))
+    lines = str(model).splitlines()
+    for name, unit in zip(model.states.names, model.states.units, strict=True):
+        assert sum(f'state {name}: trained from' in line and line.endswith(unit)
+                   for line in lines) == 1
+    assert f'{model.eigenvalues.real[0]:.4g} per {model.time_unit}' in str(model)
+    assert '  held-out rx: 0.25' in lines
+    assert lines[-1] == '  acceptance: refused (too few loops)'
+
+
 def test_a_model_cannot_be_changed():
     A = -np.eye(5)
     model = replace(random_lift(), A=A)

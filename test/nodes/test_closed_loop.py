@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plant and controller in a loop: any order of start, any names, no offset, and no bump."""
+"""Plant and controller in a loop: any order of start, no offset, and no bump."""
 
 import signal
 
@@ -19,32 +19,22 @@ from support.nodes import seconds, temperature, value
 
 FOULED = 0.8 * reactor.constant('heat_transfer_coefficient')  # W/K
 SETPOINT = 45.0  # degC
-LOCKSTEP = {'lockstep': True, 'lockstep_subscribers': 2}
 
 
 class Loop:
     """A controller and a plant without noise, and an operator who hears them."""
 
-    def __init__(self, ros: Harness, prefix: str = '', measured: str = reactor.TEMPERATURE
-                 ) -> None:
-        self.ros, self._prefix = ros, prefix
-        self.measured = ros.listen(Temperature, f'{prefix}{measured}')
-        self.commands = ros.listen(Temperature, f'{prefix}{reactor.COOLANT_SETPOINT}')
+    def __init__(self, ros: Harness) -> None:
+        self.ros = ros
+        self.measured = ros.listen(Temperature, reactor.TEMPERATURE)
+        self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self.clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
-        self._setpoint = ros.node.create_publisher(
-            Temperature, f'{prefix}{reactor.SETPOINT}', topics.LOOP_QOS)
-        self._remaps = (*(('-r', f'__ns:={prefix[:-1]}') if prefix else ()),
-                        '-r', f'{reactor.TEMPERATURE}:={measured}')
 
     def start_controller(self, celsius: float) -> None:
         """Start a controller, and turn the set-point when it hears the operator."""
-        self.controller = self.ros.start('controller', arguments=self._remaps)
-        self.ros.wait_until(self._setpoint.get_subscription_count)
-        self.ros.meet(f'{self._prefix}controller')
-        self._setpoint.publish(temperature(celsius))
-
-    def start_plant(self, **parameters: object) -> None:
-        self.ros.start('plant', parameters, self._remaps)
+        self.controller = self.ros.start('controller')
+        self.ros.speak(Temperature, reactor.SETPOINT, to='controller').publish(
+            temperature(celsius))
 
     def rest(self) -> None:
         """Wait until the plant has come to rest at the set-point for another half a minute."""
@@ -68,7 +58,7 @@ def test_follows_the_setpoint_beside_a_plant_that_was_there_before(ros: Harness)
     """Without lock-step commands come late by whatever the machine takes, and /clock ticks."""
     loop = Loop(ros)
     # no quicker: commands that are late by more than half a minute would let it run away
-    loop.start_plant(speed=20.0)
+    ros.start('plant', {'speed': 20.0})
     ros.wait_until(lambda: loop.measured)
     loop.start_controller(SETPOINT)
     ros.wait_until(lambda: loop.measured[-1].temperature < 48.0)
@@ -79,28 +69,14 @@ def test_follows_the_setpoint_beside_a_plant_that_was_there_before(ros: Harness)
     assert ticks == sorted(ticks)
 
 
-def test_two_loops_side_by_side_in_their_namespaces_and_with_another_topic(ros: Harness) -> None:
-    loops = {47.0: Loop(ros, '/unit_1/'), 42.0: Loop(ros, '/unit_2/', 'reactor_temperature')}
-    for celsius, loop in loops.items():
-        loop.start_controller(celsius)
-        # no quicker: one works on while the other starts and settles
-        loop.start_plant(**LOCKSTEP, speed=100.0)
-    for celsius, loop in loops.items():
-        ros.wait_until(lambda celsius=celsius, loop=loop: len(loop.measured) > 20 and all(
-            abs(message.temperature - celsius) <= 0.01 for message in loop.measured[-20:]))
-    ros.wait_until(lambda: {status.name for status in ros.statuses} >= {
-        'unit_1/plant: simulation', 'unit_2/controller: control'})
-    assert ros.node.count_publishers('/unit_2/temperature') == 0
-
-
 def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_force(
         ros: Harness) -> None:
     loop = Loop(ros)
     loop.start_controller(SETPOINT)
     # not as fast as it can: a publisher keeps the last hundred commands, and a bench that a busy
     # machine lets wait for longer than they last misses some
-    loop.start_plant(**LOCKSTEP, speed=200.0, lockstep_timeout=0.3,
-                     **{'constants.heat_transfer_coefficient': FOULED})
+    ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 2, 'speed': 200.0,
+                        'lockstep_timeout': 0.3, 'constants.heat_transfer_coefficient': FOULED})
     loop.rest()
     rested = seconds(loop.commands[-1])
     truth = ros.wait_for_status(

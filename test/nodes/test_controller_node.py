@@ -51,15 +51,14 @@ def test_each_command_carries_the_stamp_of_its_measurement(bench: Bench) -> None
     assert status.level == DiagnosticStatus.OK
 
 
-def test_odd_stamps_are_answered_with_themselves(bench: Bench) -> None:
+def test_odd_stamps_are_answered_with_themselves_and_a_long_frame_id_is_cut(
+        bench: Bench) -> None:
     message = temperature(STEADY)
     message.header.stamp.sec, message.header.stamp.nanosec = 2, 1_500_000_000
     assert seconds(bench.answer_to(message)) == seconds(message)
     for at in (-2.0 ** 31, -5.25, -4.25):
         assert math.isfinite(bench.measure(STEADY, at).temperature)
 
-
-def test_long_frame_id_is_cut_and_reported(bench: Bench) -> None:
     message = temperature(STEADY, 2.0)
     message.header.frame_id = 'x' * 100_000
     assert bench.answer_to(message).header.frame_id == 'x' * 256
@@ -76,8 +75,8 @@ def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
     # patient, or a busy machine could be too slow for it
     program = ('import sys\n'
                'from koopman_ros.nodes import controller\n'
-               'from koopman_ros.ros import measurements\n'
-               'measurements._PATIENCE = 100.0\n'
+               'from koopman_ros.ros import signals\n'
+               'signals._PATIENCE = 100.0\n'
                'sys.exit(controller.main())\n')
     ros.start('controller', arguments=('-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket'),
               command=(sys.executable, '-c', program))
@@ -170,9 +169,7 @@ def test_limits_ramp_and_weights_change_while_the_loop_runs(bench: Bench) -> Non
     at, before = bench.settle(STEADY + 1.0, at + 1.0)
     bench.ros.set_parameters('controller', **{'coolant_temperature.weight': 100.0})
     at, dear = bench.settle(STEADY + 1.0, at + 1.0)
-    bench.ros.set_parameters('controller', **{'temperature.weight': 10000.0})
-    at, eager = bench.settle(STEADY + 1.0, at + 1.0)
-    assert eager < before < dear < held
+    assert before < dear < held
 
     bench.ros.set_parameters('controller', **{'temperature.setpoint_ramp': 0.1})
     bench.ask(STEADY - 10.0)
@@ -241,8 +238,7 @@ def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are
         bench: Bench) -> None:
     for _ in range(2):
         bench.measure(STEADY, 2.0)
-    status = bench.status(lambda s: 'does not advance' in s.message)
-    assert status.level == DiagnosticStatus.WARN
+    bench.status(lambda s: s.level == DiagnosticStatus.WARN and 'does not advance' in s.message)
     bench.measure(STEADY, 3.0)
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
     assert math.isfinite(bench.measure(54.5, 6.0).temperature)
@@ -284,32 +280,19 @@ def test_a_plan_is_told_with_the_limits_that_are_active(bench: Bench) -> None:
     # too cold, which takes a coolant that is warmer than it may get at once
     answer = bench.measure(STEADY - 1.5, 4.0)
     assert answer.temperature == pytest.approx(before + 0.1)
-
-    def of_last() -> bool:
-        return all(heard and seconds(heard[-1]) == 4.0 for heard in (plans, limits))
-
-    bench.ros.wait_until(of_last)
+    bench.ros.wait_until(lambda: all(
+        heard and seconds(heard[-1]) == 4.0 for heard in (plans, limits)))
     plan = plans[-1]
     assert list(plan.joint_names) == ['temperature [degC]', 'coolant_temperature [degC]']
-    path = [list(point.positions) for point in plan.points]
-    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
-             for point in plan.points]
-    assert path[0] == pytest.approx([STEADY - 1.5, answer.temperature])
-    assert path[-1][0] == pytest.approx(STEADY, abs=0.1)
-    assert times[:2] == pytest.approx([0.0, 1.0])
-    assert all(after > before for before, after in itertools.pairwise(times))
+    assert list(plan.points[0].positions) == pytest.approx([STEADY - 1.5, answer.temperature])
+    assert plan.points[-1].positions[0] == pytest.approx(STEADY, abs=0.1)
     assert dict(zip(limits[-1].name, limits[-1].position, strict=True)) == {
         'at_range_coolant_temperature [-1 lower, 1 upper]': 0.0,
         'at_rate_coolant_temperature [-1 falling, 1 rising]': 1.0,
         'at_limit_temperature [-1 lower, 1 upper]': 0.0}
-    # one a sample at most, and none of another law
-    stamps = [seconds(message) for message in plans]
-    assert len(stamps) == len(set(stamps)) == len(limits)
+    # none of another law
     bench.ros.set_parameters('controller', fallback_order=['sdre', 'linear'])
-    internals = bench.ros.listen(JointState, topics.CONTROLLER_INTERNALS)
-    bench.ros.meet('controller')
     bench.measure(STEADY, 5.0)
-    bench.ros.wait_until(lambda: internals and seconds(internals[-1]) == 5.0)
     bench.ros.meet('controller')
     assert seconds(plans[-1]) == 4.0
 

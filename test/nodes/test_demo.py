@@ -42,24 +42,20 @@ def test_demo_leaves_bag_picture_and_summary(
     assert result['measurements'] == result['commands'] == measurements
     assert summary(tmp_path / 'closed_loop.mcap').message_count == result['bag_messages']
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
-    assert done.stdout.count(f'{signal} set-point [') >= 20
-
-
-def test_demo_says_which_plants_it_knows(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert setpoint_demo.main(['--plant', 'volcano', '--output', str(tmp_path)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("demo: there is no demo of 'volcano': choose one of ")
-    assert {'fed_reactor', 'pendulum', 'two_tanks'} <= set(line.split(' of ')[-1].split(', '))
+    assert f'{signal} set-point [' in done.stdout
+    assert len(re.findall(r'^ +[\d.]+ +', done.stdout, re.MULTILINE)) >= 20
 
 
 def test_demo_says_in_one_line_why_it_cannot_run(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'taken').write_text('a file, not a folder')
-    assert setpoint_demo.main(['--output', str(tmp_path / 'taken')]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith('demo: ')
-    assert str(tmp_path / 'taken') in line
+    for options, words in ((['--output', str(tmp_path / 'taken')], str(tmp_path / 'taken')),
+                           (['--plant', 'volcano', '--output', str(tmp_path)],
+                            "no demo of 'volcano': choose one of fed_reactor, pendulum")):
+        assert setpoint_demo.main(options) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith('demo: ')
+        assert words in line
 
 
 def test_demo_commands_nothing_in_a_domain_with_another_loop(
@@ -113,7 +109,7 @@ def test_demo_interrupted_in_its_loop_keeps_what_it_recorded(tmp_path: Path) -> 
         assert demo.stdout is not None
         assert demo.stdout.readline() == (
             f'another run writes to {wanted}: this one writes to {wanted}-2\n')
-        assert any('time [min] 1.0' in said for said in demo.stdout)
+        assert any(said.lstrip().startswith('1.0 ') for said in demo.stdout)
         demo.send_signal(signal.SIGINT)
         # a second one while the first is handled
         demo.send_signal(signal.SIGTERM)
@@ -127,13 +123,3 @@ def test_demo_interrupted_in_its_loop_keeps_what_it_recorded(tmp_path: Path) -> 
         with contextlib.suppress(OSError):
             assert bytes(tmp_path) not in path.read_bytes()
     assert not wanted.exists()
-
-
-def test_two_runs_write_to_two_folders(tmp_path: Path) -> None:
-    (tmp_path / 'link').symlink_to(tmp_path)
-    with (reserved_output(tmp_path / 'demo') as first,
-          reserved_output(tmp_path / 'link' / 'demo') as second):
-        assert first == tmp_path / 'demo'
-        assert second == tmp_path / 'link' / 'demo-2'
-    with reserved_output(tmp_path / 'demo') as again:
-        assert again == first

@@ -12,7 +12,14 @@ import sys
 import pytest
 
 from koopman_ros.records import summary
-from koopman_ros.testing import Harness, HarnessError, isolated_domain, NodeProcess, process
+from koopman_ros.testing import (
+    Harness,
+    HarnessError,
+    isolated_domain,
+    NodeProcess,
+    process,
+    reserved_output,
+)
 from support.nodes import TIMEOUT, wait_until_ended
 
 SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
@@ -48,34 +55,32 @@ def test_error_of_the_test_is_raised_and_its_processes_end(tmp_path: Path) -> No
     assert not sleeper.running
 
 
-@pytest.mark.parametrize(('ignored', 'code', 'words'), [
-    ('{2}', -signal.SIGABRT, 'in <module>'), ('{2, 6}', -signal.SIGKILL, '')])
-def test_process_that_ignores_signals_is_aborted_and_says_where_it_is(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ignored: str, code: int, words: str
-        ) -> None:
-    monkeypatch.setattr(process, 'STOP_TIMEOUT', 0.2)
-    monkeypatch.setattr(process, '_ABORT_TIMEOUT', 0.2 if code == -signal.SIGKILL else TIMEOUT)
-    program = ('import signal, time\n'
-               f'signal.pthread_sigmask(signal.SIG_BLOCK, {ignored})\n'
-               'print("ignoring", flush=True)\n'
-               'time.sleep(600)\n')
-    stubborn = NodeProcess('stubborn', {}, tmp_path / 'log', {},
-                           command=(sys.executable, '-c', program))
-    while 'ignoring' not in stubborn.output():
+# How a process meets its signals, the code with which it ends, and its last words.
+STUBBORN = {
+    'blocks the signal': (
+        'signal.pthread_sigmask(signal.SIG_BLOCK, {2})\n', -signal.SIGABRT, 'in <module>'),
+    'blocks the abort, too': (
+        'signal.pthread_sigmask(signal.SIG_BLOCK, {2, 6})\n', -signal.SIGKILL, ''),
+    'is stopped': ('signal.signal(signal.SIGINT, lambda *_: sys.exit(7))\n'
+                   'print("ready", flush=True)\n'
+                   'signal.raise_signal(signal.SIGSTOP)\n', 7, ''),
+}
+
+
+@pytest.mark.parametrize('name', STUBBORN)
+def test_process_ends_in_order_or_is_aborted_and_says_where_it_is(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    act, code, words = STUBBORN[name]
+    if code < 0:
+        monkeypatch.setattr(process, 'STOP_TIMEOUT', 0.2)
+        monkeypatch.setattr(process, '_ABORT_TIMEOUT', 0.2 if code == -signal.SIGKILL else TIMEOUT)
+    stubborn = NodeProcess('stubborn', {}, tmp_path / 'log', {}, command=(
+        sys.executable, '-c', 'import signal, sys, time\n'
+        f'{act}print("ready", flush=True)\ntime.sleep(600)\n'))
+    while 'ready' not in stubborn.output():
         assert stubborn.running
     assert stubborn.stop() == code
     assert words in stubborn.output()
-
-
-def test_process_that_was_stopped_ends_in_order(tmp_path: Path) -> None:
-    program = ('import signal, sys, time\n'
-               'signal.signal(signal.SIGINT, lambda *_: sys.exit(7))\n'
-               'signal.raise_signal(signal.SIGSTOP)\n'
-               'time.sleep(600)\n')
-    halted = NodeProcess('halted', {}, tmp_path / 'log', {},
-                         command=(sys.executable, '-c', program))
-    os.waitid(os.P_PID, halted.process.pid, os.WSTOPPED)
-    assert halted.stop() == 7
 
 
 def test_example_of_the_page_passes(tmp_path: Path) -> None:
@@ -148,18 +153,25 @@ def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> N
                 pass
 
 
-@pytest.mark.parametrize(('given', 'found', 'reach'), [
-    ('', 'rmw_fastrtps_cpp', 'SYSTEM_DEFAULT'),
-    ('rmw_fastrtps_dynamic_cpp', 'rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
+def test_two_runs_write_to_two_folders(tmp_path: Path) -> None:
+    (tmp_path / 'link').symlink_to(tmp_path)
+    with (reserved_output(tmp_path / 'demo') as first,
+          reserved_output(tmp_path / 'link' / 'demo') as second):
+        assert (first, second) == (tmp_path / 'demo', tmp_path / 'link' / 'demo-2')
+    with reserved_output(tmp_path / 'demo') as again:
+        assert again == first
+
+
+@pytest.mark.parametrize(('given', 'reach'), [
+    ('', 'SYSTEM_DEFAULT'), ('rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
     # whose default is the whole network, as it knows nothing of the profile
-    ('rmw_cyclonedds_cpp', 'rmw_cyclonedds_cpp', 'LOCALHOST'),
-])
+    ('rmw_cyclonedds_cpp', 'LOCALHOST')])
 def test_environment_of_the_reservation_holds_here_with_the_middleware_that_is_named(
-        monkeypatch: pytest.MonkeyPatch, given: str, found: str, reach: str) -> None:
+        monkeypatch: pytest.MonkeyPatch, given: str, reach: str) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')
     monkeypatch.setenv('RMW_IMPLEMENTATION', given)
     with isolated_domain() as environment:
         assert environment.items() <= os.environ.items()
-        assert environment['RMW_IMPLEMENTATION'] == found
+        assert environment['RMW_IMPLEMENTATION'] == (given or 'rmw_fastrtps_cpp')
         assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == reach
     assert (os.environ['ROS_DOMAIN_ID'], os.environ['RMW_IMPLEMENTATION']) == ('7', given)

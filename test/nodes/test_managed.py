@@ -5,9 +5,7 @@
 
 from collections.abc import Callable
 from itertools import pairwise
-import os
 from pathlib import Path
-import sys
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
@@ -22,17 +20,7 @@ from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.controller_bench import reproduced
-from support.nodes import opened, seconds, temperature, value
-
-
-def change(ros: Harness, node: str, label: str) -> bool:
-    return bool(ros.call(ChangeState, f'{node}/change_state', ChangeState.Request(
-        transition=Transition(label=label))).success)
-
-
-def change_by_number(ros: Harness, node: str, number: int) -> bool:
-    return bool(ros.call(ChangeState, f'{node}/change_state', ChangeState.Request(
-        transition=Transition(id=number))).success)
+from support.nodes import change, seconds, temperature, value
 
 
 def state(ros: Harness, node: str) -> str:
@@ -64,11 +52,6 @@ def started(ros: Harness, node: str, command: tuple[str, ...] | None = None, **p
     return process
 
 
-def take_down(ros: Harness, node: str) -> None:
-    assert change(ros, node, 'cleanup')
-    stays_down(ros, node)
-
-
 def stays_down(ros: Harness, node: str) -> None:
     assert state(ros, node) == 'unconfigured'
     ros.wait_until(lambda: parts(ros, node) == set())
@@ -83,10 +66,10 @@ def test_plant(ros: Harness) -> None:
     process = started(ros, 'plant', speed=20.0)
     # neither by name nor by number, which managers use
     assert not change(ros, 'plant', 'activate')
-    assert not change_by_number(ros, 'plant', Transition.TRANSITION_ACTIVATE)
+    assert not change(ros, 'plant', number=Transition.TRANSITION_ACTIVATE)
     assert state(ros, 'plant') == 'unconfigured'
 
-    assert change_by_number(ros, 'plant', Transition.TRANSITION_CONFIGURE)
+    assert change(ros, 'plant', number=Transition.TRANSITION_CONFIGURE)
     ros.wait_until(lambda: '/plant/reset' in parts(ros, 'plant'))
     still = ros.wait_for_status('plant: simulation', lambda s: s.message == 'inactive')
     # which moves nothing either
@@ -268,41 +251,6 @@ def test_controller_goes_on_from_the_last_command(ros: Harness) -> None:
     ros.wait_until(lambda: len(records) > 2)
     reproduced(records)
     assert process.stop() == 0
-    assert 'Traceback' not in process.output()
-
-
-def test_controller_that_is_taken_down_while_it_reads_a_model(ros: Harness, tmp_path: Path
-                                                              ) -> None:
-    """From a disk that is slow: the answer comes when nobody is there who could give it."""
-    pipe = tmp_path / 'disk'
-    os.mkfifo(pipe)
-    process = started(ros, 'controller', command=(sys.executable, '-c', f"""
-import sys
-from koopman_ros.nodes import controller
-from koopman_ros.ros import model_reload
-
-def slowly(*args, read=model_reload.load_suitable, **options):
-    open({str(pipe)!r}).read()
-    return read(*args, **options)
-
-model_reload.load_suitable = slowly
-sys.exit(controller.main())
-"""))
-    assert change(ros, 'controller', 'configure')
-    client = ros.node.create_client(Trigger, 'controller/reload_model')
-    ros.wait_until(client.service_is_ready)
-    ros.meet('controller')
-    client.call_async(Trigger.Request())
-    with opened(ros, pipe):
-        take_down(ros, 'controller')
-    # the file is read, and the node goes on
-    assert change(ros, 'controller', 'configure')
-    assert change(ros, 'controller', 'activate')
-    loop = Loop(ros)
-    ros.meet('controller')
-    ros.wait_until(loop.answered)
-    assert change(ros, 'controller', 'shutdown')
-    assert ros.wait_for_end(process) == 0
     assert 'Traceback' not in process.output()
 
 

@@ -5,20 +5,16 @@
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
+import itertools
 import math
 import random
-import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from sensor_msgs.msg import Temperature
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from koopman_ros.demo import reactor
 from koopman_ros.nodes.controller import ControllerNode
@@ -28,15 +24,13 @@ from koopman_ros.parameters.table import ConfigurationError, Specification
 from koopman_ros.plants import simulation
 from koopman_ros.ros import topics
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.node_descriptions import tables
-from koopman_ros.testing import isolated_domain
-from support.nodes import seconds, temperature, TIMEOUT
+from koopman_ros.testing import Harness
+from support.nodes import seconds, temperature
 
 TABLES = tables()
 STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324
-TINY = 1e-300
 # What the names of the trainer's parameters for experiments begin with.
 EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperature.safe_value',
               'temperature.experiment', 'temperature.setpoint')
@@ -60,8 +54,7 @@ def ends(row: Specification) -> list[Any]:
     kind = type(row.default)
     low = [] if row.open_minimum else [kind(row.minimum)]
     if kind is float and row.minimum == 0.0:
-        # a file cannot hold a denormal number
-        low.append(row.smallest or (TINY if row.read_only else DENORMAL))
+        low.append(row.smallest or DENORMAL)
     return [*low, kind(row.maximum)]
 
 
@@ -80,11 +73,11 @@ def with_partner(rows: Mapping[str, Specification], name: str, value: Any) -> di
     return {name: value}
 
 
-def cases(table: str, *, read_only: bool) -> list[dict[str, Any]]:
-    """Return the changes that bring each parameter of a table to its ends."""
+def cases(table: str) -> list[dict[str, Any]]:
+    """Return the changes that bring each parameter of a table to its ends, while a node runs."""
     rows = TABLES[table].rows
     return [with_partner(rows, name, value) for name, row in rows.items()
-            if row.read_only is read_only for value in ends(row)]
+            if not row.read_only for value in ends(row)]
 
 
 def usable_for_itself(reason: str) -> bool:
@@ -93,182 +86,140 @@ def usable_for_itself(reason: str) -> bool:
         'temperature.weight = 0.0 1/K^2' in reason and ' cannot be used: ' in reason)
 
 
-class Site:
-    """A node with somebody who talks to it, all in this thread: what the node raises is raised."""
-
-    def __init__(self, node: LoopNode) -> None:
-        self.node = node
-        self.bench = Node('bench', start_parameter_services=False, enable_rosout=False)
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(node)
-        self.executor.add_node(self.bench)
-        self.statuses: list[str] = []
-        self.bench.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, lambda message: self.statuses.extend(
-                status.message for status in message.status), 100)
-
-    def listen(self, topic: str) -> list[Temperature]:
-        heard: list[Temperature] = []
-        self.bench.create_subscription(Temperature, topic, heard.append, topics.LOOP_QOS)
-        return heard
-
-    def spin_until(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + TIMEOUT
-        while not condition():
-            assert time.monotonic() < deadline
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def ask(self, kind: Any, service: str, **request: Any) -> Future:
-        client = self.bench.create_client(kind, f'{self.node.get_name()}/{service}')
-        self.spin_until(client.service_is_ready)
-        return client.call_async(kind.Request(**request))
-
-    def call(self, kind: Any, service: str, **request: Any) -> Any:
-        future = self.ask(kind, service, **request)
-        self.spin_until(future.done)
-        return future.result()
-
-    def fire_timers(self) -> None:
-        """Do the work of every timer now, whatever its period."""
-        for timer in list(self.node.timers):
-            timer.callback()
-
-    def change(self, **values: Any) -> bool:
-        """Change parameters as the services do; what is refused says which, and why."""
-        result = self.node.set_parameters_atomically(
-            [Parameter(name, value=value) for name, value in values.items()])
-        assert result.successful or usable_for_itself(result.reason), result.reason
-        return result.successful
-
-
 @contextlib.contextmanager
-def site(create: Callable[[], LoopNode], **parameters: Any) -> Iterator[Site]:
-    """Run a node in a domain of its own, with parameters given at its start."""
+def running(ros: Harness, create: Callable[..., ManagedNode], **parameters: Any
+            ) -> Iterator[ManagedNode]:
+    """Run a node in the thread of the test, where an error of the node is raised."""
     given = [part for name, value in parameters.items() for part in (
         '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
-    with isolated_domain(), contextlib.ExitStack() as stack:
-        rclpy.init(args=['--ros-args', *given] if given else [])
-        stack.callback(rclpy.shutdown)
-        found = Site(create())
-        stack.callback(found.node.destroy_node)
-        if isinstance(found.node, ManagedNode):
-            found.node.start()
-        stack.callback(found.bench.destroy_node)
-        stack.callback(found.executor.shutdown)
-        stack.callback(found.node.complete)
-        yield found
+    node = create(context=ros.node.context, cli_args=['--ros-args', *given])
+    try:
+        node.start()
+        ros.node.executor.add_node(node)
+        yield node
+        node.complete()
+    finally:
+        node.destroy_node()
 
 
-def defaults(table: str, names: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: TABLES[table].rows[name].default for name in names}
+def try_each(node: ManagedNode, changes: list[dict[str, Any]], use: Callable[[], object]) -> int:
+    """Use a node after each change, which is then taken back; return how many were accepted."""
+    def change(values: Mapping[str, Any]) -> SetParametersResult:
+        return node.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()])
+
+    rows, accepted = TABLES[node.get_name()].rows, 0
+    for values in changes:
+        result = change(values)
+        accepted += result.successful
+        if result.successful:
+            use()
+        else:
+            assert usable_for_itself(result.reason), result.reason
+        result = change({name: rows[name].default for name in values})
+        assert result.successful, result.reason
+    return accepted
 
 
-class Loop:
-    """A sensor at a controller."""
-
-    def __init__(self, place: Site) -> None:
-        self.place, self.sent = place, 0
-        self.commands = place.listen(reactor.COOLANT_SETPOINT)
-        self.sensor = place.bench.create_publisher(
-            Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
-        place.spin_until(lambda: self.sensor.get_subscription_count()
-                         and place.node.count_subscribers(reactor.COOLANT_SETPOINT))
-
-    def answer(self) -> None:
-        self.sent += 1
-        self.sensor.publish(temperature(STEADY + 0.01 * (self.sent % 3), float(self.sent)))
-        # others may follow that answer silence
-        self.place.spin_until(lambda: self.sent in map(seconds, self.commands))
-        assert all(math.isfinite(command.temperature) for command in self.commands)
-        del self.commands[:]
-
-    def work(self) -> None:
-        self.answer()
-        self.place.fire_timers()
-        self.answer()
+def fire_timers(node: ManagedNode) -> None:
+    """Do the work of every timer now, whatever its period."""
+    for timer in list(node.timers):
+        timer.callback()
 
 
-def test_controller_answers_with_every_parameter_at_its_ends() -> None:
-    with site(ControllerNode) as place:
-        loop = Loop(place)
-        for change in cases('controller', read_only=False):
-            if place.change(**change):
-                loop.work()
-            assert place.change(**defaults('controller', change))
+def finite(messages: list[Temperature]) -> bool:
+    return all(math.isfinite(message.temperature) for message in messages)
 
 
-def test_controller_answers_with_all_parameters_at_ends_at_once() -> None:
+def at_once(draw: random.Random) -> dict[str, Any]:
+    """Draw an end or the default for all parameters of a controller."""
     rows = TABLES['controller'].rows
-    draw = random.Random(1)
-    accepted = 0
-    with site(ControllerNode) as place:
-        loop = Loop(place)
-        for _ in range(40):
-            change = {name: draw.choice([*ends(row), row.default])
-                      for name, row in rows.items() if ends(row) and not row.read_only}
-            for low, high in PAIRS:
-                # one pair in four would be drawn in order
-                if low in rows and not change[low] < change[high]:
-                    change[low], change[high] = rows[low].minimum, rows[high].maximum
-            if place.change(**change):
-                accepted += 1
-                loop.work()
-    assert accepted >= 5
+    change = {name: draw.choice([*ends(row), row.default])
+              for name, row in rows.items() if ends(row) and not row.read_only}
+    for low, high in PAIRS:
+        # one pair in four would be drawn in order
+        if low in rows and not change[low] < change[high]:
+            change[low], change[high] = rows[low].minimum, rows[high].maximum
+    return change
+
+
+def test_controller_answers_with_each_parameter_and_with_all_at_their_ends(ros: Harness) -> None:
+    with running(ros, ControllerNode) as node:
+        commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+        sensor = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
+        times = itertools.count(1)
+
+        def answer() -> None:
+            at = next(times)
+            sensor.publish(temperature(STEADY + 0.01 * (at % 3), float(at)))
+            # others may follow that answer silence
+            ros.wait_until(lambda: at in map(seconds, commands))
+            assert finite(commands)
+            del commands[:]
+
+        def work() -> None:
+            answer()
+            fire_timers(node)
+            answer()
+
+        try_each(node, cases('controller'), work)
+        draw = random.Random(1)
+        assert try_each(node, [at_once(draw) for _ in range(40)], work) >= 5
 
 
 def test_plant_runs_with_every_changeable_parameter_at_its_ends(
-        monkeypatch: pytest.MonkeyPatch) -> None:
+        ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     # of a reactor that has become stiff the plant says so, sooner or later
     monkeypatch.setattr(simulation, '_MAX_STEPS_PER_HOLD', 500)
-    with site(PlantNode, speed=0.0, sample_period=0.1) as place:
-        heard = place.listen(reactor.TEMPERATURE)
-        coolant = place.bench.create_publisher(
-            Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
-        place.spin_until(lambda: heard and coolant.get_subscription_count())
-        for change in cases('plant', read_only=False):
-            if place.change(**change):
-                del heard[:], place.statuses[:]
-                coolant.publish(temperature(20.0))
-                place.fire_timers()
-                place.spin_until(lambda: len(heard) > 2 or any(
-                    'stopped: ' in text for text in place.statuses))
-                assert all(math.isfinite(message.temperature) for message in heard)
-            assert place.change(**defaults('plant', change))
-            assert place.call(Trigger, 'reset').success
+    with running(ros, PlantNode, speed=0.0, sample_period=0.1) as node:
+        heard = ros.listen(Temperature, reactor.TEMPERATURE)
+        coolant = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
+
+        def work() -> None:
+            assert ros.trigger('plant/reset').success
+            del heard[:], ros.statuses[:]
+            coolant.publish(temperature(20.0))
+            fire_timers(node)
+            ros.wait_until(lambda: len(heard) > 2 or any(
+                'stopped: ' in status.message for status in ros.statuses))
+            assert finite(heard)
+
+        try_each(node, cases('plant'), work)
 
 
-def test_trainer_refuses_names_that_cannot_be_topics() -> None:
-    refusal = ' cannot be used (failed to resolve name: '
-    with site(TrainerNode, record_at_start=False) as place:
-        for name, shown, words in (
-                ('{nobody}', '{nobody}', 'unknown substitution'),
-                ('a//b', 'a//b', 'topic name must not contain'),
-                ('x' * 5000, f'{"x" * 12}...{"x" * 13}', 'topic length should not exceed')):
-            result = place.node.set_parameters_atomically([Parameter('topics', value=[name])])
+def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends(ros: Harness) -> None:
+    with running(ros, TrainerNode, record_at_start=False) as node:
+        commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+        sensor = ros.node.create_publisher(Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
+        client = ros.node.create_client(SetBool, 'trainer/experiment')
+        ros.wait_until(client.service_is_ready)
+        times = itertools.count(1)
+
+        def work() -> None:
+            begun = client.call_async(SetBool.Request(data=True))
+            while not begun.done():
+                sensor.publish(temperature(40.0, float(next(times))))
+                ros.spin_once()
+                fire_timers(node)
+            assert begun.result().success or begun.result().message.startswith('refused: ')
+            for _ in range(2):
+                ros.set_bool('trainer/experiment', False)
+            assert finite(commands)
+
+        try_each(node, [change for change in cases('trainer')
+                        if next(iter(change)).startswith(EXPERIMENT)], work)
+
+
+def test_trainer_refuses_names_that_cannot_be_topics(ros: Harness) -> None:
+    with running(ros, TrainerNode, record_at_start=False) as node:
+        for name, words in (('{nobody}', 'unknown substitution'),
+                            ('a//b', 'topic name must not contain'),
+                            ('x' * 5000, 'topic length should not exceed')):
+            result = node.set_parameters_atomically([Parameter('topics', value=[name])])
             assert not result.successful
-            assert result.reason.startswith(f"topics: '{shown}'{refusal}{words}")
-            assert '\n' not in result.reason
+            assert words in result.reason
+            assert len(result.reason.splitlines()) == 1
+            assert len(result.reason) < 250
     with (pytest.raises(ConfigurationError, match='unknown substitution'),
-          site(TrainerNode, record_at_start=False, topics="['{nobody}']")):
+          running(ros, TrainerNode, record_at_start=False, topics="['{nobody}']")):
         pass
-
-
-def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends() -> None:
-    with site(TrainerNode, record_at_start=False) as place:
-        sensor = place.bench.create_publisher(Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
-        commands, sent = place.listen(reactor.COOLANT_SETPOINT), 0
-        for change in cases('trainer', read_only=False):
-            if not next(iter(change)).startswith(EXPERIMENT):
-                continue
-            if place.change(**change):
-                begun = place.ask(SetBool, 'experiment', data=True)
-                while not begun.done():
-                    sent += 1
-                    sensor.publish(temperature(40.0, float(sent)))
-                    place.executor.spin_once(timeout_sec=0.01)
-                    place.fire_timers()
-                assert begun.result().success or begun.result().message.startswith('refused: ')
-                place.call(SetBool, 'experiment', data=False)
-                place.call(SetBool, 'experiment', data=False)
-                assert all(math.isfinite(message.temperature) for message in commands)
-            assert place.change(**defaults('trainer', change))

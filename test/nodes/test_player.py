@@ -11,8 +11,6 @@ from typing import Any
 
 from mcap.reader import make_reader
 import pytest
-from rclpy.duration import Duration
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
@@ -22,6 +20,7 @@ from sensor_msgs.msg import Temperature
 import yaml
 
 from koopman_ros import records
+from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
@@ -33,7 +32,7 @@ from koopman_ros.parameters.trainer import player_table, preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from support.bag_samples import DEFAULT_QOS
+from support.bag_samples import DEFAULT_QOS, TEMPERATURE
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
 SAMPLES = 61
@@ -130,49 +129,23 @@ def play(bag: Path, *arguments: str, **parameters: object) -> None:
     assert player.main(['player', '--ros-args', *given, *arguments]) == 0
 
 
-def stamps(messages: Sequence[Any]) -> list[int]:
-    return [stamp_nanoseconds(message.header.stamp) for message in messages]
-
-
 def test_lockstep_gives_bit_identical_commands(
         ros: Harness, recorded_loop: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    recorded = records.read_series(recorded_loop, '/coolant_setpoint')
+    place = MessageField('/coolant_setpoint', TEMPERATURE, 'temperature', 'degC')
+    recorded = records.read_series(recorded_loop, place)
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.start('controller', {'observer_bandwidth': 0.0})
     ros.meet('controller')
     play(recorded_loop, rate=0.0)
     ros.wait_until(lambda: len(commands) >= SAMPLES)
-    assert stamps(commands) == recorded.stamp_ns.tolist()
+    assert [stamp_nanoseconds(command.header.stamp) for command in commands] == (
+        recorded.stamp_ns.tolist())
     assert [command.temperature for command in commands] == recorded.values.tolist()
     # the coolant in force with each measurement, and one set-point
     inputs = {f'/{name}' for name in player_table().snapshot({}).topics}
     counts = records.summary(recorded_loop).counts
     assert f'played {sum(counts[topic] for topic in inputs & set(counts))} messages' in (
         capfd.readouterr().err)
-
-
-def test_lockstep_waits_for_requests_alone(
-        ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To wait until a message is received takes 0.1 s with some middlewares."""
-    bag = write_bag(tmp_path / 'bag.mcap', [
-        (topic, temperature(celsius, stamp), float(k)) for k in range(1, 21)
-        for topic, celsius, stamp in [
-            ('/coolant_temperature', 22.0, float(k)), ('/temperature', 50.0 + 0.1 * k, float(k)),
-            *([('/setpoint', 49.0, 0.0)] if k in (5, 6) else [])]],
-        [LATCHED_QOS])
-    waits: list[str] = []
-    wait = Publisher.wait_for_all_acked
-
-    def counted(publisher: Publisher, timeout: Duration) -> bool:
-        waits.append(publisher.topic_name)
-        return wait(publisher, timeout)
-
-    monkeypatch.setattr(Publisher, 'wait_for_all_acked', counted)
-    ros.start('controller')
-    play(bag, rate=0.0)
-    # and at the start, until the subscribers have found each topic, and at the end
-    assert waits[:-3] == ['/coolant_temperature', '/setpoint', '/setpoint']
-    assert sorted(waits[-3:]) == ['/coolant_temperature', '/setpoint', '/temperature']
 
 
 def test_messages_are_played_byte_for_byte_with_the_shipped_parameter_file(
@@ -187,18 +160,18 @@ def test_messages_are_played_byte_for_byte_with_the_shipped_parameter_file(
 
 
 def test_measurements_come_at_their_times(ros: Harness, tmp_path: Path) -> None:
-    """A sample a second, four times as fast."""
+    """A sample a second, ten times as fast."""
     bag = write_bag(tmp_path / 'slow.mcap', [
         ('/temperature', temperature(50.0 - 0.1 * k, float(k)), float(k)) for k in range(9)])
     arrived: list[float] = []
     ros.node.create_subscription(Temperature, reactor.TEMPERATURE, lambda _: arrived.append(
         time.monotonic()), topics.LOOP_QOS)
     ros.start('controller')
-    process = ros.start('player', {'bag': bag, 'rate': 4.0, 'wait_for_subscribers': 2})
+    process = ros.start('player', {'bag': bag, 'rate': 10.0, 'wait_for_subscribers': 2})
     ros.wait_until(lambda: len(arrived) == 9)
     assert ros.wait_for_end(process) == 0
     # the first one may come late on a busy machine, but none before its time
-    assert arrived[-1] - arrived[0] > 0.5 * 8.0 / 4.0
+    assert arrived[-1] - arrived[0] > 0.5 * 8.0 / 10.0
 
 
 def test_clock_shows_the_stamp_of_each_measurement(ros: Harness, tmp_path: Path) -> None:
@@ -234,20 +207,16 @@ def test_order_is_that_of_receipt_and_the_offset_leaves_out_the_beginning(
     assert [message.temperature for message in heard] == [2.0, 3.0]
 
 
-@pytest.mark.parametrize(('offered', 'reliability', 'durability'), [
-    ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-    ((BEST_EFFORT_QOS,),
-     ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    ((LATCHED_QOS,),
-     ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    ((BEST_EFFORT_QOS, DEFAULT_QOS),
-     ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-])
+@pytest.mark.parametrize(('offered', 'reliable', 'latched'), [
+    ((), True, False),
+    ((BEST_EFFORT_QOS,), False, False),
+    ((LATCHED_QOS,), True, True),
+    ((BEST_EFFORT_QOS, DEFAULT_QOS), True, False)])
 def test_offer_is_that_of_the_recorded_publishers(
-        offered: tuple[Qos, ...], reliability: ReliabilityPolicy,
-        durability: DurabilityPolicy) -> None:
+        offered: tuple[Qos, ...], reliable: bool, latched: bool) -> None:
     profile = player.recorded_offer(offered)
-    assert (profile.reliability, profile.durability) == (reliability, durability)
+    assert (profile.reliability is ReliabilityPolicy.RELIABLE) is reliable
+    assert (profile.durability is DurabilityPolicy.TRANSIENT_LOCAL) is latched
 
 
 def test_bag_in_a_namespace_is_played_into_another_controller(
@@ -266,7 +235,6 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'bag': 'none.mcap'}, "cannot start: bag 'none.mcap' does not exist"),
     ({'topics': ['pressure']}, 'no message on /pressure: choose topics among /temperature'),
-    ({'topics': ['a b']}, 'cannot start: topics: Invalid topic name'),
     ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
     ({'wait_timeout': 0.1}, '/temperature found no counterpart within 0.1 s: start the'),
     ({'wait_for_subscribers': 0, 'rate': 0.0, 'answer_timeout': 0.1},

@@ -22,12 +22,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import Float64, String
 
-from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.demo import reactor
-from koopman_ros.model import load
 from koopman_ros.nodes import trainer
-from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.records import BagMessage, read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.ros.recording import free_name
@@ -152,29 +149,23 @@ def test_recording_stops_and_starts_by_service(shared: Harness, tmp_path: Path) 
         assert values(recorded(tmp_path / name)) == [1000 * number + k for k in range(900)]
 
 
-def test_takes_the_next_name_beside_a_recording(shared: Harness, tmp_path: Path) -> None:
+def test_best_effort_publisher_is_recorded_under_the_next_free_name(
+        shared: Harness, tmp_path: Path) -> None:
     bag, second = tmp_path / 'run', tmp_path / 'run_2'
     bag.mkdir()
     (bag / 'run_0.mcap').write_text('precious')
-    shared.node.destroy_publisher(record(shared, bag))
-    words = f'recording to {second}, because {bag} exists already'
-    assert shared.set_bool('trainer/record', False).message.endswith(str(second))
-    assert [path.read_text() for path in bag.iterdir()] == ['precious']
-    assert words in shared.printed()
-
-
-def test_best_effort_publisher_is_recorded(shared: Harness, tmp_path: Path) -> None:
-    bag = tmp_path / 'run.mcap'
     received = shared.listen(Temperature, reactor.TEMPERATURE, BEST_EFFORT)
     publisher = record(shared, bag, BEST_EFFORT, subscribers=2)
     for k in range(20):
         publisher.publish(temperature(float(k)))
         shared.wait_until(lambda k=k: len(received) > k)
     # which is flushed twice a second
-    shared.wait_until(lambda: summary(bag).counts.get(TOPIC, 0) >= 20)
-    assert shared.set_bool('trainer/record', False).success
-    assert values(recorded(bag)) == list(range(20))
+    shared.wait_until(lambda: summary(second).counts.get(TOPIC, 0) >= 20)
+    assert shared.set_bool('trainer/record', False).message.endswith(str(second))
+    assert values(recorded(second)) == list(range(20))
     shared.node.destroy_publisher(publisher)
+    assert [path.read_text() for path in bag.iterdir()] == ['precious']
+    assert f'recording to {second}, because {bag} exists already' in shared.printed()
 
 
 def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Path) -> None:
@@ -184,7 +175,6 @@ def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Pa
     (result,) = ros.set_parameters('trainer', min_free_disk=1e9)
     assert result.successful
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
-    assert status.message.startswith(f'recording to {bag} stopped: ')
     assert 'below min_free_disk = 1000000000 MB; free some space and call' in status.message
     assert values(recorded(bag)) == list(range(900))
     ros.node.destroy_publisher(publisher)
@@ -243,10 +233,7 @@ def test_does_not_start_on_a_disk_with_too_little_room(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     bag = tmp_path / 'deep' / 'run'
     assert run_here(trainer, output=bag, min_free_disk=1e9) == 1
-    assert re.fullmatch(
-        rf'trainer: cannot start: cannot record: \d+ MB are free on the disk of {tmp_path}, below '
-        r'min_free_disk = 1000000000 MB: free some space, or choose another disk',
-        complaint(capfd))
+    assert re.search(rf'\d+ MB are free on the disk of {tmp_path}, below', complaint(capfd))
     assert not bag.parent.exists()
 
 
@@ -259,16 +246,6 @@ def test_free_name(tmp_path: Path) -> None:
     free = {'run': 'run_4', 'run.mcap': 'run_2.mcap', 'run_1.mcap': 'run_1_2.mcap', 'new': 'new',
             'v1.0': 'v1.0_2'}
     assert {wanted: free_name(tmp_path / wanted).name for wanted in free} == free
-
-
-def test_single_file_is_not_split() -> None:
-    table = trainer_table(load(model_path(reactor.MODEL)))
-    for limit in ({'max_bag_size': 1.0}, {'max_bag_duration': 60.0}):
-        assert table.check(table.snapshot({'output': 'run.mcap', **limit})) == (
-            "output = 'run.mcap' is one file, which max_bag_size and max_bag_duration cannot "
-            'split: give the name of a folder, without .mcap')
-        assert not table.check(table.snapshot({'output': 'run', **limit}))
-        assert not table.check(table.snapshot({'output': '', **limit}))
 
 
 UNSTAMPED = {f'{name}.{key}': value for name in ('temperature', 'coolant_temperature')

@@ -23,20 +23,17 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from koopman_ros.control import State
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import MODEL, PARAMETERS
-from koopman_ros.model import LiftedModel, load, ModelFileError, save
-from koopman_ros.parameters import model_checks
-from koopman_ros.parameters.controller import table_of
+from koopman_ros.model import load, save
 from koopman_ros.plants import Process
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.closed_loops import REACTOR
 from support.controller_bench import PATIENT, reproduced, STATUS, STEADY, until_read
-from support.nodes import opened, temperature, value
+from support.nodes import change, opened, temperature, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
 SETPOINTS = [(20.0 * k, 46.0 + math.sin(k)) for k in range(1, 150)]
@@ -116,7 +113,7 @@ def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None
         if len(bench.sent) - len(bench.commands) < 200:
             bench.measure()
 
-    timer = ros.node.create_timer(1.0 / 400.0, tick)
+    timer = ros.node.create_timer(1.0 / 100.0, tick)
     for k, name in enumerate(itertools.islice(itertools.cycle(NAMES), 12)):
         if k % 3 == 0:
             put(next(bad), file)
@@ -147,119 +144,53 @@ def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None
 SHIPPED = load(model_path('reactor_nz4'))
 
 
-def with_states(**changes: object) -> LiftedModel:
-    return replace(SHIPPED, states=replace(SHIPPED.states, **changes))
+def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
+        ros: Harness, tmp_path: Path) -> None:
+    ros.start('controller', PATIENT)
+    bench, file = Bench(ros), tmp_path / 'refused.safetensors'
 
-
-BAD_MODELS = {
-    'other unit': (
-        with_states(units=('degC',)),
-        'has states temperature [degC] and inputs coolant_temperature '
-        '[K], this controller was started for states temperature [K] and inputs'),
-    'nominal point outside its range': (
-        with_states(center=np.array([400.0])),
-        'degC, is outside its trained range, 31.85 degC to 53.85 degC'),
-    'below absolute zero': (
-        with_states(lower=np.array([-5.0])), 'which cannot be: train the model again'),
-    'range without the set-point': (
-        with_states(upper=np.array([324.8])),
-        f'set-point {STEADY:.2f} degC is outside the trained range 31.85 degC to 51.65 degC'),
-    'input without effect': (
-        replace(SHIPPED, A=-SHIPPED.A, B=np.zeros((1, 1))),
-        f'tried at temperature {STEADY:.6g} degC with the set-point temperature {STEADY:.6g} degC '
-        'the model fails (no feedback gain: the Hamiltonian has no stable subspace of full size'),
-    'gain beyond its bound': (
-        replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),
-    'refused by its training': (
-        replace(SHIPPED, provenance=replace(
-            SHIPPED.provenance, accepted=False, reasons=('too large an error',))),
-        'was refused (too large an error): train it again, or set load_refused_model'),
-    'numbers that overflow': (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
-}
-
-
-@pytest.fixture(scope='module')
-def running(shared_ros: Harness) -> Bench:
-    """Return a controller that tracks the first measurement."""
-    shared_ros.start('controller', PATIENT)
-    bench = Bench(shared_ros)
-    bench.measure(STEADY)
-    bench.wait_for_answers()
-    return bench
-
-
-@pytest.mark.parametrize('name', BAD_MODELS)
-def test_unsuitable_model_is_refused_with_the_reason(
-        running: Bench, tmp_path: Path, name: str) -> None:
     def measure() -> float:
-        running.measure(STEADY)
-        return running.wait_for_answers()
+        bench.measure(STEADY)
+        return bench.wait_for_answers()
 
-    ros = running.ros
-    model, words = BAD_MODELS[name]
-    save(model, tmp_path / 'bad.safetensors')
-    assert running.set('reactor_nz3')[0]
+    def change(**parameters: object) -> SetParametersResult:
+        return until_read(lambda: ros.set_parameters_atomically('controller', **parameters))
+
+    save(replace(SHIPPED, provenance=replace(
+        SHIPPED.provenance, accepted=False, reasons=('too large an error',))), file)
+    measure()
+    assert bench.set('reactor_nz3')[0]
     before = measure()
-    done, reason = running.set(tmp_path / 'bad.safetensors')
+    done, reason = bench.set(file)
     assert not done
     assert reason.startswith('the old model is kept: ')
-    assert words in reason
+    assert 'load_refused_model' in reason
     status = ros.wait_for_status(STATUS, lambda s: s.message == reason)
     assert status.level == DiagnosticStatus.WARN
     assert value(status, 'model') == 'reactor_nz3'
     assert ros.get_parameters('controller', 'model') == ['reactor_nz3']
     assert measure() == pytest.approx(before, abs=1e-9)
 
-    assert running.reload() == (
+    assert bench.reload() == (
         True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
         '53.85 degC; acceptance: never judged')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
 
-
-def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a package of the best one is missing, no other model would help."""
-    monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', None)
-    center = SHIPPED.states.center
-
-    def situation(*levels: str) -> model_checks.ModelCheckContext:
-        parameters = table_of(SHIPPED, {}).snapshot({'fallback_order': levels})
-        return model_checks.ModelCheckContext(parameters, State(), center, None)
-
-    model_checks.refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
-    bad = replace(SHIPPED, A=1e300 * SHIPPED.A)
-    with pytest.raises(ModelFileError, match='train it again'):
-        model_checks.refuse_without_law(bad, situation('mpc', 'sdre', 'linear'))
-    with pytest.raises(ModelFileError, match=r'pip install numba daqp\)$'):
-        model_checks.refuse_without_law(SHIPPED, situation('mpc'))
-
-
-def test_a_refused_model_is_loaded_where_the_operator_forces_it(
-        running: Bench, tmp_path: Path) -> None:
-    refused = str(tmp_path / 'refused.safetensors')
-    save(BAD_MODELS['refused by its training'][0], Path(refused))
-    result = running.ros.set_parameters_atomically(
-        'controller', load_refused_model=True, model=refused)
+    result = change(load_refused_model=True, model=str(file))
     assert result.successful, result.reason
-    done, about = running.reload()
+    done, about = bench.reload()
     assert done
     assert 'too large an error' in about
-    running.ros.set_parameters_atomically('controller', load_refused_model=False)
-    assert 'load_refused_model' in running.reload()[1]
-    assert running.ros.get_parameters('controller', 'model') == [refused]
-    assert running.set('reactor_nz3')[0]
+    assert change(load_refused_model=False).successful
+    assert 'load_refused_model' in bench.reload()[1]
+    assert ros.get_parameters('controller', 'model') == [str(file)]
 
-
-def test_model_changes_with_the_weights_that_it_needs(running: Bench) -> None:
-    def change(gain: float) -> SetParametersResult:
-        return running.ros.set_parameters_atomically(
-            'controller', model='reactor_linear', max_gain=gain)
-
-    assert 'the gain exceeds its bound' in until_read(lambda: change(1e-3)).reason
-    result = until_read(lambda: change(500.0))
+    # a model and the bound that it needs are changed together
+    assert 'the gain exceeds its bound' in change(model='reactor_linear', max_gain=1e-3).reason
+    result = change(model='reactor_linear', max_gain=500.0)
     assert result.successful, result.reason
-    assert running.ros.get_parameters('controller', 'model', 'max_gain') == [
-        'reactor_linear', 500.0]
+    assert ros.get_parameters('controller', 'model', 'max_gain') == ['reactor_linear', 500.0]
 
 
 def test_model_that_predicts_what_was_measured_much_worse_is_refused(
@@ -364,6 +295,17 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     ros.wait_until(reloaded.done)
     assert reloaded.result().success
     assert 'n_z = 3' in reloaded.result().message
+
+    # a node that is taken down while a file is read goes on when it is configured again
+    bench.ask_to_reload()
+    with opened(ros, disk(file)):
+        for transition in ('deactivate', 'cleanup'):
+            assert change(ros, 'controller', transition)
+    for transition in ('configure', 'activate'):
+        assert change(ros, 'controller', transition)
+    ros.meet('controller')
+    bench.measure()
+    ros.wait_until(lambda: len(bench.commands) == 51)
 
     # one that is changed during a slow reload stays
     reloaded = bench.ask_to_reload()

@@ -7,11 +7,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 import json
 import math
-import os
 from pathlib import Path
 import shutil
 import signal
-import subprocess
 import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -31,7 +29,7 @@ from koopman_ros.nodes import replay
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
-from koopman_ros.testing import Harness, isolated_domain
+from koopman_ros.testing import Harness
 from support.controller_bench import STEADY
 from support.nodes import complaint, run_here, seconds, temperature, value
 from support.recorded_runs import Recorded
@@ -222,18 +220,6 @@ def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Pa
                                   'reactor_nz3']
     steps = np.abs(np.diff(found.recorded[:, 0]))
     assert sum(steps > 0.49) > 10  # K; the rate limit at one sample a second
-
-
-def test_a_replay_on_several_threads_is_bit_identical(bag: Path, tmp_path: Path) -> None:
-    threads = {f'{name}_NUM_THREADS': '4' for name in ('OMP', 'OPENBLAS', 'MKL')}
-    with isolated_domain():
-        job = subprocess.run(
-            [sys.executable, '-c', 'import sys; from koopman_ros.process_entry import replay; '
-             'sys.exit(replay())', '--ros-args', '-p', f'bags:=[{bag}]', '-p',
-             f'output:={tmp_path}'], env={**os.environ, **threads}, capture_output=True, text=True,
-            timeout=240, check=False)
-    assert job.returncode == 0, job.stderr
-    assert 'recorded commands are reproduced bit for bit' in job.stdout
 
 
 def test_bag_that_was_cut_off_is_reproduced_as_far_as_it_is_whole(

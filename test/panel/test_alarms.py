@@ -184,16 +184,6 @@ def test_a_clock_that_is_set_back_leaves_the_remaining_times() -> None:
         assert len(alarms.standing) == standing
 
 
-def test_short_conditions_leave_nothing() -> None:
-    alarms = Alarms()
-    for number in range(1000):
-        for active in (True, False):
-            alarms.report(f'{number}', active, LOW, '', NOW + number + 0.5 * (not active))
-    assert alarms.journal(0.0) == alarms.standing == ()
-    assert not alarms._records
-    assert not alarms._running
-
-
 @pytest.mark.parametrize('hostile', [
     '<script>alert(1)</script>', 'a\nb\tc', 'x' * 5000, '\ud800', '\u202egnp.exe', '\0', ' '])
 def test_hostile_texts_are_bounded_and_printable(hostile: str) -> None:

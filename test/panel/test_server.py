@@ -112,7 +112,7 @@ def test_users_log_in_through_a_proxy_with_tls(site: Site) -> None:
     assert answer.status == 200
     with socketed(site, cookie, page_id(answer.content), source=PROXY, host=HOST,
                   origin=f'https://{HOST}', more={'X-Forwarded-Proto': 'https'}) as told:
-        assert told is True
+        assert told.accepted is True
     # without TLS at the proxy there is no such rule for the cookie
     answer = site.log_in('anna', source=PROXY, **forwarded('10.1.0.1', 'http'))
     assert 'secure' not in answer.headers['set-cookie']
@@ -186,10 +186,15 @@ def received(own: ClientConnection) -> str:
     return own.recv(TIMEOUT, decode=True)
 
 
+class Told(NamedTuple):
+    accepted: object
+    socket: ClientConnection
+
+
 @contextlib.contextmanager
 def socketed(site: Site, cookie: str, client_id: str, *, source: str = OTHER, host: str = '',
-             origin: str = '', more: dict[str, str] | None = None) -> Iterator[object]:
-    """Open a socket and ask to be that of a page; give the answer."""
+             origin: str = '', more: dict[str, str] | None = None) -> Iterator[Told]:
+    """Open a socket and ask to be that of a page."""
     with opened(site, cookie, {}, source, host, origin, more or {}) as own:
         assert received(own).startswith('0{')
         own.send('40')
@@ -200,7 +205,7 @@ def socketed(site: Site, cookie: str, client_id: str, *, source: str = OTHER, ho
         while not (answer := received(own)).startswith('430'):
             if answer == '2':
                 own.send('3')
-        yield json.loads(answer.removeprefix('430'))[0]
+        yield Told(json.loads(answer.removeprefix('430'))[0], own)
 
 
 def test_the_id_of_a_page_opens_it_to_its_own_session_alone(site: Site) -> None:
@@ -208,7 +213,7 @@ def test_the_id_of_a_page_opens_it_to_its_own_session_alone(site: Site) -> None:
     page = page_id(site.ask('GET', '/', Cookie=anna).content)
     for other in (site.cookie('otto'), site.cookie('olga'), site.cookie('anna')):
         with socketed(site, other, page) as told:
-            assert told is False
+            assert told.accepted is False
         with opened(site, other, {
                 'client_id': page, 'implicit_handshake': 'true', 'tab_id': 'tab',
                 'document_id': 'document', 'next_message_id': '0'}, OTHER, '', '', {}) as own:
@@ -216,7 +221,7 @@ def test_the_id_of_a_page_opens_it_to_its_own_session_alone(site: Site) -> None:
             own.send('40')
             assert received(own).startswith('44'), 'the connection is refused'
     with socketed(site, anna, page) as told:
-        assert told is True
+        assert told.accepted is True
 
 
 
@@ -233,15 +238,7 @@ def test_events_of_another_user_do_not_reach_a_page(site: Site) -> None:
         'id': train.id, 'client_id': page, 'listener_id': listener, 'args': []}])
 
     def sent(cookie: str) -> None:
-        with opened(site, cookie, {}, OTHER, '', '', {}) as own:
-            received(own)
-            own.send('40')
-            received(own)
-            own.send('420' + json.dumps(['handshake', {
-                'client_id': page, 'tab_id': 'tab', 'document_id': 'document',
-                'next_message_id': 0}]))
-            while not received(own).startswith('430'):
-                pass
+        with socketed(site, cookie, page) as (_, own):
             for junk in ('[]', '{"client_id": []}', '{}', '7', 'null'):
                 own.send(f'42["event",{junk}]')
             own.send(click)
@@ -420,11 +417,3 @@ def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
 def test_the_zoom_of_a_browser_is_checked(
         event: object, window: tuple[float, float] | None) -> None:
     assert zoomed(event) == window
-
-
-def test_without_chromium_a_test_says_how_to_install_it(
-        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv('PATH', str(tmp_path))
-    with pytest.raises(pytest.fail.Exception, match='sudo apt-get install chromium'), (
-            opened_browser()):
-        pass

@@ -163,22 +163,23 @@ def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
     assert now.states[0].span[1] >= 60.0
 
 
-def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
+def test_the_model_before_is_offered_and_the_predecessor_of_a_file_that_was_replaced() -> None:
     own = view()
-    own.take_parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})
-    state = {'mode': {'name': 'AUTOMATIC'}}
 
     def model(event: str, name: str, digest: str) -> str:
-        own.take_record(event, {'model': {'name': name, 'digest': digest}, 'state': state}, NOW)
+        own.take_record(event, {
+            'model': {'name': name, 'digest': digest}, 'parameters': {'model': name},
+            'state': {'mode': {'name': 'AUTOMATIC'}}}, NOW)
         return own.snapshot(NOW).previous_model
 
     assert model('snapshot', 'runs/new.safetensors', 'a') == ''
     # the same file once more
     assert model('model', 'runs/new.safetensors', 'a') == ''
     assert model('model', 'runs/new.safetensors', 'b') == 'runs/new.previous.safetensors'
-    own.take_parameters('controller', {
-        'model': parameter('model', 'runs/new.previous.safetensors')})
-    assert own.snapshot(NOW).previous_model == 'runs/new.safetensors'
+    # as a parameter of the same name, which the controller reads again
+    assert model('parameters', 'runs/new.safetensors', 'c') == 'runs/new.previous.safetensors'
+    assert model('parameters', 'reactor', 'd') == 'runs/new.safetensors'
+    assert model('parameters', 'runs/new.safetensors', 'c') == 'reactor'
 
 
 def test_bars_hold_ranges_and_values() -> None:

@@ -105,16 +105,6 @@ def test_a_lag_that_is_over_or_taken_away_leaves_the_command_itself() -> None:
 
 # The delay.
 
-def test_without_an_actuator_the_plant_is_the_same_to_the_bit() -> None:
-    system = one_state_reactor()
-    plant, alone = actuated(Actuator(), system), actuated(Actuator(), system)
-    for n in range(1, 20):
-        value = 300.0 + 3.0 * np.sin(n)
-        plant = given(plant, value).until(n * SECOND)
-        alone = replace(alone, u=np.array([value])).until(n * SECOND)
-        assert (plant.x[0], plant.u[0]) == (alone.x[0], alone.u[0])
-
-
 @pytest.mark.parametrize('samples', [0, 1, 3])
 def test_a_delay_of_samples_shifts_the_commands(samples: int) -> None:
     values = [float(n * n) for n in range(10)]

@@ -27,40 +27,25 @@ NOMINAL = 324.475443431599
 REACTORS = [one_state_reactor, two_state_reactor]
 
 
-def two_tanks():
-    return plant_class('two_tanks')().system()
-
-
-def quadruple_tank():
-    return plant_class('quadruple_tank')().system()
-
-
-def pendulum():
-    return plant_class('pendulum')().system()
-
-
+# by name, with a range of their states
 PLANTS = {
-    scalar_example: [0.3, 0.7, 2.0],
-    two_state_example: [0.5, 1.5, -2.0],
-    one_state_reactor: [310.0, 324.0, 360.0],
-    two_state_reactor: [310.0, 324.0, 360.0],
-    two_tanks: [0.02, 0.1, 0.4],
-    quadruple_tank: [0.02, 0.1, 0.4],
-    pendulum: [-2.0, 0.1, 3.0],
-}
+    'two_state_example': [0.5, 1.5, -2.0], 'reactor': [310.0, 324.0, 360.0],
+    'two_state': [310.0, 324.0, 360.0], 'two_tanks': [0.02, 0.1, 0.4],
+    'quadruple_tank': [0.02, 0.1, 0.4], 'pendulum': [-2.0, 0.1, 3.0], '': [0.3, 0.7, 2.0]}
 
 
 @pytest.fixture(params=PLANTS)
 def plant_and_states(request):
-    system = request.param()
+    system = plant_class(request.param)().system() if request.param else scalar_example()
     rng = np.random.default_rng(0)
     states = np.array(PLANTS[request.param])[:, None] + rng.uniform(0.0, 0.5, (3, system.n_x))
-    if request.param is two_state_reactor:
+    if request.param == 'two_state':
         states[:, 0] = [0.9, 0.5, 0.1]
     return system, states
 
 
-def test_jacobian_agrees_with_central_differences(plant_and_states):
+def test_derivatives_of_a_plant(plant_and_states):
+    """Jacobian by central differences, leading axes, drift and forcing, nominal point, pickle."""
     system, states = plant_and_states
     for j in range(system.n_x):
         step = np.zeros(system.n_x)
@@ -68,35 +53,19 @@ def test_jacobian_agrees_with_central_differences(plant_and_states):
         slope = (system.drift(states + step) - system.drift(states - step)) / (2.0 * step[j])
         np.testing.assert_allclose(
             system.drift_jacobian(states)[..., j], slope, rtol=1e-7, atol=1e-7)
-
-
-def test_functions_are_batched_over_leading_axes(plant_and_states):
-    system, states = plant_and_states
     stacked = np.stack([states, states[::-1]])
     np.testing.assert_array_equal(system.drift(stacked)[0], system.drift(states))
     np.testing.assert_array_equal(system.drift(stacked)[1, 2], system.drift(states[0]))
     assert system.drift_jacobian(stacked).shape == (2, 3, system.n_x, system.n_x)
-
-
-def test_derivative_is_drift_plus_forcing(plant_and_states):
-    system, states = plant_and_states
     u = np.linspace(1.0, 2.0, 3 * system.n_u).reshape(3, system.n_u)
     expected = [system.drift(x) + system.B @ v for x, v in zip(states, u, strict=True)]
     np.testing.assert_allclose(system.derivative(states, u), expected, rtol=1e-15)
     np.testing.assert_allclose(system.derivative(states[1], u[0]),
                                system.drift(states[1]) + system.B @ u[0], rtol=1e-15)
-
-
-def test_a_plant_rests_at_its_nominal_point_and_its_copy_is_the_same(plant_and_states):
-    system, states = plant_and_states
     rate = system.derivative(system.nominal_state, system.nominal_input)
     np.testing.assert_allclose(rate, 0.0, atol=1e-11)
     copy = pickle.loads(pickle.dumps(system))
     np.testing.assert_array_equal(copy.drift(states), system.drift(states))
-
-
-def test_arrays_are_float64_and_read_only(plant_and_states):
-    system, _ = plant_and_states
     for name in ('B', 'nominal_state', 'nominal_input', 'state_lower', 'state_upper'):
         array = getattr(system, name)
         assert array.dtype == np.float64
@@ -212,7 +181,7 @@ def test_state_that_no_input_holds(system, state, message):
 
 
 def test_training_is_told_everything_of_a_plant_but_its_drift():
-    system = two_tanks()
+    system = plant_class('two_tanks')().system()
     known = describe(system)
     # which it has of a B that is to be learned
     names = {field.name for field in fields(known)} - {'input_matrix_degree'}

@@ -29,7 +29,7 @@ from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from support.bag_samples import compressed_files, NUMBER, number
 
-MUTANTS = int(os.environ.get('BAG_MUTANTS', '40'))
+MUTANTS = int(os.environ.get('BAG_MUTANTS', '25'))
 MESSAGES = 60  # on each of two topics
 X, U = (MessageField(topic, NUMBER.type_name, 'data', '1') for topic in ('/x', '/u'))
 STATE, INPUT = records.RecordedState('x', '1', X), records.RecordedInput('u', '1', U)

@@ -100,7 +100,12 @@ def test_state_that_falls_silent_does_not_hold_up_the_others(tmp_path: Path) -> 
     assert account.dropped == {'measurement without cold': 20_000 - 30}
 
 
-def test_memory_does_not_grow_with_the_record(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(segments, 'MOST', 500)
+    monkeypatch.setattr(segments, '_MARGIN', 200)
+
     def peak(count: int) -> int:
         path = record(tmp_path / f'{count}.mcap', count)
         account = records.ImportReport()
@@ -112,5 +117,5 @@ def test_memory_does_not_grow_with_the_record(tmp_path: Path) -> None:
         finally:
             tracemalloc.stop()
 
-    peak(4000)
-    assert peak(24_000) < 1.1 * peak(8000)
+    peak(1000)
+    assert peak(7500) < 1.1 * peak(2500)

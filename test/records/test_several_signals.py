@@ -106,7 +106,7 @@ def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
     recorded = [path], [WARM, COLD], [COMMANDED]
     episodes, account = records.loop_episodes(*recorded)
     assert [len(episode) for episode in episodes] == [69, 50]
-    assert account.dropped == {'spike of a single sample (warm)': 1, 'beside a spike': 1}
+    assert account.dropped == {'spike of a single sample (warm)': 1, 'in a sample with a spike': 1}
     assert noted(account, 'jump', '42.1 degC', 'cold', '70.000 s')
     # a change of 25 K may not be one
     (episode,), _ = records.loop_episodes(*recorded, least_jumps=[1.0, 26.0])

@@ -20,17 +20,18 @@ CLOCK = records.MessageDefinition(
     'rosgraph_msgs/msg/Clock', 'builtin_interfaces/Time clock\n' + '=' * 80
     + '\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n', 'RIHS01_' + 'b' * 64)
 WALL = 1_700_000_000
+Clock = Callable[[float], float]
 
 
-def write(path: Path, logged: Callable[[float], float], told: Callable[[float], float],
+def write(path: Path, receipt_time: Clock, clock_time: Clock,
           clock: bool = True) -> Path:
     """Write 100 s of the wall clock: times of receipt [s], and times on /clock [s]."""
     with records.BagWriter(path) as writer:
         for topic, definition in (('/x', NUMBER), ('/u', NUMBER), ('/clock', CLOCK)):
             writer.add_topic(topic, definition)
         for k in range(200):
-            now = round(told(0.5 * k) * SECOND)
-            log_ns = round(logged(0.5 * k) * SECOND)
+            now = round(clock_time(0.5 * k) * SECOND)
+            log_ns = round(receipt_time(0.5 * k) * SECOND)
             if clock:
                 writer.write('/clock', HEAD + struct.pack('<iI', *divmod(now, SECOND)), log_ns)
             writer.write('/x', number(k), log_ns)
@@ -38,28 +39,28 @@ def write(path: Path, logged: Callable[[float], float], told: Callable[[float], 
     return path
 
 
-@pytest.mark.parametrize(('logged', 'told', 'seconds'), [
+@pytest.mark.parametrize(('receipt_time', 'clock_time', 'seconds'), [
     (lambda t: WALL + t, lambda t: 5.0 + t, 99.5),  # in real time
     (lambda t: 20.0 * t, lambda t: 20.0 * t, 1990.0),  # recorded with use_sim_time
     (lambda t: 20.0 * (t % 50.0), lambda t: 20.0 * (t % 50.0), 990.0),  # and started again
 ])
 def test_receipts_in_plant_time_count(
-        tmp_path: Path, logged: Callable[[float], float], told: Callable[[float], float],
+        tmp_path: Path, receipt_time: Clock, clock_time: Clock,
         seconds: float) -> None:
-    path = write(tmp_path / 'run.mcap', logged, told)
+    path = write(tmp_path / 'run.mcap', receipt_time, clock_time)
     episodes, _ = records.loop_episodes([path], [STATE], [INPUT])
     assert max(episode.time[-1] for episode in episodes) == pytest.approx(seconds)
 
 
-@pytest.mark.parametrize(('told', 'words'), [
+@pytest.mark.parametrize(('clock_time', 'words'), [
     (lambda t: 20.0 * t, r'x has no stamps, and 1990 s passed on /clock in 99.5 s'),
     (lambda t: 0.1 * t, r'9.95 s passed on /clock in 99.5 s'),
     (lambda t: min(t, 60.0), r'60 s passed on /clock in 99.5 s'),  # a pause
     (lambda t: 20.0 * (t % 50.0), r'1980 s passed on /clock in 99 s'),  # started again
 ])
 def test_receipts_in_another_time_are_refused(
-        tmp_path: Path, told: Callable[[float], float], words: str) -> None:
-    path = write(tmp_path / 'run.mcap', lambda t: WALL + t, told)
+        tmp_path: Path, clock_time: Clock, words: str) -> None:
+    path = write(tmp_path / 'run.mcap', lambda t: WALL + t, clock_time)
     with pytest.raises(records.BagReadError, match=f'{words}.*use_sim_time'):
         records.loop_episodes([path], [STATE], [INPUT])
 

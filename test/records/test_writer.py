@@ -84,25 +84,6 @@ def test_messages_carry_times_and_a_counter_by_topic(tmp_path: Path) -> None:
     assert [m.data for m in records.read_messages(writer.path)] == [data] * 4
 
 
-@pytest.mark.parametrize('compression', ['none', 'zstd', 'lz4'])
-def test_statistics_indexes_and_compression(tmp_path: Path, compression: str) -> None:
-    path = record(tmp_path / 'run.mcap', range(100, 120), max_chunk_bytes=200,
-                  compression=compression)
-    found = content(path)
-    statistics = found.statistics
-    assert (statistics.message_count, statistics.channel_message_counts) == (20, {1: 20})
-    assert (statistics.message_start_time, statistics.message_end_time) == (100, 119)
-    assert len(found.chunk_indexes) == statistics.chunk_count > 1
-    assert all(index.message_index_offsets for index in found.chunk_indexes)
-    assert {index.compression for index in found.chunk_indexes} == {
-        '' if compression == 'none' else compression}
-    assert len(found.metadata_indexes) == 2
-    with path.open('rb') as stream:
-        sent = [m.data for _, _, m in make_reader(stream, validate_crcs=True).iter_messages()]
-    assert sent == [m.data for m in records.read_messages(path)] == [
-        number(k) for k in range(100, 120)]
-
-
 @pytest.mark.parametrize(('environment', 'expected'), [(None, 'jazzy'), ('kilted', 'kilted')])
 def test_metadata_begins_empty_and_ends_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: str | None, expected: str
@@ -196,8 +177,8 @@ def test_one_file_is_not_split(tmp_path: Path, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(('name', 'options'), [
-    ('run', {}), ('run', {'compression': 'zstd', 'max_file_bytes': 4000}), ('run.mcap', {}),
-    *(('run.mcap', {'compression': compression}) for compression in ('zstd', 'lz4'))])
+    ('run', {'compression': 'zstd', 'max_file_bytes': 4000}), ('run.mcap', {}),
+    ('run.mcap', {'compression': 'lz4'})])
 def test_rosbags_reads_messages_offers_and_metadata(
     tmp_path: Path, write_bag: Callable[..., Path], samples: list[Sample], name: str,
     options: dict[str, Any]
@@ -218,6 +199,10 @@ def test_rosbags_reads_messages_offers_and_metadata(
             TOPICS, len(samples) // 4)
         found = [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
     assert found == [(s.topic, TOPICS[s.topic], s.log_time_ns, s.data) for s in samples]
+    # that mcap's own reader seeks by
+    index = content(path if path.is_file() else path / 'run_0.mcap').chunk_indexes
+    assert {one.compression for one in index} == {options.get('compression', '')}
+    assert all(one.message_index_offsets for one in index)
     assert (len(list(path.glob('*.mcap'))) > 2) == ('max_file_bytes' in options)
 
 

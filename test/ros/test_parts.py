@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of nodes: what goes with them; what a recorder and a plan write; models refused."""
+"""Parts of nodes: what goes with them; what a recorder and a plan write."""
 
-from dataclasses import replace
+from collections.abc import Callable
 import math
 from pathlib import Path
 import threading
@@ -14,7 +14,6 @@ from typing import Any
 from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
-from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import Temperature
@@ -24,23 +23,19 @@ from koopman_ros.control.laws import Plan
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from koopman_ros.model import LiftedModel, load, ModelFileError, save
-from koopman_ros.parameters import model_checks
+from koopman_ros.model import load
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.nodes.plant import PlantNode
+from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.parameters.signal_topics import Signals, signals_of, SignalTopics
-from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.signal_topics import Signals, signals_of
 from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.controller_messages import active_constraints, planned
 from koopman_ros.ros.controller_status import statuses
 from koopman_ros.ros.diagnostics import Severity
-from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
-from koopman_ros.ros.recording import Recording
-from koopman_ros.ros.training import Training
-from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
 from support.nodes import temperature, TIMEOUT
 
@@ -48,60 +43,29 @@ SIGNALS = signals_of(load(model_path(reactor.MODEL)))
 NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
 
 
-class PartNode(ManagedNode):
-    """A managed node of one part."""
-
-    def __init__(self, part: str, folder: Path, context: Context) -> None:
-        super().__init__('part', context=context)
-        self._part, self._folder = part, folder
-
-    def configure(self) -> None:
-        table = trainer_table(load(model_path(reactor.MODEL)))
-        settings = table.snapshot({'output': str(self._folder / 'bag')})
-        wiring = SignalTopics(SIGNALS, settings.states, settings.inputs)
-        match self._part:
-            case 'endpoint monitor':
-                monitor = topics.EndpointMonitor(self, lambda: None)
-                monitor.publish('mine', Temperature)
-                monitor.subscribe('other', lambda _: None, Temperature)
-                self.complete = lambda: None
-            case 'recorder':
-                self.complete = Recorder(self, BagWriter(self._folder / 'bag'), NAMES,
-                                         topics.expected_topics(wiring)).close
-            case 'recording':
-                recording = Recording(self, settings, wiring)
-                recording.start()
-                self.complete = recording.complete
-            case 'experiment':
-                experiment = PlantExperiment(self, settings, wiring)
-                assert experiment._start() == ''
-                self.complete = experiment.complete
-            case 'training':
-                training = Training(self, settings, wiring, lambda: str(self._folder / 'missing'))
-                training.start()
-                self.complete = training.complete
-            case 'watchdog':
-                watchdog = Watchdog(lambda _: None)
-                watchdog.start()
-                self.complete = watchdog.end
-
-
-@pytest.mark.parametrize('part', ['endpoint monitor', 'recorder', 'recording', 'experiment',
-                                  'training', 'watchdog'])
-def test_clean_up_removes_everything_that_a_part_created(
-        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+@pytest.mark.parametrize('create', [PlantNode, ControllerNode, TrainerNode])
+def test_clean_up_removes_everything_that_a_node_created(
+        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        create: Callable[..., ManagedNode]) -> None:
     # a training that loads no library, and ends when it is asked to
     monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
         'sh', '-c', 'cat > /dev/null'))
-    node = PartNode(part, tmp_path, shared_ros.node.context)
+    node = create(context=shared_ros.node.context, cli_args=[
+        '--ros-args', '-p', f'output:={tmp_path}/bag', '-p', f'bags:=[{tmp_path}/missing]'])
 
     def created() -> tuple[object, ...]:
         return (*map(set, (node.publishers, node.subscriptions, node.services, node.timers)),
                 set(threading.enumerate()), tuple(node.diagnostics.tasks))
 
     before = created()
-    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    node.start()
+    if isinstance(node, TrainerNode):
+        assert node._experiment is not None
+        assert node._training is not None
+        assert node._experiment._start() == ''
+        node._training.start()
     assert created() != before
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     assert created() == before
     node.destroy_node()
@@ -160,52 +124,6 @@ def test_time_of_receipt(received: float, source: float, found: float) -> None:
             'source_timestamp': round(source * NANOSECONDS)}
     assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS) == round(
         found * NANOSECONDS)
-
-
-@pytest.mark.parametrize(('state', 'coolant', 'fits'), [
-    ('temperature', 'coolant_temperature', True), ('T', 'coolant_temperature', False),
-    ('temperature', 'coolant', False), ('coolant_temperature', 'temperature', False)])
-def test_model_of_other_signals_than_the_controller_was_started_for_is_refused(
-        tmp_path: Path, state: str, coolant: str, fits: bool) -> None:
-    """By name: one that takes the coolant for what is controlled would cool where it is cold."""
-    path, shipped = tmp_path / 'x.safetensors', load(model_path('reactor_nz4'))
-    save(replace(shipped, states=replace(shipped.states, names=(state,)),
-                 inputs=replace(shipped.inputs, names=(coolant,))), path)
-    # it may be the one to start with
-    assert load_suitable(str(path)).model.states.names[0] == state
-    if fits:
-        assert load_suitable(str(path), SIGNALS).model.states.names[0] == state
-        return
-    with pytest.raises(ModelFileError, match=(
-            rf'has states {state} \[K\] and inputs {coolant} \[K\], this controller was started '
-            r'for states temperature \[K\] and inputs coolant_temperature \[K\]: choose a model')):
-        load_suitable(str(path), SIGNALS)
-
-
-def test_model_whose_step_takes_too_long_is_refused_with_its_time(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    """No model within the bounds takes that long, so the limit is moved."""
-    monkeypatch.setattr(model_checks, '_LONGEST_STEP', 1e-7)
-    with pytest.raises(ModelFileError, match=(
-            r'a control step with the model takes [0-9.e-]+ s of a processor, at most 1e-07 s are '
-            r'allowed: train one with fewer coordinates \(n_z = 4\)$')):
-        load_suitable('reactor_nz4')
-
-
-def test_model_whose_step_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise np.linalg.LinAlgError('Eigenvalues did not converge')
-
-    monkeypatch.setattr(LiftedModel, 'distance', fail)
-    with pytest.raises(ModelFileError, match=r'model fails .*Eigenvalues did not converge'):
-        load_suitable('reactor_nz4')
-
-
-@pytest.mark.parametrize('name', ['x' * 5000 + '.safetensors', '/tmp/\0.safetensors'])
-def test_name_that_is_no_path_is_not_repeated_at_length(name: str) -> None:
-    with pytest.raises(ModelFileError, match='is no path of a file, which has at most 4096') as e:
-        load_suitable(name)
-    assert len(str(e.value)) < 200
 
 
 def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_state() -> None:

@@ -159,7 +159,7 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
         message.clock.sec, message.clock.nanosec = sec, nanosec
         clock.publish(message)
         ros.meet('controller')
-    ros.wait_until(lambda: '/clock told sec -5, nanosec 0, which is no time: ignored' in (
+    ros.wait_until(lambda: '/clock has sec -5, nanosec 0, which is no valid time: ignored' in (
         process.output()))
     # the true time is taken still
     clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))
@@ -219,9 +219,7 @@ PARAMETERS = '/**:\n  ros__parameters:\n    '
     (plant, None, 'Error opening YAML file'),
     (plant, 'plant: [1, 2\n foo: : bar\n', "Couldn't parse params file"),
     (trainer, '/**:\n  speed: 1.0\n', 'Cannot have a value before ros__parameters'),
-    (player, f'{PARAMETERS}topics: []\n',
-     'topics = [] must be a list of at least one string, e.g. [a, b]'),
-    (plant, f'{PARAMETERS}speed: 1\n', 'speed = 1 must be a double, e.g. 1.0'),
+    (player, f'{PARAMETERS}topics: []\n', 'topics = [] must be a list of at least one string'),
     (controller, f'{PARAMETERS}coolant_temperature: {{max_disturbance: -1.0}}\n',
      'coolant_temperature.max_disturbance = -1.0 K must be in [0, 1000000000] K'),
     (controller, f'{PARAMETERS}model: /nowhere/lift.safetensors\n', '/nowhere/lift.safetensors'),

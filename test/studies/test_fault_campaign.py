@@ -17,12 +17,12 @@ from koopman_ros.event_log.records import parse
 from studies.faults import interceptor
 from studies.faults.__main__ import main
 from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
-from studies.faults.cases import CASES
+from studies.faults.cases import CASES, refused_values
 from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
 from studies.faults.interceptor import Packet
 from studies.faults.judge import judge, out_of_range, responses
-from studies.faults.plants import QUADRUPLE_TANK
+from studies.faults.plants import FaultPlant, QUADRUPLE_TANK, REACTOR, TWO_TANKS
 from studies.faults.processes import second_controller
 from studies.faults.report import write
 from support.recorded_runs import Recorded, STEADY
@@ -218,6 +218,12 @@ def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
     assert found['reasons'] == []
     assert found['answers']['measurements'] > 100
     assert set(found['recorded'].values()) == {found['answers']['answered']}
+
+
+@pytest.mark.parametrize('on', [REACTOR, TWO_TANKS, QUADRUPLE_TANK])
+def test_refused_values_are_of_parameters_that_exist(on: FaultPlant) -> None:
+    names = {name for change in refused_values(on) for name in change}
+    assert names <= set(on.table.rows)
 
 
 def test_report_and_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

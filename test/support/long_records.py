@@ -47,7 +47,7 @@ def simulated(samples: int, runs: int, seed: int, noise: float = _NOISE) -> tupl
 def write(path: Path, topics: Sequence[str], values: Array, period: float, start: float = 1.0
           ) -> Path:
     """Write numbers (N, topics) as stamped messages, one of each topic a sample."""
-    with BagWriter(path) as writer:
+    with BagWriter(path, max_chunk_bytes=2**16) as writer:
         for topic in topics:
             writer.add_topic(topic, message_definition(TYPE))
         for k, row in enumerate(values.tolist()):

@@ -14,6 +14,8 @@ from typing import Any, BinaryIO
 import warnings
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
@@ -60,6 +62,12 @@ def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
     folder = tmp_path_factory.mktemp('shared')
     with Harness(folder) as bench:
         yield bench
+
+
+def change(ros: Harness, node: str, label: str = '', number: int = 0) -> bool:
+    """Ask for a transition by its label, or as managers do by its number."""
+    return bool(ros.call(ChangeState, f'{node}/change_state', ChangeState.Request(
+        transition=Transition(label=label, id=number))).success)
 
 
 def run_here(program: ModuleType, *arguments: str, **parameters: object) -> int:

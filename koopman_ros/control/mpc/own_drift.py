@@ -9,11 +9,6 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.model import LiftedModel
 
 
-def has_own_drift(model: LiftedModel) -> bool:
-    """Return whether a subclass computes the drift, unknown to the compiled functions."""
-    return type(model).drift is not LiftedModel.drift
-
-
 def roll_out(model: LiftedModel, u: Array, x: Array, w: Array, x_ref: Array, u_ref: Array,
              lengths: Array, steps: int, Q: Array, R: Array) -> tuple[Array, Array]:
     """Return the same as :func:`koopman_ros.control.mpc.condensing.roll_out`."""

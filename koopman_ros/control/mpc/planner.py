@@ -74,7 +74,9 @@ class Planner:
     def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
                  state_upper: Array) -> None:
         self._model, self._tuning, self._weights = model, tuning, weights
-        self._arrays, self._own_drift = model_arrays(model), own_drift.has_own_drift(model)
+        self._arrays = model_arrays(model)
+        # of a subclass that computes it in its own way, unknown to the compiled functions
+        self._own_drift = type(model).drift is not LiftedModel.drift
         inputs, limits = model.inputs, tuning.limits
         self._lower = np.maximum(inputs.to_deviation(limits.lower), -_INFINITY)
         self._upper = np.minimum(inputs.to_deviation(limits.upper), _INFINITY)

@@ -21,6 +21,7 @@ from koopman_ros.learning.identification.total_variation import noise_level
 from koopman_ros.learning.identification.weak_form import regress
 
 _GROWTH = 2.0  # exponent by which roll-outs that judge an unstable plant may grow
+_MEMORIES = 10.0  # slowest time constants of a simulation
 _SHORTEST = 20  # samples of a segment, whatever grows
 
 
@@ -41,9 +42,10 @@ class SplitRecord:
         self.parts = segments_of(episodes, signals)
         # which samples of all episodes each of them holds
         edges = np.cumsum([0, *map(len, episodes)]).tolist()
-        numbered = [replace(episode, x=np.arange(*ends, dtype=np.float64)[:, None])
-                    for episode, ends in zip(episodes, itertools.pairwise(edges), strict=True)]
-        self._rows = [part.x[:, 0].astype(int) for part in segments_of(numbered, signals)]
+        self._numbered = [
+            replace(episode, x=np.arange(*ends, dtype=np.float64)[:, None])
+            for episode, ends in zip(episodes, itertools.pairwise(edges), strict=True)]
+        self._rows = [part.x[:, 0].astype(int) for part in segments_of(self._numbered, signals)]
         # a filter that knows nothing at first knows more when an episode has lasted a while
         begins = {episode.time[0] for episode in episodes} if hidden else set()
         self._settled = [i for i, part in enumerate(self.parts) if part.time[0] not in begins]
@@ -53,8 +55,8 @@ class SplitRecord:
         self.choose, self.held_out = (
             [i for i in share if i in self._settled] for share in (choose, held_out))
         if not (self.choose and self.held_out):
-            raise ValueError('the episodes are too short for a filter to find what is not '
-                             'measured: record longer without gaps')
+            raise ValueError('the episodes are too short for a filter to estimate unmeasured '
+                             'states: record longer without gaps')
         self.step = longest_step(self.parts)  #: longest of a roll-out
         self._last: tuple[Predictor[Drift], FilterRun] | None = None
         #: usual time between samples
@@ -71,6 +73,30 @@ class SplitRecord:
         pieces = self._pieces([replace(self.parts[i], x=self._rows[i][:, None].astype(float))
                                for i in parts], samples)
         return run.foreseen[[int(piece.x[0, 0]) for piece in pieces]]
+
+    def simulated(self, predictor: Predictor[Drift], samples: int, fit: Sequence[int],
+                  judge: Sequence[int], settling: int) -> tuple[Segments, Segments, Array]:
+        """
+        Return the record in pieces for simulations, which go on through what does not count.
+
+        :param samples: longest piece.
+        :param settling: first samples of each piece, which count with the segments to fit to:
+            they determine the start.
+        :return: pieces of which the segments to fit to count, the same with those to judge by, and
+            the states (M, n_x) foreseen for their first samples, in deviations.
+        """
+        pieces, numbers = cut(self._episodes, samples), cut(self._numbered, samples)
+        rows = [piece.x[:, 0].astype(int) for piece in numbers]
+        counts = np.zeros((1 + max(int(own[-1]) for own in rows), 2))
+        counts[self._rows_of(fit), 0] = counts[self._rows_of(judge), 1] = 1.0
+        for own in rows:
+            counts[own[:settling]] = 1.0, 0.0
+        data = Segments.of(pieces, self.step)
+        flags = Segments.of([replace(piece, x=counts[own])
+                             for piece, own in zip(pieces, rows, strict=True)], self.step).x
+        fitted, judged = (replace(data, measured=data.measured & (flags[..., i] > 0.0))
+                          for i in range(2))
+        return fitted, judged, self._run(predictor).foreseen[[int(own[0]) for own in rows]]
 
     def innovations(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None
                     ) -> Array:
@@ -114,6 +140,15 @@ class SplitRecord:
         if fastest * self.period * longest <= growth:
             return longest
         return max(_SHORTEST, int(growth / (fastest * self.period)))
+
+    def memory(self, drift: Drift) -> int:
+        """Return samples over which a plant forgets its start, or an unstable one goes far."""
+        fastest = float(np.max(np.linalg.eigvals(drift.slope(drift.box.states.center)).real))
+        shortest = max(len(part) for part in self.parts)
+        if fastest * self.period * shortest > _GROWTH:
+            return self.length(drift, _GROWTH)
+        longest = max(len(episode) for episode in self._episodes)
+        return int(min(longest, max(shortest, _MEMORIES / max(-fastest * self.period, 1e-9))))
 
     @staticmethod
     def _pieces(episodes: list[Episode], samples: int | None) -> list[Episode]:

@@ -225,7 +225,7 @@ class Segments:
 
     def path(self, rate: Rate, x0: Array) -> Array:
         """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
-        path = np.empty(self.x.shape)
+        path = np.empty((*self.x.shape[:2], x0.shape[-1]))
         path[0] = x = x0
         with np.errstate(all='ignore'):
             for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):

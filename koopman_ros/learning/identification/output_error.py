@@ -142,7 +142,8 @@ class Refined(Generic[_Model]):
 
 def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Array,
                      deviation: Array, *, settling: int = 0, smooth: bool = False,
-                     tolerance: float = 1e-4,
+                     tolerance: float = 1e-4, penalty: Array | None = None,
+                     iterations: int = _MAX_ITERATIONS,
                      monitor: Callable[[int, float], bool] | None = None) -> Refined[_Model]:
     """
     Refine a drift model and a filter's gain until the next measurement is foreseen best.
@@ -161,10 +162,12 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
     :param smooth: whether the starts are refined in place of the gain. With both a predictor would
         be found that is not stable and fits its starts to the noise.
     :param tolerance: relative decrease of the cost that ends it.
+    :param penalty: (p,) weights of the squares of the model's parameters in the cost (ridge).
+    :param iterations: limit on steps tried.
     """
-    problem = _Problem(model, segments, gain, starts, deviation, settling, smooth)
+    problem = _Problem(model, segments, gain, starts, deviation, settling, smooth, penalty)
     theta: Array = minimise(
-        problem.add_residuals, problem.start(), max_iterations=_MAX_ITERATIONS,
+        problem.add_residuals, problem.start(), max_iterations=iterations,
         tolerance=tolerance, patience=3, monitor=monitor).theta.numpy()
     refined, K, starts = problem.split(theta)
     cost = normal_equations(problem.add_residuals, torch.from_numpy(theta), derivatives=False).cost
@@ -182,6 +185,7 @@ class _Problem(Generic[_Model]):
     deviation: Array
     settling: int = 0
     smooth: bool = True
+    penalty: Array | None = None
 
     def start(self) -> Tensor:
         """Return the parameters to begin with."""
@@ -261,6 +265,12 @@ class _Problem(Generic[_Model]):
                                          data.steps[k][:, None, None])
         found = () if sums is None else sums.result()
         equations.add_sums(cost, *(torch.from_numpy(a / self.count) for a in found))
+        if self.penalty is not None:
+            weights = np.zeros(len(theta))
+            weights[:len(self.penalty)] = self.penalty
+            slope = weights * theta.numpy()
+            equations.add_sums(0.5 * float(slope @ theta.numpy()), *(
+                map(torch.from_numpy, (slope, np.diag(weights))) if found else ()))
 
 
 class _Sums:

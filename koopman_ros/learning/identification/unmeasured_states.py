@@ -8,17 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 from dataclasses import dataclass, replace
+import itertools
+from typing import TypeVar
 
 import numpy as np
 
 from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.data_split import SplitRecord
-from koopman_ros.learning.identification.drift import DriftModel
+from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
     INNOVATIONS_FORM,
+    OUTPUT_ERROR,
     Score,
     stage_by_stage,
     Stopped,
@@ -30,11 +33,14 @@ from koopman_ros.learning.identification.innovations_form import (
     SETTLING,
     standardised,
 )
+from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import (
     innovations_form,
     PolynomialCoefficients,
+    Refinable,
+    Refined,
 )
-from koopman_ros.model import Box
+from koopman_ros.model import Box, Coordinates
 
 HIGHEST_DEGREE = 3
 UNIT = '1'  # of a state that is not measured: any other scale would do as well
@@ -45,47 +51,61 @@ _SAMPLES = 20  # between samples, in which rates are counted at first
 # A larger model must err less by so many standard errors of the difference.
 _SIGMAS = 2.0
 
+_UNITS, _STARTS = 8, 2  # hidden units of a network, and how often it is learned with each ridge
+_RIDGES = (1e-4, 1e-6)  # weights of its squared parameters beside the mean squared error
+_ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
+_EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
+_LOST = 10.0  # half-ranges from the measurement
+
 _Polynomial = Predictor[DriftModel]
+_Model = TypeVar('_Model', bound=Refinable)
 
 
 @dataclass(frozen=True)
 class _StructureCandidate:
-    """A predictor, and how it foresees the segments to choose by."""
+    """A model with the gain of a filter, and how far its simulations are from measurements."""
 
-    predictor: _Polynomial
+    model: Refinable
+    gain: Array  #: (n_x, n_y) of the filter, in deviations
     hidden: int
-    innovations: Array  #: (N, n_y) there, in deviations
-    deviation: Array  #: (n_y,) standard deviations of the innovations over all segments
+    method: str
+    errors: Array  #: (N, n_y) of simulations of the segments to choose by, in deviations
+
+    @property
+    def label(self) -> str:
+        count = self.hidden
+        return f'{self.method}, {count} {"state" if count == 1 else "states"} not measured'
 
     @property
     def degree(self) -> int:
-        return self.predictor.drift.degree
+        return getattr(self.model.drift, 'degree', 1)
 
     @property
-    def method(self) -> str:
-        count = self.hidden
-        return f'{INNOVATIONS_FORM}, {count} {"state" if count == 1 else "states"} not measured'
+    def score(self) -> Score:
+        scale = self.model.drift.box.states.scale[:self.errors.shape[1]]
+        squares = np.mean(self.errors ** 2, axis=0)
+        return Score(self.label, self.degree, scale * np.sqrt(squares), float(np.mean(squares)))
 
 
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
                         highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
                         watch: Watch = lambda *_: False, backend: Backend | None = None
-                    ) -> Identified:
+                        ) -> Identified:
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
-    A polynomial drift, a filter's gain and the starts of all segments are refined until the next
-    measurement is foreseen, see :func:`innovations_form`; first linear models, from filters that
-    know nothing of the plant, then models of higher degree from those below. Of all numbers of
-    states that are not measured and all degrees the smallest model is taken that foresees
-    segments held out for the choice about as well as the best, and fitted to these, too. States
-    that are not measured are what the filter makes of them: of the unit 1, from -1 to 1, and
-    uncorrelated with the measurements; no record tells their own names and units.
+    First the next measurement is foreseen by a filter, see :func:`innovations_form`: linear
+    models, from filters that know nothing of the plant, then polynomials of higher degree. From
+    each of them simulations of the record are refined (output error), also with a small network
+    beside a linear drift. Of all numbers of states that are not measured and all drifts the
+    smallest model is taken whose simulations of segments held out for the choice err about as
+    little as the best, and fitted to these, too. States that are not measured are what the filter
+    makes of them: of the unit 1, from -1 to 1; no record tells their own names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
-    :param highest_degree: of f.
-    :param seed: of the split.
+    :param highest_degree: of polynomials f.
+    :param seed: of the split, and of networks.
     :param backend: where each number of states is tried; this process by default.
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
@@ -97,43 +117,46 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                          'input_matrix_degree to 0')
     record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
-    total = hidden * highest_degree + 2
+    total = hidden * (highest_degree + 1) + 2
     words = {f'{count} {"state" if count == 1 else "states"} not measured': count
              for count in range(1, hidden + 1)}
     candidates: list[_StructureCandidate] = []
-    under_way = dict.fromkeys(words, 0)  # degrees that were tried
+    under_way = dict.fromkeys(words, 0)  # kinds of drift that were tried
 
-    def told(name: str, degree: int | None) -> bool:
-        if degree is not None:
-            under_way[name] = degree - 1
-        text = f'drift of degree {degree} with {name}' if degree else 'drift'
+    def progress(name: str, kind: int | None) -> bool:
+        if kind is not None:
+            under_way[name] = kind - 1
+        text = 'drift' if not kind else (
+            f'drift of degree {kind} with {name}' if kind <= highest_degree else
+            f'network with {name}')
         if watch(sum(under_way.values()), total, text):
             raise Stopped
         return False
 
+    first = _Search(record).linear(1, lambda *_: progress(next(iter(words)), 1))
+    shared = _Shared(record, highest_degree, seed, record.memory(first.drift))
     with contextlib.closing((backend or Serial()).run(
-            _tried, words, shared=(record, highest_degree), watch=told)) as results:
+            _tried, words, shared=shared, watch=progress)) as results:
         for name, found in results:
-            under_way[name] = highest_degree
+            under_way[name] = highest_degree + 1
             candidates += found
-    progress = stage_by_stage(watch, total, hidden * highest_degree)
+    stage = stage_by_stage(watch, total, hidden * (highest_degree + 1))
     if not candidates:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
     best = _plainest(candidates)
-    monitor = progress(f'drift of degree {best.degree} on all episodes')
-    predictor = _Search(record, best.deviation).refined(
-        sorted([*record.fit, *record.choose]), best.predictor, monitor)
-    scale = predictor.drift.box.states.scale[:len(plant.state_names)]
-    return replace(record.identified(predictor, best.method, [
-        Score(one.method, one.degree, scale * np.sqrt(np.mean(one.innovations ** 2, axis=0)),
-              float(np.mean(one.innovations ** 2))) for one in candidates],
-        progress('linear model')), warnings=warnings)
+    monitor = stage(f'{best.model.drift.form} on all episodes')
+    predictor = _fitted(shared, best, monitor)
+    return replace(record.identified(
+        predictor, best.label, [one.score for one in candidates], stage('linear model')),
+        warnings=warnings)
 
 
 def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
-    """Return the smallest whose squared innovations are not clearly above the least."""
-    scale = np.min([np.mean(one.innovations ** 2, axis=0) for one in candidates], axis=0)
-    squares = [np.mean(one.innovations ** 2 / scale, axis=1) for one in candidates]
+    """Return the smallest whose squared errors are not clearly above the least."""
+    scale = np.min([np.mean(one.errors ** 2, axis=0) for one in candidates], axis=0)
+    # errors of a simulation last: in blocks they are independent
+    squares = [np.array([np.mean(block ** 2 / scale) for block in np.array_split(
+        one.errors, max(2, len(one.errors) // SETTLING))]) for one in candidates]
     least = min(squares, key=np.mean)
 
     def worse(own: Array) -> bool:
@@ -141,26 +164,149 @@ def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
         return bool(np.mean(excess) > _SIGMAS * np.std(excess) / np.sqrt(len(excess)))
 
     able = [one for one, own in zip(candidates, squares, strict=True) if not worse(own)]
-    return min(able, key=lambda one: one.predictor.drift.coefficients.size)
+    return min(able, key=lambda one: len(one.model.theta))
 
 
-def _tried(shared: tuple[SplitRecord, int], count: int, tell: Tell) -> list[_StructureCandidate]:
-    """Return predictors with so many hidden states, of rising degree, until none is found."""
-    record, highest_degree = shared
-    search, candidates = _Search(record), list[_StructureCandidate]()
-    for degree in range(1, highest_degree + 1):
-        def monitor(*_: object, degree: int = degree) -> bool:
-            return tell(degree)
+@dataclass(frozen=True)
+class _Shared:
+    """What all candidates are made of."""
 
-        monitor()
+    record: SplitRecord
+    highest_degree: int
+    seed: int
+    samples: int  #: of a simulation
+
+    def simulations(self, predictor: Predictor[Drift], fit: Sequence[int], judge: Sequence[int]
+                    ) -> tuple[Segments, Segments, Array]:
+        """Return the pieces to fit to, those to judge by, and their foreseen starts."""
+        return self.record.simulated(
+            predictor, self.samples, fit, judge, min(SETTLING, self.samples // 3))
+
+
+def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]:
+    """Return candidates with so many hidden states: polynomials of rising degree, and networks."""
+    record, search, found = shared.record, _Search(shared.record), list[_StructureCandidate]()
+    last: _Polynomial | None = None
+    linear: Refined[PolynomialCoefficients] | None = None
+
+    def begin(kind: int) -> Callable[..., bool]:
+        tell(kind)
+        return lambda *_: tell(kind)
+
+    for degree in range(1, shared.highest_degree + 1):
+        monitor = begin(degree)
         try:
-            found = search.refined(record.fit, raised(candidates[-1].predictor), monitor) if (
-                candidates) else search.linear(count, monitor)
-            candidates.append(_StructureCandidate(
-                found, count, record.innovations(found, record.choose), search.deviation))
+            last = search.linear(count, monitor) if last is None else search.refined(
+                record.fit, raised(last), monitor)
+            foreseeing = _Candidates(shared, last, count)
+            found += foreseeing.judged(
+                PolynomialCoefficients(last.drift, search.learn_B), foreseeing.starts,
+                INNOVATIONS_FORM)
+            refined = foreseeing.refined(PolynomialCoefficients(last.drift, search.learn_B),
+                                         monitor)
         except (ValueError, np.linalg.LinAlgError):
             break
-    return candidates
+        found += foreseeing.judged(refined.model, refined.starts, OUTPUT_ERROR)
+        if linear is None:
+            linear, beside = refined, foreseeing
+    explained = _EXPLAINED * float(np.mean(search.deviation ** 2))
+    if linear is not None and all(np.mean(one.errors ** 2) > explained for one in found):
+        monitor = begin(shared.highest_degree + 1)
+        for start, ridge in itertools.product(range(_STARTS), _RIDGES):
+            network = NetworkDrift.beside(
+                linear.model.drift, _UNITS, shared.seed + start, ridge=ridge,
+                learn_input_matrix=search.learn_B)
+            refined_network = beside.refined(network, monitor, linear.starts)
+            found += beside.judged(refined_network.model, refined_network.starts, OUTPUT_ERROR)
+    return found
+
+
+class _Candidates:
+    """Models that are simulated from where a filter foresees the first samples."""
+
+    def __init__(self, shared: _Shared, predictor: _Polynomial, count: int) -> None:
+        self._gain, self._count = predictor.gain, count
+        record = shared.record
+        self._fitted, self._judged, self.starts = shared.simulations(
+            predictor, record.fit, record.choose)
+
+    def refined(self, model: _Model, monitor: Callable[..., bool], starts: Array | None = None
+                ) -> Refined[_Model]:
+        """Return a model whose simulations err least."""
+        return _simulated(model, self._gain, self._fitted,
+                          self.starts if starts is None else starts, monitor)
+
+    def judged(self, model: Refinable, starts: Array, method: str) -> list[_StructureCandidate]:
+        """Return the candidate of a model, or none where its simulations diverge."""
+        drift, n_y = model.drift, self._gain.shape[1]
+        states, data = drift.box.states, self._judged
+        path = data.path(drift.rate, states.to_physical(starts))[data.measured]
+        errors = (path[:, :n_y] - data.x[data.measured]) / states.scale[:n_y]
+        if not np.all(np.abs(errors) < _LOST):
+            return []
+        return [_StructureCandidate(model, self._gain, self._count, method, errors)]
+
+
+def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
+               monitor: Callable[..., bool]) -> Refined[_Model]:
+    penalty = model.penalty if isinstance(model, NetworkDrift) else None
+    return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
+                            tolerance=_TOLERANCE, penalty=penalty, iterations=_ITERATIONS,
+                            monitor=monitor)
+
+
+def _fitted(shared: _Shared, best: _StructureCandidate, monitor: Callable[..., bool]
+            ) -> Predictor[Drift]:
+    """Return the best candidate, fitted to the segments to choose by, too, with its filter."""
+    record = shared.record
+    parts = sorted([*record.fit, *record.choose])
+    start = Predictor(best.model.drift, best.gain)
+    deviation = np.std(record.innovations(start), axis=0)
+    if best.method == INNOVATIONS_FORM:
+        assert isinstance(best.model, PolynomialCoefficients)
+        return _Search(record, deviation).refined(
+            parts, Predictor(best.model.drift, best.gain), monitor)
+    data, _, starts = shared.simulations(start, parts, record.held_out)
+    model = _simulated(best.model, best.gain, data, starts, monitor).model
+    start = Predictor(model.drift, best.gain)
+    found = innovations_form(
+        _Known(model.drift), best.gain, record.segments(parts), record.foreseen(start, parts),
+        deviation, settling=min(SETTLING, min(len(record.parts[i]) for i in parts) // 3),
+        monitor=monitor)
+    predictor = Predictor(model.drift, found.gain)
+    estimates = record.estimates(predictor)
+    if isinstance(predictor.drift, DriftModel):
+        return standardised(Predictor(predictor.drift, found.gain), estimates)
+    assert isinstance(predictor.drift, NetworkDrift)
+    return _spanned(Predictor(predictor.drift, found.gain), estimates)
+
+
+def _spanned(predictor: Predictor[NetworkDrift], xi: Array) -> Predictor[NetworkDrift]:
+    """Return the same with hidden states from -1 to 1, where they were estimated at xi."""
+    old, n_y = predictor.drift.box.states, predictor.gain.shape[1]
+    low, high = old.to_physical(xi.min(axis=0)), old.to_physical(xi.max(axis=0))
+    low[:n_y], high[:n_y] = old.lower[:n_y], old.upper[:n_y]
+    new = Coordinates.spanning(old.names, old.units, low, high)
+    return Predictor(predictor.drift.moved(new),
+                     predictor.gain * old.scale[:, None] / new.scale[:, None] * (
+                         new.scale[:n_y] / old.scale[:n_y]))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A drift that is not refined, beside a gain that is."""
+
+    drift: Drift
+
+    @property
+    def theta(self) -> Array:
+        return np.empty(0)
+
+    def at(self, theta: Array) -> _Known:
+        return self
+
+    def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
+        return self.drift.scaled_rate(xi, v), self.drift.scaled_slope(xi, v) @ S
 
 
 class _Search:
@@ -173,6 +319,7 @@ class _Search:
     def __init__(self, record: SplitRecord, deviation: Array | None = None) -> None:
         self.record, self._plant = record, record.plant
         self.deviation = np.ones(len(self._plant.state_names)) if deviation is None else deviation
+        self.learn_B = self._plant.B is None
 
     def linear(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial:
         """Return the best linear predictor."""
@@ -194,7 +341,7 @@ class _Search:
         record = self.record
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
-            PolynomialCoefficients(start.drift, self._plant.B is None), start.gain,
+            PolynomialCoefficients(start.drift, self.learn_B), start.gain,
             record.segments(parts), record.foreseen(start, parts), self.deviation,
             settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost

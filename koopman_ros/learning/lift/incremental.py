@@ -13,14 +13,12 @@ import math
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.lift.levenberg_marquardt import (
-    LeastSquaresResult,
-    minimise,
-    MinimumStatus,
-)
+from koopman_ros.learning.lift.levenberg_marquardt import minimise, MinimumStatus
 from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 
+_DECODER_WEIGHTS = (0.1, 1e-4)  # of its residual (the paper's lambda), one after the other
+_RIDGE = 1e-6  # weight in the fits that start a new coordinate and a decoder
 _STILL = 1e-6  # root mean square, in the scale of the states, of a coordinate that stands still
 
 # Called after every step with (iteration, cost); True ends the minimisation.
@@ -59,9 +57,6 @@ class IncrementalTraining:
     #: units of the decoder network, which holds on to the states where they are no coordinates
     #: themselves; None for 8 with two or more states in a free lift and none otherwise
     decoder: int | None = None
-    #: weight of its residual (the paper's lambda), divided by 1000 for the last steps
-    decoder_weight: float = 0.1
-    ridge: float = 1e-6  #: ridge weight in the fit that starts a new coordinate
     max_iterations: int = 1000  #: limit of Levenberg-Marquardt steps for each coordinate
     tolerance: float = 1e-3  #: relative decrease of the cost over 20 steps taken as convergence
     #: for unstable plants: weight of the input in the regulator of the linear fit, under whose
@@ -105,11 +100,10 @@ class IncrementalTraining:
             layout, theta = parent.layout, parent.theta
         else:
             layout, theta = self._extended(data, n_z, parent or self.root(data), seed)
-        weights = [self.decoder_weight, 1e-3 * self.decoder_weight] if layout.decoder else [0.0]
         iterations = 0
-        for weight in weights:
+        for weight in _DECODER_WEIGHTS if layout.decoder else (0.0,):
             problem = LiftProblem(layout, data, ResidualWeights(self.whitening, weight))
-            minimum: LeastSquaresResult = minimise(
+            minimum = minimise(
                 problem.add_residuals, theta, max_iterations=self.max_iterations,
                 tolerance=self.tolerance, monitor=monitor)
             theta, iterations = minimum.theta, iterations + minimum.iterations
@@ -169,7 +163,7 @@ class IncrementalTraining:
                    if n_z == old.n_z + 1 else _whitened(data.x))
         begun = replace(begun, V=torch.cat([
             torch.cat([given.V, zero((len(given.V), count))], 1),
-            _ridge_fit(features, targets, self.ridge).T]))
+            _ridge_fit(features, targets).T]))
         return layout, _with_linear_fits(layout, begun, data, generator)
 
 
@@ -210,10 +204,10 @@ def xavier(rows: int, columns: int, generator: torch.Generator) -> Tensor:
     return spread * torch.randn((rows, columns), generator=generator, dtype=torch.float64)
 
 
-def _ridge_fit(features: Tensor, targets: Tensor, ridge: float) -> Tensor:
+def _ridge_fit(features: Tensor, targets: Tensor) -> Tensor:
     """Fit `targets` (N, k) by features (N, h); return the weights (h, k)."""
     N, h = features.shape
-    gram = features.T @ features / N + ridge * torch.eye(h).to(features)
+    gram = features.T @ features / N + _RIDGE * torch.eye(h).to(features)
     return torch.linalg.solve(gram, features.T @ targets / N)
 
 
@@ -229,7 +223,7 @@ def _decoder_start(z: Tensor, x: Tensor, units: int, generator: torch.Generator
     W = xavier(units, z.shape[1], generator).to(z)
     b = 0.5 * torch.randn(units, generator=generator, dtype=torch.float64).to(z)
     features = torch.cat([torch.tanh(z @ W.T + b), z.new_ones((len(z), 1))], 1)
-    fit = _ridge_fit(features, x, 1e-6).T.contiguous()
+    fit = _ridge_fit(features, x).T.contiguous()
     return W, b, fit[:, :-1].contiguous(), fit[:, -1].contiguous()
 
 

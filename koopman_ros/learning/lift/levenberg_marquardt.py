@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 import math
 
@@ -110,68 +110,53 @@ def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
     :param patience: number of accepted steps over which the decrease is judged.
     :param monitor: called with the iteration and cost after each step; True ends the run.
     """
-    state: _State | None = None
+    now = normal_equations(residuals, theta)
+    if not math.isfinite(now.cost):
+        return LeastSquaresResult(theta, math.inf, 0, MinimumStatus.STALLED)
+    scaling = torch.clamp(now.matrix.diagonal().clone(), min=1e-12)
+    damping, factor, costs, iteration = 1e-3, _FACTOR, [now.cost], 0
+
+    def result(status: MinimumStatus, decrease: float = math.nan) -> LeastSquaresResult:
+        return LeastSquaresResult(theta, now.cost, iteration, status, decrease)
+
     try:
-        now = normal_equations(residuals, theta)
-        if not math.isfinite(now.cost):
-            return LeastSquaresResult(theta, math.inf, 0, MinimumStatus.STALLED)
-        state = _State(theta, now, torch.clamp(now.matrix.diagonal().clone(), min=1e-12))
-        costs = [now.cost]
         for iteration in range(1, max_iterations + 1):
-            state = replace(_step(residuals, state), iteration=iteration)
-            if state.damping > _MAX_DAMPING:
-                status = MinimumStatus.CONVERGED if len(costs) > 1 else MinimumStatus.STALLED
-                return state.minimum(status)
-            if state.factor == _FACTOR:
-                costs.append(state.now.cost)
-                if _converged(costs, tolerance, patience):
-                    return state.minimum(MinimumStatus.CONVERGED)
-            if monitor is not None and monitor(iteration, state.now.cost):
-                return state.minimum(MinimumStatus.INTERRUPTED)
+            # after a step that was taken the next one mostly is, too: its derivatives at once
+            trial = _step(residuals, theta, now, damping * scaling, derivatives=factor == _FACTOR)
+            if trial is None:
+                damping, factor = damping * factor, 2.0 * factor
+            else:
+                theta, now, gain = trial
+                scaling = torch.maximum(scaling, now.matrix.diagonal())
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+                damping, factor = max(damping, 1e-15), _FACTOR
+                costs.append(now.cost)
+            if damping > _MAX_DAMPING:
+                return result(MinimumStatus.CONVERGED if len(costs) > 1
+                              else MinimumStatus.STALLED)
+            if trial is not None and len(costs) > patience and (
+                    costs[-1 - patience] - costs[-1] <= tolerance * costs[-1 - patience]):
+                return result(MinimumStatus.CONVERGED)
+            if monitor is not None and monitor(iteration, now.cost):
+                return result(MinimumStatus.INTERRUPTED)
     except KeyboardInterrupt:
-        if state is None:
-            raise
-        return state.minimum(MinimumStatus.INTERRUPTED)
+        return result(MinimumStatus.INTERRUPTED)
     before = costs[-1 - min(patience, len(costs) - 1)]
-    return replace(state.minimum(MinimumStatus.MAX_ITERATIONS),
-                   decrease=(before - costs[-1]) / before if before > costs[-1] else math.nan)
+    return result(MinimumStatus.MAX_ITERATIONS, (
+        (before - costs[-1]) / before if before > costs[-1] else math.nan))
 
 
-@dataclass(frozen=True)
-class _State:
-    """Where a minimisation stands."""
-
-    theta: Tensor
-    now: NormalEquations
-    scaling: Tensor
-    damping: float = 1e-3
-    factor: float = _FACTOR  # by which the damping rises when a step is refused; reset when taken
-    iteration: int = 0
-
-    def minimum(self, status: MinimumStatus) -> LeastSquaresResult:
-        return LeastSquaresResult(self.theta, self.now.cost, self.iteration, status)
-
-
-def _converged(costs: list[float], tolerance: float, patience: int) -> bool:
-    return len(costs) > patience and (
-        costs[-1 - patience] - costs[-1] <= tolerance * costs[-1 - patience])
-
-
-def _step(residuals: Residuals, state: _State) -> _State:
-    """Try one damped Gauss-Newton step; take it when it lowers the cost."""
-    now, damping, scaling = state.now, state.damping, state.scaling
-    factor, info = torch.linalg.cholesky_ex(now.matrix + torch.diag(damping * scaling))
-    if int(info) == 0:
-        step = -torch.cholesky_solve(now.gradient[:, None], factor)[:, 0]
-        predicted = 0.5 * float(step @ (damping * scaling * step - now.gradient))
-        # after a step that was taken the next one mostly is, too: its derivatives at once
-        trial = normal_equations(residuals, state.theta + step,
-                                 derivatives=state.factor == _FACTOR)
-        gain = (now.cost - trial.cost) / predicted if predicted > 0.0 else -1.0
-        if math.isfinite(trial.cost) and gain > 0.0:
-            theta = state.theta + step
-            now = trial if trial.derivatives else normal_equations(residuals, theta)
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-            return _State(theta, now, torch.maximum(scaling, now.matrix.diagonal()),
-                          max(damping, 1e-15))
-    return replace(state, damping=damping * state.factor, factor=2.0 * state.factor)
+def _step(residuals: Residuals, theta: Tensor, now: NormalEquations, damping: Tensor, *,
+          derivatives: bool) -> tuple[Tensor, NormalEquations, float] | None:
+    """Return parameters, equations and gain ratio of a damped step that lowers the cost."""
+    factor, info = torch.linalg.cholesky_ex(now.matrix + torch.diag(damping))
+    if int(info):
+        return None
+    step = -torch.cholesky_solve(now.gradient[:, None], factor)[:, 0]
+    predicted = 0.5 * float(step @ (damping * step - now.gradient))
+    moved = theta + step
+    trial = normal_equations(residuals, moved, derivatives=derivatives)
+    gain = (now.cost - trial.cost) / predicted if predicted > 0.0 else -1.0
+    if not (math.isfinite(trial.cost) and gain > 0.0):
+        return None
+    return moved, trial if derivatives else normal_equations(residuals, moved), gain

@@ -92,51 +92,39 @@ class MomentSums:
         Z[first:, self._places[3]] = V
         return Z
 
-    def residual_rates(self) -> Tensor:
-        """Return T (n_z, p, K) with dr_i/dtheta = T_i phi for r = J_N f - A N."""
-        layout, A, V, W = (self._layout, self._parameters.A, self._parameters.V,
-                           self._parameters.W)
-        first = layout.n_z - layout.n_free
-        F, G, rates, values, _, slope_inputs, inputs = self._places
-        T = V.new_zeros((layout.n_z, layout.size, feature_count(layout)))
-        of_rates = torch.cat([V.new_zeros((first, V.shape[1])), V])
-        for place, weights in ((F, of_rates), (G, -A[:, first:] @ V)):
-            T[:, :F.stop, place].diagonal(dim1=1, dim2=2)[...] = self._per_hidden(weights)
-        at_V, at_A = layout.slices[2:4]
+    def coordinate_rates(self, *, along_drift: bool = False) -> Tensor:
+        """Return U (n_z, p, K) with dz_i/dtheta = U_i phi, or that of dz_i/dt along the drift."""
+        layout, V = self._layout, self._parameters.V
+        first, at_V = layout.n_z - layout.n_free, layout.slices[2]
+        hidden, values = self._places[0 if along_drift else 1], self._places[2 + (not along_drift)]
+        U = V.new_zeros((layout.n_z, layout.size, feature_count(layout)))
+        # the output weights (n_free, h), once for each parameter of the hidden layer
+        weights = torch.cat([V.repeat_interleave(layout.n_x, 1), V], 1)
+        U[first:, :at_V.start, hidden].diagonal(dim1=1, dim2=2)[...] = weights
         for k in range(layout.n_free):
             rows = slice(at_V.start + k * V.shape[1], at_V.start + (k + 1) * V.shape[1])
-            T[first + k, rows, rates].diagonal()[...] = 1.0
-            T[:, rows, values].diagonal(dim1=1, dim2=2)[...] = -A[:, first + k, None]
-        Z = self.coordinates()
-        for i in range(layout.n_z):
-            T[i, at_A.start + i * layout.n_z:at_A.start + (i + 1) * layout.n_z] = -Z
-        if layout.n_u:
-            shape = (layout.n_x, layout.n_u)
-            at_B = layout.slices[4]
-            for k in range(layout.n_u):
-                T[:, at_B, slope_inputs].unflatten(1, shape).unflatten(
-                    3, (V.shape[1], layout.n_u))[:, :, k, :, k] = -torch.einsum(
-                        'ij,jm->imj', of_rates, W)
-                for m in range(first):
-                    T[m, at_B, inputs].unflatten(0, shape)[m, k, k] = -1.0
-        return T
-
-    def coordinate_rates(self) -> Tensor:
-        """Return U (n_z, p, K) with dz_i/dtheta = U_i phi."""
-        layout, V = self._layout, self._parameters.V
-        first = layout.n_z - layout.n_free
-        G, values = self._places[1], self._places[3]
-        U = V.new_zeros((layout.n_z, layout.size, feature_count(layout)))
-        U[first:, :G.stop - G.start, G].diagonal(dim1=1, dim2=2)[...] = self._per_hidden(V)
-        start = layout.slices[2].start
-        for k in range(layout.n_free):
-            rows = slice(start + k * V.shape[1], start + (k + 1) * V.shape[1])
             U[first + k, rows, values].diagonal()[...] = 1.0
         return U
 
-    def _per_hidden(self, weights: Tensor) -> Tensor:
-        """Repeat weights (R, h) for each parameter of the hidden layer: (R, h (n_x + 1))."""
-        return torch.cat([weights.repeat_interleave(self._layout.n_x, 1), weights], 1)
+    def residual_rates(self) -> Tensor:
+        """Return T (n_z, p, K) with dr_i/dtheta = T_i phi for r = J_N f - A N."""
+        layout, A, V = self._layout, self._parameters.A, self._parameters.V
+        first = layout.n_z - layout.n_free
+        T = self.coordinate_rates(along_drift=True) - torch.tensordot(
+            A, self.coordinate_rates(), 1)
+        at_A, Z = layout.slices[3], self.coordinates()
+        for i in range(layout.n_z):
+            T[i, at_A.start + i * layout.n_z:at_A.start + (i + 1) * layout.n_z] = -Z
+        if layout.n_u:
+            slope_inputs, inputs = self._places[5:]
+            at_B, shape = layout.slices[4], (layout.n_x, layout.n_u)
+            for k in range(layout.n_u):
+                T[first:, at_B, slope_inputs].unflatten(1, shape).unflatten(
+                    3, (V.shape[1], layout.n_u))[:, :, k, :, k] = -torch.einsum(
+                        'ij,jm->imj', V, self._parameters.W)
+                for m in range(first):
+                    T[m, at_B, inputs].unflatten(0, shape)[m, k, k] = -1.0
+        return T
 
 
 def feature_count(layout: Layout) -> int:

@@ -67,17 +67,16 @@ class Tracker:
 
     def _report(self, iteration: int, residual: float, checked: float = 0.0) -> bool:
         if self._watch is not None and not self.stop:
-            self.stop = self._watch(MultistartProgress(self.n_z, self.finished, self._total,
-                                                       iteration,
-                                                       residual, self._rw, checked))
+            self.stop = self._watch(MultistartProgress(
+                self.n_z, self.finished, self._total, iteration, residual, self._rw, checked))
         return self.stop
 
 
 @contextlib.contextmanager
-def torch_threads(count: int) -> Generator[None]:
-    """Let torch work with so many threads for a while; the bits of its sums depend on them."""
+def _one_thread() -> Generator[None]:
+    """Run torch with one thread: the rounding of its sums depends on their number."""
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(1)
     try:
         yield
     finally:
@@ -85,25 +84,21 @@ def torch_threads(count: int) -> Generator[None]:
 
 
 def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
-               parent: TrainedLift | None, seed: int, starts: int, threads: int, tracker: Tracker
+               parent: TrainedLift | None, seed: int, starts: int, tracker: Tracker
                ) -> Generator[tuple[str, TrainedLift | str]]:
     """Run one round; yield the result of each start in their order, or the reason of a failure."""
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     items = {f'start {i + 1} with n_z = {n_z}': (
         recipe.of_start(i) if isinstance(recipe, IncrementalTraining) else recipe, number)
         for i, number in enumerate(seeds)}
-    return backend.run(_start, items, shared=(data, n_z, parent, threads), watch=tracker.told)
+    return backend.run(_start, items, shared=(data, n_z, parent), watch=tracker.told)
 
 
-def _start(shared: tuple[ScaledSamples, int, TrainedLift | None, int], item: tuple[Recipe, int],
+def _start(shared: tuple[ScaledSamples, int, TrainedLift | None], item: tuple[Recipe, int],
            tell: Tell) -> TrainedLift | str:
-    (data, n_z, parent, threads), (recipe, seed) = shared, item
-
-    def monitor(iteration: int, cost: float) -> bool:
-        return tell((iteration, cost))
-
+    (data, n_z, parent), (recipe, seed) = shared, item
     try:
-        with torch_threads(threads):
-            return recipe.start(data, n_z, parent, seed, monitor)
+        with _one_thread():
+            return recipe.start(data, n_z, parent, seed, lambda *step: tell(step))
     except torch.linalg.LinAlgError as error:
         return f'a start is degenerate ({error}): check that all states move on their own'

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 import math
 
 import torch
@@ -34,8 +34,6 @@ class Layout:
 
     N(x) = [x; V (h(x) - h(0))] with identity coordinates and without x otherwise, where
     h(x) = tanh(W x + b). The vector stacks W, b, V, A, B and the decoder, row by row.
-
-    :raises ValueError: on sizes that do not fit.
     """
 
     n_x: int  #: number of states
@@ -44,10 +42,6 @@ class Layout:
     identity: bool  #: whether z starts with the state
     n_u: int = 0  #: number of inputs whose B is learned, 0 where B is known
     decoder: int = 0  #: units of the decoder network x = D(z; q), 0 for none
-
-    def __post_init__(self) -> None:
-        if self.n_free < 0 or self.n_x < 1 or self.hidden < 0:
-            raise ValueError(f'sizes do not fit: {self}')
 
     @property
     def n_free(self) -> int:
@@ -65,9 +59,7 @@ class Layout:
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Place of each parameter in the vector."""
-        ends = [0]
-        for shape in self.shapes:
-            ends.append(ends[-1] + math.prod(shape))
+        ends = accumulate(map(math.prod, self.shapes), initial=0)
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
     @property

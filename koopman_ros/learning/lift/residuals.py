@@ -78,10 +78,6 @@ class LiftProblem:
     chunk: int = 0  #: samples at a time; by default as many as fit into the cache
 
     def __post_init__(self) -> None:
-        if self.layout.n_u and self.data.u is None:
-            raise ValueError('the inputs are needed to learn B')
-        if self.weights.decoder and not self.layout.decoder:
-            raise ValueError('a decoder weight needs a decoder network')
         if not self.chunk:
             floats = max(feature_count(self.layout),
                          self.layout.n_x * self.layout.size * bool(self.layout.decoder))

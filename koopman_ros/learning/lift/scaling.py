@@ -94,8 +94,8 @@ class Scaling:
     def model(self, grown: TrainedLift, **about: Any) -> LiftedModel:
         """Return the trained model in units; `about` are further fields of the model."""
         parts = grown.layout.split(grown.theta.cpu())
-        A, B = self.pace * parts.A.numpy(), None if parts.B is None else (
-            self.pace * parts.B.numpy())
+        A = self.pace * parts.A.numpy()
+        B = None if parts.B is None else self.pace * parts.B.numpy()
         alone = grown.drift_alone
         observables = NetworkObservables(
             parts.W.numpy(), parts.b.numpy(), parts.V.numpy()[:0 if alone else None],

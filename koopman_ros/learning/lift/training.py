@@ -67,7 +67,53 @@ class Trained:
 class TrainingFailed(ValueError):  # noqa: N818
     """Training ended without a lift that is better than a linear model; the message says why."""
 
-    law_check: ClosedLoopTest | None = None  #: the closed loops of a lift whose law failed
+
+@dataclass(frozen=True)
+class PreparedSamples:
+    """Checked samples, split into training, validation and test episodes."""
+
+    plant: PlantDescription  #: of the samples
+    parts: tuple[DriftSamples, DriftSamples, DriftSamples]  #: for training, validation and test
+    box: Box  #: of all samples
+    states: TrainingStates | None  #: of all samples; None for one state, where the box says it
+
+    @staticmethod
+    def of(plant: PlantDescription, samples: DriftSamples) -> PreparedSamples:
+        """Check and split samples; ValueError for times or a nominal point that do not fit."""
+        parts, box = split_by_episode(samples, seed=0), Box.of(plant, samples.x, samples.u)
+        check_rates(plant, samples)
+        check_nominal_point(plant, samples, box)
+        signals = box.states
+        states = None if len(signals) == 1 else TrainingStates.of(
+            signals.to_deviation(samples.x), 0.5 * (signals.upper - signals.lower) / signals.scale)
+        return PreparedSamples(plant, parts, box, states)
+
+    def linear(self) -> LiftedModel:
+        """Return the linear model that fits the training episodes best."""
+        return Edmd(degree=1).learn(self.plant, self.parts[0], self.box)
+
+    def rx(self, model: LiftedModel) -> float:
+        """Return the error of a model on the validation episodes."""
+        part = self.parts[1]
+        return fit(model, part.x, part.dxdt, part.u).rx
+
+    def reference_drift(self, model: LiftedModel) -> Rate:
+        """
+        Return the drift that predicts the validation episodes best, on which a law is tried.
+
+        Polynomials, which share nothing with the lift but its samples, or the lift's own drift
+        where it is better than all of them: errors of the polynomials should not count against it.
+        """
+        training, validation, _ = self.parts
+        candidates = [model]
+        for degree in range(1, _HIGHEST_DEGREE + 1):
+            # with so few samples to a monomial it would follow each of them
+            if math.comb(model.n_x + degree, degree) * _SAMPLES_OF_MONOMIAL <= len(training):
+                candidates.append(Edmd(degree).learn(self.plant, training, self.box))
+        rates = [lifted_rate(one, one.seconds_per_time_unit) for one in candidates]
+        errors = [float(np.sum(((rate(validation.x, validation.u) - validation.dxdt)
+                                / self.box.states.scale) ** 2)) for rate in rates]
+        return rates[int(np.argmin(errors))]
 
 
 @dataclass(frozen=True)
@@ -84,9 +130,9 @@ class _Candidate:
 
 
 def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, seed: int = 0,
-          starts: int = 4, split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
-          loops: int = LOOPS, device: str = 'cpu', threads: int = 1,
-          backend: Backend | None = None, begin: LiftedModel | None = None) -> Trained:
+          starts: int = 4, watch: Watch | None = None, refuse: bool = True, loops: int = LOOPS,
+          device: str = 'cpu', backend: Backend | None = None,
+          begin: LiftedModel | None = None) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
@@ -97,13 +143,11 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
     :param starts: number of starts in each round; their seeds are drawn from `seed`.
-    :param split_seed: seed of the split into training, validation and test episodes.
     :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
         refused.
     :param loops: closed loops in which the law is tried before, see
         :func:`~koopman_ros.evaluation.closed_loop_test.evaluate_closed_loops`; 0 for none.
     :param device: that evaluates the residuals, as torch names it, on every worker.
-    :param threads: torch's threads for each start, for a number of which the bits are the same.
     :param backend: of starts and closed loops, see :func:`~koopman_ros.execution.backend_of`; this
         process by default.
     :param begin: a lift of a plant of the same kind that the training begins from: its coordinates
@@ -123,31 +167,27 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     rounds = recipe.rounds(samples.x.shape[1])
     if begin is not None:
         rounds = _further(recipe, rounds, begin)
-    parts = split_by_episode(samples, split_seed)
+    prepared = PreparedSamples.of(plant, samples)
+    parts, box = prepared.parts, prepared.box
     tracker = Tracker(watch, starts * len(rounds) - (starts - 1) * (begin is not None))
     backend = backend or Serial()
-    box = Box.of(plant, samples.x, samples.u)
-    check_rates(plant, samples)
-    check_nominal_point(plant, samples, box)
     scaling = Scaling.of(plant, box, parts[0],
                          recipe.pre_feedback if isinstance(recipe, IncrementalTraining) else None)
     data = scaling.data(parts[0], device)
-    about = {'training_states': training_states(box, samples),
+    about = {'training_states': prepared.states,
              'provenance': Provenance(plant.name, seed, samples.digest(), {}, __version__)}
-    first = None if begin is None or not isinstance(recipe,
-                                                    IncrementalTraining) else scaling.planted(
-        recipe, begin, data)
+    first = (scaling.planted(recipe, begin, data)
+             if begin is not None and isinstance(recipe, IncrementalTraining) else None)
 
     def run(n_z: int, parent: TrainedLift | None) -> Generator[tuple[str, TrainedLift | str]]:
         count = 1 if parent is None and first is not None else starts
-        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, threads,
-                          tracker)
+        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, tracker)
 
     def judge(grown: TrainedLift | str) -> _Candidate | str:
         return _judged(grown, lambda found: scaling.model(found, **about), parts)
 
     path, interrupted = _run_rounds(rounds, tracker, run, judge)
-    return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse,
+    return _conclude(prepared, path, interrupted, tracker, loops if refuse else 0, refuse,
                      backend)
 
 
@@ -207,15 +247,12 @@ def _run_rounds(rounds: Sequence[int], tracker: Tracker,
     return path, interrupted
 
 
-def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, DriftSamples],
-              path: list[_Candidate],
-              interrupted: bool, tracker: Tracker, loops: int, refuse: bool,
-              backend: Backend) -> Trained:
+def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bool,
+              tracker: Tracker, loops: int, refuse: bool, backend: Backend) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
-    winner = path[-1]
-    box = Box(winner.model.states, winner.model.inputs, plant.time_unit)
-    linear = Edmd(degree=1).learn(plant, parts[0], box)
-    rx = fit(linear, parts[1].x, parts[1].dxdt, parts[1].u).rx
+    winner, test = path[-1], prepared.parts[2]
+    linear = prepared.linear()
+    rx = prepared.rx(linear)
     if refuse and not winner.fit.rx + ROUNDING < rx:
         raise TrainingFailed(
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
@@ -227,25 +264,22 @@ def _conclude(plant: PlantDescription, parts: tuple[DriftSamples, DriftSamples, 
         # one that was ended before gets its loops all the same
         watch = (lambda _: False) if tracker.stop else tracker.check
         with contextlib.suppress(KeyboardInterrupt):
-            law_check = evaluate_closed_loops(winner.model,
-                                              reference_drift(plant, box, parts, winner.model),
-                                              loops=loops, watch=watch, backend=backend)
+            law_check = evaluate_closed_loops(
+                winner.model, prepared.reference_drift(winner.model), loops=loops, watch=watch,
+                backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
-            refusal = TrainingFailed(
-                f'the lift with n_z = {winner.model.n_z} is no controller: {law_check}: use '
-                f'{_remedies(winner.model)}')
-            refusal.law_check = law_check
-            raise refusal
+            raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} is no controller: '
+                                 f'{law_check}: use {_remedies(winner.model)}')
     models, figures = [], []
     for candidate in path:
-        figures.append(evaluate(candidate.model, parts[2]))
+        figures.append(evaluate(candidate.model, test))
         metrics = figures[-1].metrics(candidate.model.states.names)
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
     if law_check is not None:
         models[-1] = replace(models[-1], verified_loops=law_check.tried)
-    return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check,
+    return Trained(models[-1], figures[-1], evaluate(linear, test), law_check,
                    _ending(winner.grown, interrupted), tuple(models), tracker.finished,
                    tracker.steps)
 
@@ -264,33 +298,6 @@ def _ending(grown: TrainedLift, interrupted: bool) -> str:
     return grown.status.value + ('' if math.isnan(grown.decrease) else (
         f'; with n_z = {grown.layout.n_z} the last {PATIENCE} steps took '
         f'{100.0 * grown.decrease:.2g} % off the cost'))
-
-
-def reference_drift(plant: PlantDescription, box: Box,
-                    parts: tuple[DriftSamples, DriftSamples, DriftSamples],
-                    model: LiftedModel) -> Rate:
-    """
-    Return the drift that predicts the validation episodes best, on which a law is tried.
-
-    Polynomials, which share nothing with the lift but its samples, or the lift's own drift where
-    it is better than all of them: errors of the polynomials should not count against it.
-    """
-    candidates = [model]
-    for degree in range(1, _HIGHEST_DEGREE + 1):
-        # with so few samples to a monomial it would follow each of them
-        if math.comb(model.n_x + degree, degree) * _SAMPLES_OF_MONOMIAL <= len(parts[0]):
-            candidates.append(Edmd(degree).learn(plant, parts[0], box))
-    rates = [lifted_rate(one, one.seconds_per_time_unit) for one in candidates]
-    errors = [float(np.sum(((rate(parts[1].x, parts[1].u) - parts[1].dxdt) / box.states.scale
-                            ) ** 2)) for rate in rates]
-    return rates[int(np.argmin(errors))]
-
-
-def training_states(box: Box, samples: DriftSamples) -> TrainingStates | None:
-    """Return where the data are, held-out ones included; None for one state: its box says it."""
-    states = box.states
-    return None if len(states) == 1 else TrainingStates.of(
-        states.to_deviation(samples.x), 0.5 * (states.upper - states.lower) / states.scale)
 
 
 def _judged(grown: TrainedLift | str, model_of: Callable[[TrainedLift], LiftedModel],

@@ -82,7 +82,7 @@ class ReactorParameters(Constants):
         return -self.reaction_enthalpy / (self.density * self.heat_capacity)
 
 
-def one_state_reactor(parameters: ReactorParameters | None = None, *,
+def one_state_reactor(parameters: ReactorParameters | None = None,
                       nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
     Build the reactor of the paper (eq. 36): temperature as state, concentration held fixed.
@@ -101,7 +101,7 @@ def one_state_reactor(parameters: ReactorParameters | None = None, *,
                     nominal_state)
 
 
-def two_state_reactor(parameters: ReactorParameters | None = None, *,
+def two_state_reactor(parameters: ReactorParameters | None = None,
                       nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
     Build the benchmark reactor of Seborg and Henson: concentration and temperature as states.
@@ -116,7 +116,7 @@ def two_state_reactor(parameters: ReactorParameters | None = None, *,
                     ('concentration',), ('mol/L',))
 
 
-def fed_reactor(parameters: ReactorParameters | None = None, *,
+def fed_reactor(parameters: ReactorParameters | None = None,
                 nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
     Build the two-state reactor with its feed flow as an input beside the coolant.
@@ -146,27 +146,21 @@ def fed_reactor(parameters: ReactorParameters | None = None, *,
 class OneStateReactor(ReactorParameters):
     """The reactor of the paper as a plant of the catalogue."""
 
-    def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
-        """Build it as :func:`one_state_reactor` does."""
-        return one_state_reactor(self, nominal_state=nominal_state)
+    system = one_state_reactor
 
 
 @dataclass(frozen=True)
 class TwoStateReactor(ReactorParameters):
     """The benchmark reactor as a plant of the catalogue."""
 
-    def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
-        """Build it as :func:`two_state_reactor` does."""
-        return two_state_reactor(self, nominal_state=nominal_state)
+    system = two_state_reactor
 
 
 @dataclass(frozen=True)
 class FedReactor(ReactorParameters):
     """The benchmark reactor, its feed flow an input, as a plant of the catalogue."""
 
-    def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
-        """Build it as :func:`fed_reactor` does."""
-        return fed_reactor(self, nominal_state=nominal_state)
+    system = fed_reactor
 
 
 def _reactor(name: str, constants: ReactorParameters, drift: ArrayFunction,

@@ -4,7 +4,6 @@
 """The predictive law against independent optima, its limits, and its failures."""
 
 from dataclasses import fields
-import json
 import math
 import sys
 import time
@@ -27,7 +26,6 @@ from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.evaluation.simulate import at, simulate, Simulation
-from koopman_ros.event_log.records import decoded, encoded
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance
 from koopman_ros.plants import ControlAffineSystem, plant_class, Process, steady_state
 
@@ -429,14 +427,6 @@ def test_warm_start_converges_to_the_plan_of_a_cold_one():
     cold = compute(one, [0.0, 0.0], (50.0, 0.0))
     warm = compute(one, [0.0, 0.0], (50.0, 0.0), memory)
     np.testing.assert_allclose(warm.u, cold.u, rtol=1e-6)
-
-
-def test_memory_comes_back_from_a_record_bit_for_bit():
-    one = law(OSCILLATOR[1])
-    memory = compute(one, [0.7, -0.4]).memory
-    recorded = decoded(json.loads(json.dumps(encoded(memory))))
-    assert compute(one, [0.6, -0.4], memory=memory).u.tobytes() == compute(
-        one, [0.6, -0.4], memory=recorded).u.tobytes()
 
 
 @pytest.mark.parametrize('memory', [

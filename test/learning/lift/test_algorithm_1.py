@@ -10,17 +10,15 @@ import pytest
 from scipy.stats import kstest
 import torch
 
-from koopman_ros.core.datasets import DriftSamples, PlantDescription
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import Algorithm1, Edmd, fit, Linearisation
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus, normal_equations
-from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.model import Box
 from support.small_plants import bent_samples, TWO_STATE, two_state_samples
 
 
-@pytest.mark.parametrize('degree', [2, 3])
-@pytest.mark.parametrize('B', [TWO_STATE.B, None], ids=['known B', 'learned B'])
+@pytest.mark.parametrize(('degree', 'B'), [(2, TWO_STATE.B), (3, None)])
 def test_monomials_hold_the_exact_lift_of_the_two_state_example(degree, B):
     """The monomials hold (x1, x2, x1^2), which the drift maps into itself."""
     samples = two_state_samples()
@@ -43,9 +41,7 @@ def van_der_pol(x, u):
     return np.stack([x[..., 1], (1.0 - x[..., 0] ** 2) * x[..., 1] - x[..., 0] + u[..., 0]], -1)
 
 
-VAN_DER_POL = PlantDescription('Van der Pol', ('x1', 'x2'), ('1', '1'), ('u',), ('1',), 's',
-                               np.zeros(2),
-                               np.zeros(1), np.array([[0.0], [1.0]]))
+VAN_DER_POL = replace(TWO_STATE, B=np.array([[0.0], [1.0]]))
 
 
 def van_der_pol_samples(count=400, seed=0):
@@ -54,8 +50,7 @@ def van_der_pol_samples(count=400, seed=0):
     return DriftSamples(x, van_der_pol(x, u), u, np.arange(count) // 40)
 
 
-@pytest.mark.parametrize('degree', [3, 5])
-@pytest.mark.parametrize('B', [VAN_DER_POL.B, None], ids=['known B', 'learned B'])
+@pytest.mark.parametrize(('degree', 'B'), [(3, VAN_DER_POL.B), (5, None)])
 def test_a_drift_of_monomials_is_found_exactly(degree, B):
     """
     Van der Pol's drift is of degree 3; the rates of its other monomials are of degree 5.
@@ -67,9 +62,6 @@ def test_a_drift_of_monomials_is_found_exactly(degree, B):
     found = fit(model, fresh.x, fresh.dxdt, fresh.u)
     assert found.rw > 1e-3
     assert found.rx < 1e-20
-    xi = model.states.to_deviation(fresh.x)
-    f = van_der_pol(fresh.x, np.zeros((400, 1)))
-    np.testing.assert_allclose(model.drift(xi) * model.states.scale, f, rtol=0, atol=1e-10)
     np.testing.assert_allclose(model.linearised.A * model.states.scale[:, None]
                                / model.states.scale, [[0.0, 1.0], [-1.0, 1.0]],
                                rtol=0, atol=1e-10)
@@ -109,19 +101,14 @@ def data():
     return ScaledSamples(torch.from_numpy(x), torch.from_numpy(samples.dxdt - 2.0 * u))
 
 
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'gamma': 1.0}, 'gamma must be above 1, got 1.0'),
-    ({'lambda_initial': 0.0}, 'lambda_initial must be above 0, got 0.0'),
-    *(({name: 0}, 'sizes and limits must be at least 1')
-      for name in ('n_z', 'decoder', 'max_rounds', 'max_iterations', 'hidden')),
-])
-def test_a_recipe_without_sense(change, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize('change', [
+    {'gamma': 1.0}, {'lambda_initial': 0.0}, {'decoder': 0}, {'max_rounds': 0}], ids=str)
+def test_a_recipe_without_sense(change):
+    with pytest.raises(ValueError, match='must be'):
         Algorithm1(**{**SMALL, **change})
 
 
 def test_there_is_one_round_of_starts():
-    assert Algorithm1(5).rounds(3) == (5,)
     assert Algorithm1(3).rounds(3) == (3,)
     assert Algorithm1(4, identity=True).rounds(3) == (4,)
     for n_z, identity in ((2, False), (3, True)):
@@ -129,29 +116,23 @@ def test_there_is_one_round_of_starts():
             Algorithm1(n_z, identity=identity).rounds(3)
 
 
-def unmoved(seed):
-    """Return a start as it was drawn: where the cost is not a number, no step is taken."""
-    nothing = ScaledSamples(*(torch.full((2, 1), torch.nan).double() for _ in range(3)))
-    recipe = Algorithm1(4, identity=True, hidden=60, decoder=30)
-    grown = recipe.start(nothing, 4, None, seed)
-    assert grown.status is MinimumStatus.STALLED
-    return grown
-
-
 def test_all_parameters_start_from_the_standard_normal_distribution():
-    grown = unmoved(4)
-    assert grown.layout == Layout(1, 4, 60, True, n_u=1, decoder=30)
-    parts = grown.layout.split(grown.theta)
-    for part in (grown.theta, parts.W, parts.V, parts.decoder[0]):
+    # where the cost is not a number, no step is taken
+    nothing = ScaledSamples(*(torch.full((2, 1), torch.nan).double() for _ in range(3)))
+    first, again, other = (Algorithm1(4, identity=True, hidden=60, decoder=30).start(
+        nothing, 4, None, seed) for seed in (4, 4, 2))
+    assert first.status is MinimumStatus.STALLED
+    parts = first.layout.split(first.theta)
+    for part in (first.theta, parts.W, parts.V, parts.decoder[0]):
         assert kstest(part.flatten().numpy(), 'norm').pvalue > 0.01
-    assert torch.equal(unmoved(1).theta, unmoved(1).theta)
-    assert not torch.equal(unmoved(1).theta, unmoved(2).theta)
+    assert torch.equal(first.theta, again.theta)
+    assert not torch.equal(first.theta, other.theta)
 
 
 @pytest.mark.parametrize(('initial', 'gamma'), [(10.0, 10.0), (3.0, 2.0)])
 def test_lambda_falls_by_gamma_from_one_minimisation_to_the_next(data, initial, gamma):
     recipe = Algorithm1(**SMALL, lambda_initial=initial, gamma=gamma, tolerance=0.0)
-    for number in range(4):
+    for number in range(3):
         seen = []
 
         def monitor(iteration, cost, number=number, seen=seen):

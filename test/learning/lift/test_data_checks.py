@@ -44,7 +44,7 @@ def test_times_that_do_not_contradict_the_rates(samples):
     check_rates(DECAY, samples)
 
 
-@pytest.mark.parametrize('period', [0.5, 2.0, 2.5, 4.0, 5.0, 8.0])
+@pytest.mark.parametrize('period', [0.5, 2.5, 5.0])
 @pytest.mark.parametrize('damping', [0.01, 0.5])
 def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period):
     """The derivatives of dx1/dt = x2, dx2/dt = -x1 - 2 D x2 are exact, however far apart."""
@@ -99,26 +99,19 @@ def test_a_steady_state_is_accepted(plant, samples):
     look(plant, samples)
 
 
-@pytest.mark.parametrize('known', [True, False], ids=['known B', 'learned B'])
-def test_a_nominal_point_where_the_plant_moves_is_refused(known):
-    plant = replace(BENT, nominal_state=[3.1], B=BENT.B if known else None)
+RISING = replace(bent_samples(), dxdt=bent_samples().dxdt + 20.0)
+
+
+@pytest.mark.parametrize(('plant', 'samples', 'words'), [
     # -0.1 - 0.3 * 0.1^2 = -0.103 m/s, which 0.0515 m/s of flow make up for
-    with pytest.raises(ValueError, match=r'moves with -0\.103 m/s of level: by the samples it '
-                                         r'does with nominal_state = \[3\.1\] and nominal_input '
-                                         r'= \[0\.5515\]$'):
-        train(plant, bent_samples(), SMALL, starts=1)
-
-
-def test_the_steady_state_nearby_of_more_states_than_inputs():
-    """dx1/dt = -0.1 x1 stands still at x1 = 0 alone, dx2/dt = x2 - x1^2 + u wherever u = -x2."""
-    plant = replace(TWO_STATE, nominal_state=[0.5, 0.0])
-    with pytest.raises(ValueError, match=r'moves with -0\.05 1/s of x1') as error:
-        look(plant, two_state_samples())
-    assert 'nominal_state = [0.0, ' in str(error.value)
-
-
-def test_where_there_is_no_steady_state_nearby():
-    samples = bent_samples()
-    wrong = replace(samples, dxdt=samples.dxdt + 20.0)
-    with pytest.raises(ValueError, match=r'moves with 20 m/s of level: move the plant around a'):
-        look(BENT, wrong)
+    *((replace(BENT, nominal_state=[3.1], B=B), bent_samples(),
+       r'-0\.103 m/s of level: by .* nominal_state = \[3\.1\] and nominal_input = \[0\.5515\]$')
+      for B in (BENT.B, None)),
+    # dx1/dt = -0.1 x1 stands still at x1 = 0 alone, dx2/dt = x2 - x1^2 + u wherever u = -x2
+    (replace(TWO_STATE, nominal_state=[0.5, 0.0]), two_state_samples(),
+     r'-0\.05 1/s of x1, .* nominal_state = \[0\.0, '),
+    (BENT, RISING, '20 m/s of level: move the plant around a')],
+    ids=['known B', 'learned B', 'more states than inputs', 'no steady state'])
+def test_a_nominal_point_where_the_plant_moves_is_refused(plant, samples, words):
+    with pytest.raises(ValueError, match=f'moves with {words}'):
+        train(plant, samples, replace(SMALL, n_z=3), starts=1)

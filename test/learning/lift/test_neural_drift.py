@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from koopman_ros.core.datasets import DriftSamples, split_by_episode
-from koopman_ros.learning import fit, IncrementalTraining, NeuralDrift, train, TrainingFailed
+from koopman_ros.learning import fit, IncrementalTraining, NeuralDrift, train
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from koopman_ros.learning.lift.network import Layout
 from koopman_ros.learning.lift.neural_drift import NeuralDriftProblem, with_readout
@@ -83,7 +83,7 @@ class Given:
     (BENT, bent_samples()), (TWO_STATE, two_state_samples(300))], ids=['bent', 'two states'])
 def test_training_keeps_the_read_out_that_is_better_on_validation_episodes(plant, samples):
     recipe = Given(IncrementalTraining(plant.B.shape[0] + 1, hidden_first=6, max_iterations=20))
-    model = train(plant, samples, recipe, starts=1, loops=16).model
+    model = train(plant, samples, recipe, starts=1, loops=0).model
     training, validation, _ = split_by_episode(samples, 0)
     by_features = with_readout(model, training)
     rx = [fit(m, validation.x, validation.dxdt, validation.u).rx
@@ -126,7 +126,7 @@ def test_the_sums_of_a_drift_are_those_of_its_differentiated_residual(n_u):
 def test_a_neural_drift_is_learned(B):
     """The paper's two-state example, whose quadratic drift no tanh spans."""
     trained = train(replace(TWO_STATE, B=B), two_state_samples(400),
-                    NeuralDrift(6, max_iterations=100), starts=2, loops=16)
+                    NeuralDrift(6, max_iterations=100), starts=1, loops=0)
     model = trained.model
     assert (model.n_z, model.identity, model.readout.shape) == (2, True, (2, 8))
     assert trained.figures.fit.rx < 1e-4 * trained.linear.fit.rx
@@ -134,13 +134,6 @@ def test_a_neural_drift_is_learned(B):
     np.testing.assert_allclose(units, TWO_STATE.B, rtol=0, atol=1e-3)
     # z = x: the lifted A is the linear fit
     np.testing.assert_array_equal(model.lift(np.array([0.3, -0.2])), [0.3, -0.2])
-
-
-def test_a_plant_that_is_linear_needs_no_network():
-    samples = bent_samples()
-    linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    with pytest.raises(TrainingFailed, match='does not predict the motion better than a linear'):
-        train(BENT, linear, NeuralDrift(3, max_iterations=20), starts=1)
 
 
 def test_a_recipe_without_sense():

@@ -55,7 +55,6 @@ def test_the_bits_do_not_depend_on_where_starts_run(kind, expected, places):
 
 
 def test_a_start_that_fails_is_named(places):
-    """Not all of the samples span another coordinate."""
     class Failing(type(RECIPE)):
         def start(self, *_):
             raise ValueError('no new coordinate can be started')
@@ -69,22 +68,22 @@ def test_a_start_that_fails_is_named(places):
 # Estimates, and closed loops.
 
 
-def test_degrees_are_estimated_side_by_side(places):
-    noisy = CUBIC.excited(300, 0.1, noise=0.02)
-    here, there = (identify(CUBIC.plant, [noisy], degrees=(1, 2), methods=methods(10),
-                            backend=places[kind]) for kind in ('', 'joblib:2'))
-    assert there.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
-    assert [(score.method, score.degree, score.cost) for score in there.scores] == [
-        (score.method, score.degree, score.cost) for score in here.scores]
+def estimated(backend):
+    return identify(CUBIC.plant, [CUBIC.excited(300, 0.1, noise=0.02)], degrees=(1, 2),
+                    methods=methods(10), backend=backend)
 
 
-def test_hidden_states_are_estimated_elsewhere(places):
+def estimated_with_a_hidden_state(backend):
     whole = PAIR.excited(200, 0.1, noise=0.01)
     plant = replace(PAIR.plant, state_names=('x1',), state_units=('1',),
                     nominal_state=np.zeros(1))
-    episode = replace(whole, x=whole.x[:, :1])
-    here, there = (identify_unmeasured(plant, [episode], 1, highest_degree=1, backend=places[kind])
-                   for kind in ('', 'joblib:2'))
+    return identify_unmeasured(plant, [replace(whole, x=whole.x[:, :1])], 1, highest_degree=1,
+                               backend=backend)
+
+
+@pytest.mark.parametrize('estimate', [estimated, estimated_with_a_hidden_state])
+def test_drifts_are_estimated_side_by_side(places, estimate):
+    here, there = (estimate(places[kind]) for kind in ('', 'joblib:2'))
     assert there.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
     assert [score.rmse.tobytes() for score in there.scores] == [
         score.rmse.tobytes() for score in here.scores]
@@ -173,9 +172,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if __name__ == '__main__':
     with backend_of('joblib:1') as backend:
         # endless, or it could be over before a busy machine interrupts it
-        recipe = IncrementalTraining(200, max_iterations=60, tolerance=0.0)
-        found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch,
-                      loops=16, backend=backend)
+        recipe = IncrementalTraining(200, max_iterations=20, tolerance=0.0)
+        found = train(BENT, bent_samples(), recipe, starts=1, watch=watch, loops=0,
+                      backend=backend)
     print('model', found.model.n_z, found.status)
 """
 
