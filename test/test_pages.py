@@ -65,7 +65,8 @@ def test_make_targets_are_in_the_makefile(page: Path) -> None:
 
 def test_pages_and_packages_are_listed_and_the_readme_is_short() -> None:
     listed = re.findall(r'^[\w/-]+$', (ROOT / 'docs' / 'index.md').read_text(), re.MULTILINE)
-    assert {str(page.relative_to(ROOT / 'docs').with_suffix('')) for page in ROOT.glob('docs/**/*.md')
+    assert {str(page.relative_to(ROOT / 'docs').with_suffix(''))
+            for page in ROOT.glob('docs/**/*.md')
             if page.parts[-2] != 'api'} <= {*listed, 'index'}
     text = (ROOT / 'CONTRIBUTING.md').read_text()
     for package in ROOT.glob('koopman_ros/*/__init__.py'):
@@ -82,10 +83,12 @@ def test_continuous_integration_runs_what_the_pages_say() -> None:
 
 
 def test_interfaces_list_the_topics_with_their_types_and_the_services() -> None:
-    assert [row[:2] for row in _rows('reference/interfaces.md') if '_msgs/' in row[1] and '`' not in row[1]
+    assert [row[:2] for row in _rows('reference/interfaces.md') if '_msgs/' in row[1]
+            and '`' not in row[1]
             ] == [[f'`{name}`', f'{kind.__module__.split(".")[0]}/{kind.__name__}']
                   for name, kind in topics.TYPES.items()]
-    services = {row[0].strip('`') for row in _rows('reference/interfaces.md') if 'std_srvs/' in row[1]}
+    services = {row[0].strip('`') for row in _rows('reference/interfaces.md')
+                if 'std_srvs/' in row[1]}
     text = (ROOT / 'docs' / 'reference/interfaces.md').read_text()
     managed = set(re.findall(r'`(~/\w+_\w+)`', text[text.index('## Lifecycle'):]))
     for name, node in node_descriptions.PROGRAMS.items():
@@ -103,7 +106,8 @@ def test_interfaces_list_the_limits_of_a_plan() -> None:
     (state,), (given,) = wiring.signals.states, wiring.signals.inputs
     plan = Plan(*3 * (none,), none, none, none)
     names = active_constraints(wiring.signals, plan, Time(), '').name
-    assert [row[0].strip('`') for row in _rows('reference/interfaces.md') if row[0].startswith('`at_')] == [
+    assert [row[0].strip('`') for row in _rows('reference/interfaces.md')
+            if row[0].startswith('`at_')] == [
         name.replace(given, '<input>').replace(f'_{state} ', '_<state> ') for name in names]
 
 
@@ -112,7 +116,8 @@ def test_interfaces_list_where_signals_are(system: str, column: int) -> None:
     wiring = preset_wiring(system)
     assert wiring is not None
     listed = {row[1].strip('`'): re.findall('`(.+?)`', row[column])
-              for row in _rows('reference/interfaces.md') if re.match('`<(state|input)>.*topic`', row[1])}
+              for row in _rows('reference/interfaces.md') if re.match('`<(state|input)>.*topic`',
+                                                                      row[1])}
     assert listed == {
         f'<{kind}>.{row.name}': [getattr(places, row.name) for places in of.values()]
         for kind, of in (('state', wiring.states), ('input', wiring.inputs))

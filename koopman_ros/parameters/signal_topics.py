@@ -77,8 +77,8 @@ class CommandedPlaces(MeasuredPlace):
 
     command_topic: str = _topic('Topic of the commands.')
     command_type: str = _topic('Type of the commands; empty: that of the measurements.')
-    command_field: str = _topic('Field of the command that holds the value; empty: the usual field '
-                                'of the type.')
+    command_field: str = _topic('Field of the command that holds the value; empty: the usual '
+                                'field of the type.')
     command_unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 

@@ -129,7 +129,7 @@ class Failing:
     (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check module')),
     (plant, {'system': 'bad_oven:Empty'}, ('must be a ControlAffineSystem', 'method system')),
     (plant, {'system': 'bad_oven:Failing'}, ('cannot be built (ZeroDivisionError', 'its class')),
-    (trainer, {}, ('what is measured and commanded is not known', "like ['level [m]']")),
+    (trainer, {}, ('the measured signals and inputs of the system', "like ['level [m]']")),
     (trainer, {**SIGNALS, 'states_measured': '["temperature [Kelvin]"]'},
      ("there is no unit 'Kelvin'", 'write one like K')),
     (controller, {**SIGNALS, 'model': 'reactor_nz4'},
