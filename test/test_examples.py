@@ -10,6 +10,7 @@ from pathlib import Path
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
@@ -339,15 +340,31 @@ def test_tutorials_are_cells_that_notebooks_open(path: Path) -> None:
 
 
 def test_page_quotes_the_tutorials() -> None:
-    _, _, page = (ROOT / 'docs' / 'own_plant.md').read_text().partition('## From Python')
+    _, _, page = (ROOT / 'docs' / 'how-to' / 'python.md').read_text().partition('# Use')
     sources = [path.read_text() for path in TUTORIALS.glob('*.py')]
     blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
     assert len(blocks) > 2
     for block in blocks:
         assert any(block in source for source in sources), block
-    listed = re.findall(r'\(\.\./examples/tutorials/(\w+)\.py\)',
-                        (ROOT / 'docs' / 'tutorials.md').read_text())
+    listed = re.findall(r'\(\.\./\.\./examples/tutorials/(\w+)\.py\)',
+                        (ROOT / 'docs' / 'tutorials' / 'python_scripts.md').read_text())
     assert sorted(listed) == sorted(path.stem for path in TUTORIALS.glob('*.py'))
+
+
+def test_page_without_ros_prints_what_it_shows(tanks: Run, tmp_path: Path) -> None:
+    page = (ROOT / 'docs' / 'tutorials' / 'without_ros.md').read_text()
+    (block,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    (printed,) = re.findall(r'```text\n(.*?)```', page, re.DOTALL)
+    folder = tmp_path / 'out' / 'tutorials'
+    folder.mkdir(parents=True)
+    shutil.copy(tanks.folder / 'results' / 'two_tanks.csv', folder)
+    done = subprocess.run([sys.executable, '-c', block], cwd=tmp_path, capture_output=True,
+                          text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith('accepted ')
+    numbers = [re.findall(r'\d\.\d+', text) for text in (done.stdout, printed)]
+    np.testing.assert_allclose(*np.array(numbers, dtype=float), rtol=0.2)
+    assert (tmp_path / 'two_tanks.safetensors').is_file()
 
 
 def test_example_of_the_readme_brings_the_reactor_to_its_set_point(tmp_path: Path) -> None:

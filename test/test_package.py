@@ -129,8 +129,7 @@ def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> N
     assert nodes | tests <= {*keys['ros'], *keys['apt'], *keys['pip']}
     assert not set(keys['none']) & {key for kind in ('ros', 'apt', 'pip') for key in keys[kind]}
     assert nodes & set(keys['pip']) == {'mcap-ros2-support', 'python3-rosbags-pip'}
-    _, _, install = (ROOT / 'docs' / 'operation.md').read_text().partition('## Install')
-    install, _, _ = install.partition('## Start')
+    _, _, install = (ROOT / 'docs' / 'how-to' / 'install.md').read_text().partition('# Install')
     assert not [key for key in keys['pip'] if f'`{key}`' not in install]
     assert not [name for name in keys['none'] if not re.search(rf'install[^`]*\b{name}', install)
                 and f'python3-{name}' not in install]
@@ -149,7 +148,7 @@ def test_packages_that_messages_and_pages_advise_are_known() -> None:
     locked = {canonicalize_name(Requirement(line).name) for line in (
         ROOT / 'requirements.lock').read_text().splitlines() if not line.startswith('#')}
     texts = {path: path.read_text() for path in (
-        *ROOT.glob('*.md'), *ROOT.glob('docs/*.md'), *ROOT.glob('koopman_ros/**/*.py'),
+        *ROOT.glob('*.md'), *ROOT.glob('docs/**/*.md'), *ROOT.glob('koopman_ros/**/*.py'),
         *ROOT.glob('studies/**/*.py'), *ROOT.glob('benchmarks/*.py'), *ROOT.glob('config/*.yaml'))}
     assert not [path for path, text in texts.items() if 'koopman_ros[' in text]
     advised = {name for text in texts.values() for name in re.findall(

@@ -21,9 +21,9 @@ from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/**/*.md'))]
 PARTS = 'koopman_ros|studies|benchmarks|examples|config|docs|test'
-each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
 @each_page
@@ -64,8 +64,10 @@ def test_make_targets_are_in_the_makefile(page: Path) -> None:
 
 
 def test_pages_and_packages_are_listed_and_the_readme_is_short() -> None:
-    listed = re.findall(r'^\w+$', (ROOT / 'docs' / 'index.md').read_text(), re.MULTILINE)
-    assert {page.stem for page in ROOT.glob('docs/*.md')} <= {*listed, 'index'}
+    listed = re.findall(r'^[\w/-]+$', (ROOT / 'docs' / 'index.md').read_text(), re.MULTILINE)
+    assert {str(page.relative_to(ROOT / 'docs').with_suffix(''))
+            for page in ROOT.glob('docs/**/*.md')
+            if page.parts[-2] != 'api'} <= {*listed, 'index'}
     text = (ROOT / 'CONTRIBUTING.md').read_text()
     for package in ROOT.glob('koopman_ros/*/__init__.py'):
         assert f' koopman_ros/{package.parent.name}/ ' in text
@@ -81,11 +83,13 @@ def test_continuous_integration_runs_what_the_pages_say() -> None:
 
 
 def test_interfaces_list_the_topics_with_their_types_and_the_services() -> None:
-    assert [row[:2] for row in _rows('interfaces.md') if '_msgs/' in row[1] and '`' not in row[1]
+    assert [row[:2] for row in _rows('reference/interfaces.md') if '_msgs/' in row[1]
+            and '`' not in row[1]
             ] == [[f'`{name}`', f'{kind.__module__.split(".")[0]}/{kind.__name__}']
                   for name, kind in topics.TYPES.items()]
-    services = {row[0].strip('`') for row in _rows('interfaces.md') if 'std_srvs/' in row[1]}
-    text = (ROOT / 'docs' / 'interfaces.md').read_text()
+    services = {row[0].strip('`') for row in _rows('reference/interfaces.md')
+                if 'std_srvs/' in row[1]}
+    text = (ROOT / 'docs' / 'reference/interfaces.md').read_text()
     managed = set(re.findall(r'`(~/\w+_\w+)`', text[text.index('## Lifecycle'):]))
     for name, node in node_descriptions.PROGRAMS.items():
         serves = set(node.serves) - set(node_descriptions.STANDARD_SERVICES)
@@ -102,7 +106,8 @@ def test_interfaces_list_the_limits_of_a_plan() -> None:
     (state,), (given,) = wiring.signals.states, wiring.signals.inputs
     plan = Plan(*3 * (none,), none, none, none)
     names = active_constraints(wiring.signals, plan, Time(), '').name
-    assert [row[0].strip('`') for row in _rows('interfaces.md') if row[0].startswith('`at_')] == [
+    assert [row[0].strip('`') for row in _rows('reference/interfaces.md')
+            if row[0].startswith('`at_')] == [
         name.replace(given, '<input>').replace(f'_{state} ', '_<state> ') for name in names]
 
 
@@ -111,7 +116,8 @@ def test_interfaces_list_where_signals_are(system: str, column: int) -> None:
     wiring = preset_wiring(system)
     assert wiring is not None
     listed = {row[1].strip('`'): re.findall('`(.+?)`', row[column])
-              for row in _rows('interfaces.md') if re.match('`<(state|input)>.*topic`', row[1])}
+              for row in _rows('reference/interfaces.md') if re.match('`<(state|input)>.*topic`',
+                                                                      row[1])}
     assert listed == {
         f'<{kind}>.{row.name}': [getattr(places, row.name) for places in of.values()]
         for kind, of in (('state', wiring.states), ('input', wiring.inputs))
@@ -119,10 +125,10 @@ def test_interfaces_list_where_signals_are(system: str, column: int) -> None:
 
 
 def test_interfaces_list_the_message_types() -> None:
-    text = (ROOT / 'docs' / 'interfaces.md').read_text()
+    text = (ROOT / 'docs' / 'reference/interfaces.md').read_text()
     for kind in KNOWN_TYPES:
         assert f'`{kind}`' in text
-    rows = [row for row in _rows('interfaces.md') if '/msg/' in row[1] and len(row) == 4]
+    rows = [row for row in _rows('reference/interfaces.md') if '/msg/' in row[1] and len(row) == 4]
     for units, kind, field, there in rows:
         for unit in units.replace('any other', 'V').split(', '):
             found = place('here', '<signal>', unit)
@@ -133,7 +139,7 @@ def test_interfaces_list_the_message_types() -> None:
 
 def test_interfaces_list_what_there_is_of_each_signal() -> None:
     """Beside its places, with the unit of each."""
-    rows = {row[0]: row[1:] for row in _rows('interfaces.md') if 'unit]' in row[1]}
+    rows = {row[0]: row[1:] for row in _rows('reference/interfaces.md') if 'unit]' in row[1]}
     for node, cells in rows.items():
         table = node_descriptions.tables()[node]
         for cell, kind in zip(cells, ('states', 'inputs'), strict=True):
@@ -150,7 +156,7 @@ def test_interfaces_list_what_there_is_of_each_signal() -> None:
 
 
 def test_operation_quotes_what_diagnostics_say() -> None:
-    quotes = [quote for row in _rows('operation.md') if len(row) == 5
+    quotes = [quote for row in _rows('reference/faults.md') if len(row) == 5
               for quote in re.findall('`(.+?)`', row[2])]
     assert len(quotes) > 15
     for quote in quotes:

@@ -198,5 +198,5 @@ figure.savefig(OUT / 'buckled_beam.png')
 # ## In ROS
 #
 # For a simulated beam on topics write the equation as a class of constants with a method `system`,
-# as [your own plant](../../docs/own_plant.md) does; the file that `save` writes of the model is
-# for the controller node, as in `two_tanks.py`.
+# as [your own plant](../../docs/tutorials/own_plant.md) does; the model file that `save`
+# writes is for the controller node, as in `two_tanks.py`.

@@ -239,7 +239,7 @@ figure.savefig(OUT / 'two_tanks_loop.png')
 # The controller node takes the file as it is. The first command starts it for the signals, limits
 # and weights that `config/plants/two_tanks.yaml` has for tanks on topics, the second one simulates
 # such tanks. A record of the leaking tanks makes the next model:
-# [recording and retraining](../../docs/retraining.md).
+# [recording and retraining](../../docs/how-to/retrain.md).
 
 # %%
 command = (f'ros2 run koopman_ros controller --ros-args -p system:=two_tanks '

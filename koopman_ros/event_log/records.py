@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records: numbered lines of JSON, one for each event that changed a controller; see docs/records.md.
+Records: numbered lines of JSON, one for each event that changed a controller.
+
+They are described in docs/reference/event_log.md.
 
 Numbers are in the model's units, times in nanoseconds. JSON has numbers, texts, lists and objects.
 What it lacks is an object with the key ``@``, which says what it is: ``float`` for one that is not

@@ -64,7 +64,9 @@ _SOURCES_WINDOW = 10.0  # s, where no time-out of the measurements says how long
 
 class ControllerNode(ManagedNode):
     """
-    Carry messages to and from the control step; docs/interfaces.md has its topics and services.
+    Carry messages to and from the control step.
+
+    Its topics and services are in docs/reference/interfaces.md.
 
     All runs in the executor's thread, but for the watch over silence while that thread is busy.
     """

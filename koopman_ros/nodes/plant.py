@@ -52,7 +52,7 @@ class RunPhase(Enum):
 
 
 class PlantNode(ManagedNode):
-    """Run a plant in time; docs/interfaces.md has its topics and services."""
+    """Run a plant in time; docs/reference/interfaces.md has its topics and services."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('plant', **options)

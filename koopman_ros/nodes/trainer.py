@@ -25,7 +25,7 @@ from koopman_ros.ros.training import present_lift, Training
 
 
 class TrainerNode(ManagedNode):
-    """Compose what the trainer does; docs/interfaces.md has its topics and services."""
+    """Compose what the trainer does; docs/reference/interfaces.md has its topics and services."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('trainer', **options)

@@ -172,7 +172,7 @@ def policy(system: str = DEFAULT_SYSTEM) -> str:
     """Return the text of the SROS2 policy: one enclave for each node, and one for operators."""
     root = ElementTree.Element('policy', version='0.2.0')
     root.append(ElementTree.Comment(
-        ' Least privilege for each node, written by `make config`: see docs/security.md. For '
+        ' Least privilege for each node, written by `make config`: see docs/how-to/secure.md. For '
         'nodes in\n       a namespace replace every ns="/" by it. '))
     enclaves = ElementTree.SubElement(root, 'enclaves')
     for name, own in {**programs(system), 'operator': operator(system)}.items():

@@ -117,7 +117,8 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
 def take_down(name: str, node: LoopNode | None, executor: Executor | None,
               patience: float = TAKE_DOWN_PATIENCE) -> None:
     """Take a node down, and the middleware, by force where that takes longer than so many s."""
-    # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see docs/middleware.md
+    # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see
+    # docs/explanation/fast_dds_deadlock.md
     disarm = force_exit_after(patience, 0, (
         f'{name}: the middleware does not shut down: left to the operating system'))
     if executor is not None:

@@ -84,7 +84,7 @@ def test_process_ends_in_order_or_is_aborted_and_says_where_it_is(
 
 
 def test_example_of_the_page_passes(tmp_path: Path) -> None:
-    page = Path(__file__).parents[2] / 'docs' / 'testing.md'
+    page = Path(__file__).parents[2] / 'docs' / 'how-to' / 'test_nodes.md'
     _, example, _ = re.split('```(?:python)?\n', page.read_text())
     exec(example, names := {})
     (test,) = (found for name, found in names.items() if name.startswith('test_'))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant of one's own as docs/own_plant.md has it: its commands, its files, its messages."""
+"""The commands, files and messages of docs/tutorials/own_plant.md."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +27,7 @@ from support.installation import Installation, ROOT, run, underlay
 from support.nodes import run_here
 
 OVEN = ROOT / 'examples' / 'oven'
-PAGE = (ROOT / 'docs' / 'own_plant.md').read_text()
+PAGE = (ROOT / 'docs' / 'tutorials' / 'own_plant.md').read_text()
 # node and arguments of each command on the page that takes a file, in the order there
 RECORD, SIMULATE, TRAIN, CONTROL, RUN, *_ = (
     (node, tuple(shlex.split(text))) for node, text in re.findall(
@@ -129,7 +129,7 @@ class Failing:
     (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check module')),
     (plant, {'system': 'bad_oven:Empty'}, ('must be a ControlAffineSystem', 'method system')),
     (plant, {'system': 'bad_oven:Failing'}, ('cannot be built (ZeroDivisionError', 'its class')),
-    (trainer, {}, ('what is measured and commanded is not known', "like ['level [m]']")),
+    (trainer, {}, ('the measured signals and inputs of the system', "like ['level [m]']")),
     (trainer, {**SIGNALS, 'states_measured': '["temperature [Kelvin]"]'},
      ("there is no unit 'Kelvin'", 'write one like K')),
     (controller, {**SIGNALS, 'model': 'reactor_nz4'},
@@ -155,7 +155,7 @@ def test_start_with_what_is_wrong_says_so(
 def test_page_names_the_files_and_quotes_what_is_said() -> None:
     sources = {path.suffix: [p.read_text() for p in OVEN.glob(f'*{path.suffix}')]
                for path in OVEN.iterdir() if path.suffix}
-    on_ros = PAGE.partition('## From Python')[0]
+    on_ros = PAGE
     for kind, suffix in (('yaml', '.yaml'), ('python', '.py')):
         blocks = re.findall(rf'```{kind}\n(.*?)```', on_ros, re.DOTALL)
         assert blocks
