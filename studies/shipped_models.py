@@ -17,7 +17,7 @@ import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
-from koopman_ros.learning import IncrementalTraining, roll_out, train
+from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.model import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import (
@@ -120,7 +120,7 @@ def linear_model(like: LiftedModel) -> LiftedModel:
 def _with_roll_out(model: LiftedModel) -> LiftedModel:
     """Add the roll-out error, in K, over a fresh episode of random steps to the metrics."""
     truth = random_steps(SYSTEM, TRAINING, 15.0, SEED - 1)
-    predicted = roll_out(model, truth.x[0], truth.u, TRAINING.sample_period)
+    predicted = model.predict(truth.x[0], truth.u, TRAINING.sample_period)
     error = float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
     metrics = {**model.provenance.metrics, 'rollout_rmse': error}
     return replace(model, provenance=replace(model.provenance, metrics=metrics))

@@ -24,7 +24,7 @@ from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
 from koopman_ros.evaluation import at, simulate
-from koopman_ros.learning import evaluate_model, learn_lift, roll_out, Thresholds
+from koopman_ros.learning import evaluate_model, learn_lift, Thresholds
 from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.model import load, save
 from koopman_ros.plants import (
@@ -124,7 +124,7 @@ for line in (*decision.reasons, *decision.warnings):
 
 # %%
 fresh = random_steps(truth, design, 600.0, seed=4)
-predicted = roll_out(trained.model, fresh.x[0], fresh.u, PERIOD)
+predicted = trained.model.predict(fresh.x[0], fresh.u, PERIOD)
 astray = np.sqrt(np.mean((predicted - fresh.x) ** 2, axis=0))
 print(f'prediction of ten fresh minutes: {1e3 * astray.round(6)} mm off')
 

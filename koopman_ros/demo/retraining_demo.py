@@ -23,7 +23,6 @@ from koopman_ros.demo import reactor
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import Operator, running_loop
 from koopman_ros.demo.results import DemoRun, draw_phases, read_run
-from koopman_ros.learning import roll_out
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.trainer import MANUAL
 from koopman_ros.plants import (
@@ -109,7 +108,7 @@ def rollout_rmse(model: LiftedModel) -> float:
     design = RandomStepDesign(model.inputs.lower, model.inputs.upper, model.states.lower,
                               model.states.upper, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
     truth = random_steps(fouled, design, 15.0, _TEST_SEED)
-    predicted = roll_out(model, truth.x[0], truth.u, design.sample_period)
+    predicted = model.predict(truth.x[0], truth.u, design.sample_period)
     return float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
 
 

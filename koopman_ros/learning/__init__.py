@@ -18,7 +18,6 @@ from koopman_ros.learning.lift.metrics import (
     Fit,
     fit,
     LiftMetrics,
-    roll_out,
     rollout_rmse,
 )
 from koopman_ros.learning.lift.multistart import MultistartProgress
@@ -57,7 +56,6 @@ __all__ = [
     'learn_lift',
     'retrain',
     'retrain_fleet',
-    'roll_out',
     'rollout_rmse',
     'train',
     'write_report',

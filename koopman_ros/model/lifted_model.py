@@ -30,6 +30,10 @@ from koopman_ros.model_classes import (
 )
 
 _SAMPLES = 256  # random states of a box whose training states are not known
+# Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
+_MAX_DRIFTS = 10_000
+# A prediction this far from the nominal point, in units of the scale, has diverged.
+_DIVERGED = 1e6
 # Of Gauss and Legendre on [0, 1].
 NODES, WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
 
@@ -195,6 +199,50 @@ class LiftedModel:
         """Eigenvalues (n_z,) of A in 1/time unit, slowest (largest real part) first."""
         values = np.linalg.eigvals(self.A).astype(np.complex128)
         return values[np.argsort(-values.real)]
+
+    def predict(self, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
+        """
+        Simulate the states under inputs that are held: dx/dt = f(x) + B(x) u.
+
+        :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
+        :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
+        :param sample_period: in the model's time unit, or (K,) periods.
+        :return: (..., K + 1, n_x) states at the samples, in state units.
+        :raises RuntimeError: when the prediction diverges.
+        :raises ValueError: for arrays that do not fit the model, or periods that are not above 0.
+        """
+        # not needed by nodes, which it would cost a tenth of a second at their start
+        from scipy.integrate import DOP853
+
+        inputs = self.inputs.array('inputs', inputs)
+        xi = self.states.to_deviation(self.states.array('x0', x0))
+        shape = xi.shape
+        if inputs.ndim != xi.ndim + 1:
+            raise ValueError(f'incompatible inputs: expected ({", ".join(map(str, shape[:-1]))}'
+                             f'{", " if shape[:-1] else ""}K, {self.n_u}), got {inputs.shape}')
+        holds = inputs.shape[-2]
+        periods = np.asarray(sample_period, dtype=np.float64)
+        if periods.shape not in ((), (holds,)) or not np.all(periods > 0.0):
+            raise ValueError(f'sample_period must be above 0 {self.time_unit}, one number or one '
+                             f'for each of {holds} inputs, got {sample_period}')
+        v = self.inputs.to_deviation(inputs)
+        path = [xi]
+        for k, period in enumerate(np.broadcast_to(periods, (holds,))):
+            # a prediction that overflows is reported below
+            with np.errstate(all='ignore'):
+                rate = self.rate_under(v[..., k, :])
+                solver = DOP853(
+                    lambda _, y, rate=rate: rate(y.reshape(shape)).ravel(), 0.0, xi.ravel(),
+                    period, rtol=1e-9, atol=1e-12)
+                # near a state where J_N is singular the steps may become ever shorter
+                while solver.status == 'running' and solver.nfev < _MAX_DRIFTS:
+                    solver.step()
+            xi = solver.y.reshape(shape)
+            if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
+                raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
+                                   'inputs within the training box')
+            path.append(xi)
+        return self.states.to_physical(np.stack(path, axis=-2))
 
     @cached_property
     def fastest_rate(self) -> float:

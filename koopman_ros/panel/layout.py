@@ -163,6 +163,11 @@ class PageLayout:
         found: ui.button = self.control(ui.button(text, on_click=act).props('outline'))
         return found
 
+    def allow(self, control: Any, possible: bool) -> None:
+        """Enable a control for operators while it can act."""
+        if control.enabled is not (enabled := self.enabled and possible):
+            control.set_enabled(enabled)
+
     async def confirm(self, question: str, yes: str, details: Sequence[str] = ()) -> bool:
         """Return whether the visitor confirms; Escape cancels."""
         with ui.dialog() as dialog, box('card'):

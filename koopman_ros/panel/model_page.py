@@ -11,6 +11,7 @@ import math
 
 from nicegui import ui
 
+from koopman_ros.core.units import printed
 from koopman_ros.panel.layout import AnswerLine, box, card, label, PageLayout, show_if
 from koopman_ros.panel.model_card import status_card
 from koopman_ros.panel.report_cards import comparison_card, report_card
@@ -138,26 +139,28 @@ def _model(page: PageLayout) -> None:
 
 
 def _buttons(page: PageLayout, actions: Mapping[str, Callable[[], Awaitable[Answer | None]]]
-             ) -> None:
-    """Add buttons for actions, and the line of their answers."""
+             ) -> list[ui.button]:
+    """Add buttons for actions, and the line of their answers; return the buttons."""
     async def press(act: Callable[[], Awaitable[Answer | None]]) -> None:
         if found := await act():
             answer.show(found)
 
     with box('row1'):
-        for text, act in actions.items():
-            page.button(text, partial(press, act))
+        buttons = [page.button(text, partial(press, act)) for text, act in actions.items()]
     answer = AnswerLine()
+    return buttons
 
 
 def _recording(page: PageLayout) -> None:
     with card('recording', 'Recording'):
         task = _Task()
-        _buttons(page, {'Record': partial(page.act, 'record', TRAINER, True),
-                        'Stop': partial(page.act, 'record', TRAINER, False)})
+        record, stop = _buttons(page, {'Record': partial(page.act, 'record', TRAINER, True),
+                                       'Stop': partial(page.act, 'record', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(RECORDING)
+        page.allow(record, 'bag' not in found.values)
+        page.allow(stop, 'bag' in found.values)
         task.show(found, {key: value for key, value in found.values.items()
                           if not key.startswith('messages on') and value not in found.message})
 
@@ -175,11 +178,12 @@ def _experiment(page: PageLayout) -> None:
                 'Start the experiment?', 'Start the experiment',
                 ['The experiment applies random steps within these limits:', *lines]) else None
 
-        _buttons(page, {'Start …': start,
-                        'End': partial(page.act, 'experiment', TRAINER, False)})
+        _, end = _buttons(page, {'Start …': start,
+                                 'End': partial(page.act, 'experiment', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
+        page.allow(end, 'left [s]' in found.values)
         task.show(found, found.values)
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
 
@@ -192,7 +196,7 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         return ['Trainer not running: no limits available']
 
     def text(name: str) -> str:
-        return f'{parameters[name].text} {parameters[name].unit}'.rstrip()
+        return f'{parameters[name].text} {printed(parameters[name].unit)}'.rstrip()
 
     on = parameters['experiment_signal'].text
     lines = [f'steps: {on}, for {text("experiment_length")}, each '
@@ -215,8 +219,8 @@ def _training(page: PageLayout) -> None:
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')
         task = _Task()
-        _buttons(page, {'Train': partial(page.act, 'train', TRAINER),
-                        'Cancel': partial(page.act, 'cancel', TRAINER)})
+        train, cancel = _buttons(page, {'Train': partial(page.act, 'train', TRAINER),
+                                        'Cancel': partial(page.act, 'cancel', TRAINER)})
 
     def show(now: Snapshot) -> None:
         found = now.status(TRAINING)
@@ -224,6 +228,9 @@ def _training(page: PageLayout) -> None:
             done = float(found.values.get(_DONE, 'nan'))
         except ValueError:
             done = math.nan
+        running = done < 100.0 and found.level == OK and 'accepted' not in found.values
+        page.allow(train, not running)
+        page.allow(cancel, running)
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)
         share.set_text('' if math.isnan(done) else f'{done:.0f} %')
         task.show(found, {key.replace('_', ' '): value

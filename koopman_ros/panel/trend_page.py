@@ -28,6 +28,7 @@ _ALL: Range = (0.0, 1.0)  # shares of the time shown
 _PAUSE = 0.3  # s between two updates of a zoom
 _EPOCH = 1e9  # s; a later stamp is a wall time, an earlier one is a simulated time
 _MARKS = 40  # last events that are shown
+_LEAST = 0.1  # of the range of a signal, which an axis shows
 _INKS = ('#1d1d1b', '#4b6a88', '#7a6a45', '#6b4b6b', '#3f6b54', '#8a5a44')
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
           'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
@@ -44,6 +45,7 @@ class _Pen:
     signal: str
     key: str  # in the trends
     title: str
+    label: str  # of the signal
     steps: bool  # whether the value holds until the next one
 
 
@@ -61,6 +63,7 @@ def _charts(now: Snapshot) -> _Charts:
                 face.controlled) else ['measured', 'predicted']
         found.setdefault((is_input, face.unit), []).extend(
             _Pen(kind, face.name, pen(kind, face.name), f'{pen(kind, face.label)} [{face.unit}]',
+                 face.label,
                  kind in ('commands', 'active_setpoints') or (kind == 'planned' and is_input))
             for kind in kinds)
     return [(unit, pens) for (_, unit), pens in found.items()]
@@ -83,7 +86,7 @@ class TrendChart:
         simulated = page.source.snapshot.time < _EPOCH
         self._chart = ui.echart(_options(self._charts, height, zoom, simulated)).props(
             'aria-label="Trends of all signals" role=img')
-        self._chart.style['height'] = f'{height * len(self._charts) + (90 if zoom else 45)}px'
+        self._chart.style['height'] = f'{height * len(self._charts) + (105 if zoom else 60)}px'
         if zoom:
             self._chart.on('chart:datazoom', self._on_zoom, ['start', 'end', 'batch'],
                            throttle=_PAUSE, leading_events=False)
@@ -128,8 +131,9 @@ class TrendChart:
             'legend': {'data': [own.title for own in pens if own.kind != 'planned'
                                 or faces[own.signal].plan]},
             'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end} for _ in self._charts],
-            'yAxis': [_ends([faces[own.signal].span for own in pens]) if self._whole else {
-                'min': None, 'max': None} for _, pens in self._charts],
+            'yAxis': [axis_ends([faces[own.signal].span for own in pens],
+                            () if self._whole else [values[own.key][1] for own in pens])
+                      for _, pens in self._charts],
             'series': [{'name': own.title, 'data': _points(*values[own.key]),
                         'markLine': _lines(own, faces[own.signal],
                                            self.marks if own is pens[0] else ())}
@@ -206,9 +210,21 @@ def _points(times: Array, values: Array) -> list[list[float | None]]:
             for t, v in zip(times.tolist(), values.tolist(), strict=True)]
 
 
-def _ends(spans: Sequence[Range]) -> dict[str, float]:
-    return {'min': round(min(low for low, _ in spans), 6),
-            'max': round(max(high for _, high in spans), 6)}
+def axis_ends(spans: Sequence[Range], pens: Sequence[Array]) -> dict[str, float | None]:
+    """Return the ends of an axis: of the spans without pens, else such that noise stays small."""
+    low, high = min(low for low, _ in spans), max(high for _, high in spans)
+    if not pens:
+        return {'min': round(low, 6), 'max': round(high, 6)}
+    least = _LEAST * (high - low)
+    values = np.concatenate(pens)
+    values = values[np.isfinite(values)]
+    if not len(values) or np.ptp(values) >= least:
+        # the chart finds round numbers
+        return {'min': None, 'max': None}
+    middle = 0.5 * float(np.min(values) + np.max(values))
+    step = 10.0 ** math.floor(math.log10(least) - 0.5)
+    return {'min': round(math.floor((middle - 0.5 * least) / step) * step, 6),
+            'max': round(math.ceil((middle + 0.5 * least) / step) * step, 6)}
 
 
 def _lines(own: _Pen, face: Faceplate, marks: Sequence[TrendMark]) -> dict[str, Any]:
@@ -250,16 +266,18 @@ def _options(charts: _Charts, height: int, zoom: bool, simulated: bool) -> dict[
                    'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
                    # less than that of the text cuts it where there are several pages of pens
                    'itemHeight': 14, 'itemWidth': 14},
-        'grid': [{'left': 56, 'right': 16, 'top': 45 + height * at, 'height': height - 60}
+        'grid': [{'left': 56, 'right': 16, 'top': 60 + height * at, 'height': height - 60}
                  for at in several],
         'xAxis': [{'type': 'time', 'gridIndex': at, 'axisPointer': {'label': {
             ':formatter': _CLOCK if not simulated else _PLANT_CLOCK}}, 'axisLabel': {
             'formatter': '{HH}:{mm}:{ss}', 'hideOverlap': True, 'color': '#1d1d1b'}}
             for at in several],
-        'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at, 'name': unit,
-                   'axisLabel': {'color': '#1d1d1b'}, 'nameTextStyle': {'color': '#1d1d1b'},
+        'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
+                   'name': f'{", ".join(dict.fromkeys(own.label for own in own_pens))} [{unit}]',
+                   'axisLabel': {'color': '#1d1d1b'},
+                   'nameTextStyle': {'color': '#1d1d1b', 'align': 'left'},
                    'splitLine': {'lineStyle': {'color': '#c4c4c0'}}}
-                  for at, (unit, _) in enumerate(charts)],
+                  for at, (unit, own_pens) in enumerate(charts)],
         'dataZoom': [] if not zoom else [
             {'type': 'inside', 'xAxisIndex': list(several), 'filterMode': 'none'},
             {'type': 'slider', 'xAxisIndex': list(several), 'bottom': 6, 'height': 24,

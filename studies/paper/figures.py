@@ -12,7 +12,6 @@ import numpy as np
 
 from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend, LIMIT, Picture
 from koopman_ros.evaluation import ClosedLoop
-from koopman_ros.learning import roll_out
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import RandomStepDesign
 from studies.campaign import Campaign
@@ -180,7 +179,7 @@ def _roll_outs(design: RandomStepDesign, where: str, campaign: Campaign, path: P
         top.plot(truth.time, truth.x[:, 0], label='reactor', **EXACT)
         for name, label, style in (('nz=3', 'learned lift, n$_z$ = 3', LEARNED),
                                    ('linear', 'linearisation', LINEAR)):
-            predicted = roll_out(models[name], truth.x[0], truth.u[:-1], np.diff(truth.time))
+            predicted = models[name].predict(truth.x[0], truth.u[:-1], np.diff(truth.time))
             errors[name] = float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
             top.plot(truth.time, predicted[:, 0], label=label, **style)
         top.set(ylabel='temperature  [K]')

@@ -17,7 +17,6 @@ from koopman_ros.learning import (
     AcceptanceResult,
     evaluate_model,
     learn_lift,
-    roll_out,
     Thresholds,
     Trained,
     TrainingFailed,
@@ -169,7 +168,7 @@ def _roll_out_error(model: LiftedModel, system: ControlAffineSystem, design: Ran
     errors = []
     for number in range(_TESTS):
         truth = _drive(system, design, 10_000 * (seed + 1) + number, _TEST_MINUTES)
-        predicted = roll_out(model, truth.x[0, [state]], truth.u[:-1], PERIOD)
+        predicted = model.predict(truth.x[0, [state]], truth.u[:-1], PERIOD)
         errors.append(predicted - truth.x[:, [state]])
     return float(np.sqrt(np.mean(np.square(errors))))
 

@@ -20,6 +20,7 @@ from typing import NamedTuple
 from urllib.parse import urlencode
 
 from nicegui import Client
+import numpy as np
 from playwright.sync_api import expect, Page
 import pytest
 from websockets.sync.client import ClientConnection, connect
@@ -28,7 +29,7 @@ from websockets.typing import Origin
 from koopman_ros.panel import trend_page
 from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
-from koopman_ros.panel.trend_page import zoomed
+from koopman_ros.panel.trend_page import axis_ends, zoomed
 from support.browser import opened_browser, Pages
 from support.hostile import HostileSource, NOW, TEXTS
 from support.users import PASSWORDS, write_users
@@ -417,3 +418,21 @@ def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
 def test_the_zoom_of_a_browser_is_checked(
         event: object, window: tuple[float, float] | None) -> None:
     assert zoomed(event) == window
+
+
+@pytest.mark.parametrize(('values', 'ends'), [
+    ([], None), ([math.nan], None), ([0.0, 3.0], None),
+    # noise of a tenth of a degree does not fill the chart of a range of twenty
+    ([46.03, 46.1, math.nan], (45.0, 47.2))])
+def test_an_axis_shows_a_share_of_the_range_of_its_signals(
+        values: list[float], ends: tuple[float, float] | None) -> None:
+    shown = axis_ends([(30.0, 40.0), (35.0, 50.0)], [np.array(values), np.array([])])
+    if ends is None:
+        assert shown == {'min': None, 'max': None}
+        return
+    low, high = shown['min'], shown['max']
+    assert low is not None
+    assert high is not None
+    assert ends[0] <= low <= 46.03 < 46.1 <= high <= ends[1]
+    assert high - low >= 2.0
+    assert axis_ends([(30.0, 40.0), (35.0, 50.0)], ()) == {'min': 30.0, 'max': 50.0}

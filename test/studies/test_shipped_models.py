@@ -13,7 +13,7 @@ from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
-from koopman_ros.learning import fit, roll_out
+from koopman_ros.learning import fit
 from koopman_ros.model import load
 from koopman_ros.plants import (
     box_episodes,
@@ -62,7 +62,7 @@ def episodes():
 
 def roll_out_error(model, episodes):
     """Return the root mean square of the prediction error over all episodes, in K."""
-    squares = [np.square(roll_out(model, episode.x[0], episode.u, SAMPLE_PERIOD)
+    squares = [np.square(model.predict(episode.x[0], episode.u, SAMPLE_PERIOD)
                          - episode.x) for episode in episodes]
     return float(np.sqrt(np.mean(squares)))
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import DOP853
 
 from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import Array, DriftSamples
@@ -18,8 +17,6 @@ from koopman_ros.model import LiftedModel
 _MAX_COND = 1e13
 # Of relative mean-square errors below it, which is smaller says nothing.
 ROUNDING = 1e-20
-# Of the drift in a roll-out, for each sample; a model a thousand times faster needs a fifth.
-_MAX_DRIFTS = 10_000
 # A prediction this far from the nominal point, in units of the scale, has diverged.
 _DIVERGED = 1e6
 
@@ -109,48 +106,6 @@ def _relative_error(model: LiftedModel, xi: Array, f: Array) -> float:
     return float(np.sum(error ** 2) / np.sum(f ** 2))
 
 
-def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
-    """
-    Predict the states under inputs that are held, from the model's drift: dx/dt = f(x) + B(x) u.
-
-    :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
-    :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
-    :param sample_period: in the model's time unit, or (K,) periods.
-    :return: (..., K + 1, n_x) states at the samples, in state units.
-    :raises RuntimeError: when the prediction diverges.
-    :raises ValueError: for arrays that do not fit the model, or periods that are not above 0.
-    """
-    inputs = model.inputs.array('inputs', inputs)
-    xi = model.states.to_deviation(model.states.array('x0', x0))
-    shape = xi.shape
-    if inputs.ndim != xi.ndim + 1:
-        raise ValueError(f'incompatible inputs: expected ({", ".join(map(str, shape[:-1]))}'
-                         f'{", " if shape[:-1] else ""}K, {model.n_u}), got {inputs.shape}')
-    holds = inputs.shape[-2]
-    periods = np.asarray(sample_period, dtype=np.float64)
-    if periods.shape not in ((), (holds,)) or not np.all(periods > 0.0):
-        raise ValueError(f'sample_period must be above 0 {model.time_unit}, one number or one for '
-                         f'each of {holds} inputs, got {sample_period}')
-    v = model.inputs.to_deviation(inputs)
-    path = [xi]
-    for k, period in enumerate(np.broadcast_to(periods, (holds,))):
-        # a prediction that overflows is reported below
-        with np.errstate(all='ignore'):
-            rate = model.rate_under(v[..., k, :])
-            solver = DOP853(
-                lambda _, y, rate=rate: rate(y.reshape(shape)).ravel(), 0.0, xi.ravel(), period,
-                rtol=1e-9, atol=1e-12)
-            # near a state where J_N is singular the steps may become ever shorter
-            while solver.status == 'running' and solver.nfev < _MAX_DRIFTS:
-                solver.step()
-        xi = solver.y.reshape(shape)
-        if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
-            raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
-                               'inputs within the training box')
-        path.append(xi)
-    return model.states.to_physical(np.stack(path, axis=-2))
-
-
 def rollout_rmse(model: LiftedModel, samples: DriftSamples) -> Array | None:
     """
     Predict every episode from its first state; return the root mean square error (n_x,), in units.
@@ -170,7 +125,7 @@ def rollout_rmse(model: LiftedModel, samples: DriftSamples) -> Array | None:
         rows = np.stack(group)
         periods = np.diff(samples.time[rows[0]])
         try:
-            predicted = roll_out(model, samples.x[rows[:, 0]], samples.u[rows[:, :-1]], periods)
+            predicted = model.predict(samples.x[rows[:, 0]], samples.u[rows[:, :-1]], periods)
         except (RuntimeError, np.linalg.LinAlgError):
             return np.full(model.n_x, np.inf)
         squares += np.sum((predicted - samples.x[rows]) ** 2, axis=(0, 1))

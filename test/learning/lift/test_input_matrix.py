@@ -17,7 +17,7 @@ from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.evaluation.model_comparison import PredictionWindows
-from koopman_ros.learning import Edmd, fit, IncrementalTraining, NeuralDrift, roll_out, train
+from koopman_ros.learning import Edmd, fit, IncrementalTraining, NeuralDrift, train
 from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
@@ -167,7 +167,7 @@ def test_lifts_and_drifts_are_learned_with_it():
         assert fit(model, fresh.x, fresh.dxdt, fresh.u).rx < 1e-4
         found = evaluate_closed_loops(model, PLANT.derivative, loops=8)
         assert found.accepted, found
-        path = roll_out(model, fresh.x[0], fresh.u[:5], 0.05)
+        path = model.predict(fresh.x[0], fresh.u[:5], 0.05)
         assert np.all(np.abs(path[1:5] - fresh.x[1:5]) < [1e-3, 0.1])
 
 

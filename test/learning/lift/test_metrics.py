@@ -15,7 +15,6 @@ from koopman_ros.learning import (
     Fit,
     fit,
     LiftMetrics,
-    roll_out,
     rollout_rmse,
 )
 from koopman_ros.model import (
@@ -92,7 +91,7 @@ def test_roll_out_of_a_linear_model_against_the_matrix_exponential():
     inputs, x0 = rng.uniform(-3.0, 3.0, (25, 1)), np.array([2.2, 1.7])
     # all inputs held equally long, and each for a time of its own
     for periods in (0.3, rng.uniform(0.1, 0.5, 25)):
-        path = roll_out(model, x0, inputs, periods)
+        path = model.predict(x0, inputs, periods)
         assert path.shape == (26, 2)
         np.testing.assert_array_equal(path[0], x0)
         deviation = x0 - model.states.center
@@ -107,16 +106,16 @@ def test_roll_out_follows_the_projected_drift():
     c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
     observables = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
     model = LiftedModel(observables, -np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
-    path = roll_out(model, np.array([1.2]), np.zeros((20, 1)), 0.2)
+    path = model.predict(np.array([1.2]), np.zeros((20, 1)), 0.2)
     expected = np.arctanh(np.tanh(1.2) * np.exp(-0.2 * np.arange(21)))
     np.testing.assert_allclose(path[:, 0], expected, rtol=0, atol=1e-8)
 
 
 def test_a_roll_out_without_inputs_and_one_that_diverges():
     x0 = np.array([2.2, 1.7])
-    np.testing.assert_array_equal(roll_out(linear_model(), x0, np.zeros((0, 1)), 0.3), [x0])
+    np.testing.assert_array_equal(linear_model().predict(x0, np.zeros((0, 1)), 0.3), [x0])
     with pytest.raises(RuntimeError, match=r'diverged after \d+ samples: keep the inputs within'):
-        roll_out(linear_model(50.0 * np.eye(2)), np.ones(2), np.zeros((40, 1)), 1.0)
+        linear_model(50.0 * np.eye(2)).predict(np.ones(2), np.zeros((40, 1)), 1.0)
 
 
 def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
@@ -125,11 +124,11 @@ def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
     observables = NetworkObservables(np.ones((2, 1)), np.array([-0.5, -2.5]),
                                      np.array([[1.0, -1.0]]), identity=False)
     model = LiftedModel(observables, np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
-    path = roll_out(model, np.array([0.5]), np.zeros((7, 1)), 0.1)
+    path = model.predict(np.array([0.5]), np.zeros((7, 1)), 0.1)
     z = model.lift(path)
     np.testing.assert_allclose(z, z[0] * np.exp(0.1 * np.arange(8))[:, None], rtol=1e-7)
     with pytest.raises(RuntimeError, match='diverged after 9 samples'):
-        roll_out(model, np.array([0.5]), np.zeros((9, 1)), 0.1)
+        model.predict(np.array([0.5]), np.zeros((9, 1)), 0.1)
 
 
 @pytest.mark.parametrize('change', [
@@ -137,9 +136,9 @@ def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
     {'sample_period': [0.1] * 3}, {'sample_period': -0.1}], ids=str)
 def test_a_roll_out_of_what_does_not_fit(change):
     usual = {'x0': [2.2, 1.7], 'inputs': [[1.0], [2.0]], 'sample_period': 0.1}
-    assert roll_out(linear_model(), **usual).shape == (3, 2)
+    assert linear_model().predict(**usual).shape == (3, 2)
     with pytest.raises(ValueError, match=r'expected|must be above 0 s'):
-        roll_out(linear_model(), **{**usual, **change})
+        linear_model().predict(**{**usual, **change})
 
 
 def test_samples_of_another_plant_are_no_fit():
@@ -154,10 +153,10 @@ def test_roll_outs_side_by_side_are_those_one_by_one():
     model = replace(model, A=0.1 * model.A)
     x0 = rng.uniform(model.states.lower, model.states.upper, (2, 3, 2))
     inputs = rng.uniform(-1.0, 1.0, (2, 3, 7, 1))
-    together = roll_out(model, x0, inputs, 0.2)
+    together = model.predict(x0, inputs, 0.2)
     assert together.shape == (2, 3, 8, 2)
     for i, j in np.ndindex(2, 3):
-        np.testing.assert_allclose(together[i, j], roll_out(model, x0[i, j], inputs[i, j], 0.2),
+        np.testing.assert_allclose(together[i, j], model.predict(x0[i, j], inputs[i, j], 0.2),
                                    rtol=0, atol=1e-7)
 
 
@@ -167,7 +166,7 @@ def linear_episodes(jacobian=JACOBIAN, lengths=(6, 9), shift=0.0, period=0.2):
     x, u, time, episode = [], [], [], []
     for number, length in enumerate(lengths):
         inputs = rng.uniform(-1.0, 1.0, (length, 1))
-        path = roll_out(model, rng.uniform([2.5, 0.0], [3.5, 2.0]), inputs[:-1], period)
+        path = model.predict(rng.uniform([2.5, 0.0], [3.5, 2.0]), inputs[:-1], period)
         path[1:] += shift
         x, u = [*x, path], [*u, inputs]
         time.append(5.0 + period * np.arange(length))
