@@ -100,7 +100,7 @@ def test_bounds_of_an_experiment_are_asked_for_by_name():
 
 
 def test_trainer_that_knows_no_signals_says_how_to_name_them():
-    with pytest.raises(ConfigurationError, match=r"system 'oven': give .* like \['level \[m\]'\]"):
+    with pytest.raises(ConfigurationError, match=r"'oven' are not known: .*\['level \[m\]'\]"):
         trainer_table(None, {'system': 'oven'})
 
 

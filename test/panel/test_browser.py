@@ -177,7 +177,7 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         experiment = card(page, 'Experiment')
         expect(experiment).to_contain_text('steps: setpoint')
         press(experiment, 'Start …')
-        expect(page.get_by_role('dialog')).to_contain_text('set-points 40 degC to 50 degC')
+        expect(page.get_by_role('dialog')).to_contain_text('set-points 40 °C to 50 °C')
         confirmed(page, 'Start the experiment', experiment, re.compile('^(?!.*refused).+'))
 
         def recorded() -> int:

@@ -218,6 +218,8 @@ def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]
                 learn_input_matrix=search.learn_B)
             refined_network = beside.refined(network, monitor, linear.starts)
             found += beside.judged(refined_network.model, refined_network.starts, OUTPUT_ERROR)
+            if np.mean(found[-1].errors ** 2) <= explained:
+                break
     return found
 
 

@@ -92,9 +92,8 @@ def test_steady_states_of_an_unstable_plant_from_closed_loop():
 
 def test_a_known_input_matrix_is_kept():
     gain = 1.0
-    found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])),
-                                [record(saddle, samples=600, gain=2.0)], 1,
-                                highest_degree=1)
+    moved = record(lambda x, u: A @ x + np.array([gain, 0.0]) * u, samples=400)
+    found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])), [moved], 1, highest_degree=1)
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
 
