@@ -199,11 +199,9 @@ def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]
             last = search.linear(count, monitor) if last is None else search.refined(
                 record.fit, raised(last), monitor)
             foreseeing = _Candidates(shared, last, count)
-            found += foreseeing.judged(
-                PolynomialCoefficients(last.drift, search.learn_B), foreseeing.starts,
-                INNOVATIONS_FORM)
-            refined = foreseeing.refined(PolynomialCoefficients(last.drift, search.learn_B),
-                                         monitor)
+            polynomial = PolynomialCoefficients(last.drift, search.learn_B)
+            found += foreseeing.judged(polynomial, foreseeing.starts, INNOVATIONS_FORM)
+            refined = foreseeing.refined(polynomial, monitor)
         except (ValueError, np.linalg.LinAlgError):
             break
         found += foreseeing.judged(refined.model, refined.starts, OUTPUT_ERROR)
@@ -217,8 +215,9 @@ def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]
                 linear.model.drift, _UNITS, shared.seed + start, ridge=ridge,
                 learn_input_matrix=search.learn_B)
             refined_network = beside.refined(network, monitor, linear.starts)
-            found += beside.judged(refined_network.model, refined_network.starts, OUTPUT_ERROR)
-            if np.mean(found[-1].errors ** 2) <= explained:
+            offered = beside.judged(refined_network.model, refined_network.starts, OUTPUT_ERROR)
+            found += offered
+            if any(np.mean(one.errors ** 2) <= explained for one in offered):
                 break
     return found
 

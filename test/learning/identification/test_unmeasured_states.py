@@ -113,6 +113,12 @@ def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days():
     assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
 
 
+def test_a_record_whose_simulations_all_diverge_is_refused():
+    with pytest.raises(ValueError, match='no drift fits the episodes: record longer'):
+        identify_unmeasured(replace(PLANT, B=np.array([[1.0]])),
+                            [record(saddle, samples=200, gain=2.0, size=0.1)], 1, highest_degree=1)
+
+
 def simulated(drift, episode):
     """Simulate the level, from a start that is forgotten."""
     x = np.array([episode.x[0, 0], drift.box.states.center[1]])
