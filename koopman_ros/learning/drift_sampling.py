@@ -148,7 +148,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     :param judging: called with the class whose law is being tried and the share that is done.
     :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
         run, too.
-    :raises TrainingFailed: when there is no model of the class that was asked for, or of any.
+    :raises TrainingFailed: when no model of the requested class was learned, or none at all.
     :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
     :raises Stopped: when `judging` ended it.
     """

@@ -147,7 +147,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     :param alone: whether it is the only one to be learned.
     :param judge: of the models, in place of validation episodes and `loops`.
     :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
-    :raises TrainingFailed: when there is no model of the class that was asked for, or of any.
+    :raises TrainingFailed: when no model of the requested class was learned, or none at all.
     :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
         was asked for or all samples are to blame.
     """

@@ -45,7 +45,6 @@ from koopman_ros.panel.snapshot import (
 from koopman_ros.panel.training_report import Learning
 from koopman_ros.panel.trend_backfill import backfill, read_past
 from koopman_ros.panel.view_model import LoopViewModel
-from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.parameters.table import ConfigurationError
@@ -113,7 +112,7 @@ class PanelNode(LoopNode):
         self._nodes = {role: RemoteNode(
             self, getattr(settings, role),
             {service: kind for of, service, kind in _SERVICES.values() if of == role},
-            partial(self._on_parameters, role)) for role in (CONTROLLER, TRAINER)}
+            partial(self.view.take_parameters, role)) for role in (CONTROLLER, TRAINER)}
         self._wake = self.create_guard_condition(self._on_actions)
         wall_timer(self, _PERIOD, self._on_timer)
         wall_timer(self, _REMOTE_PERIOD, self._on_remote_timer)
@@ -262,9 +261,6 @@ class PanelNode(LoopNode):
     def _on_event(self, event: ParameterEvent) -> None:
         for node in self._nodes.values():
             node.on_event(event)
-
-    def _on_parameters(self, role: str, found: Mapping[str, ParameterDescription]) -> None:
-        self.view.take_parameters(role, found)
 
     def _read_model(self, status: Mapping[str, str]) -> None:
         """Show training range and origin of the active model if its file can be read here."""

@@ -97,7 +97,7 @@ def wait_for_replay(bench: BusyBench, stamps: Sequence[float]) -> None:
 
 
 def test_watchdog_commands_while_the_control_step_is_busy(ros: Harness, tmp_path: Path) -> None:
-    """In simulated time, which nobody reads meanwhile."""
+    """In simulated time, while the clock is not read."""
     bench = BusyBench(ros, tmp_path / 'pipe', simulated=True)
     held = bench.commands[0].temperature
     busy = bench.get_busy(2.03)
