@@ -140,6 +140,16 @@ class Refined(Generic[_Model]):
         matrix: Array = found.matrix.numpy() * self._problem.count
         return matrix
 
+    def left_out(self, samples: int) -> Array:
+        """
+        Return the errors (N, n_y) of samples in models that were not fitted to them.
+
+        Of stretches of so many samples each is left out in turn, linearised about the parameters:
+        e = (I - H)^-1 r with the hat matrix H of the stretch (Cook and Weisberg 1982). They are
+        weighed as the cost weighs them, one piece of the record after the other.
+        """
+        return self._problem.left_out(self._theta, samples)
+
 
 def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Array,
                      deviation: Array, *, settling: int = 0, smooth: bool = False,
@@ -241,6 +251,27 @@ class _Problem(Generic[_Model]):
             slope = weights * theta.numpy()
             equations.add_sums(0.5 * float(slope @ theta.numpy()), *(
                 map(torch.from_numpy, (slope, np.diag(weights))) if found else ()))
+
+    def left_out(self, theta: Array, samples: int) -> Array:
+        """Return the errors as :meth:`Refined.left_out` has them."""
+        model, K, starts = self.split(theta)
+        p, (M, n_x), n_y = len(self.model.theta), starts.shape, self._target.shape[2]
+        q = p + (n_x if self.smooth else K.size)
+        before, after = self._path(model.drift, K, starts)
+        errors = (before[..., :n_y] - self._target) / self.deviation
+        J = np.concatenate([S for _, S in self._sensitivities(model, K, before, after, q)])
+        J /= self.deviation[:, None]
+        matrix = normal_equations(self.add_residuals, torch.from_numpy(theta)).matrix.numpy()
+        # starts are always fitted: nothing but the first samples tells them
+        C = (np.linalg.pinv(matrix, hermitian=True) / self.count)[:p, :p]
+        found = []
+        for m in range(M):
+            rows = np.flatnonzero(self._counted[:, m, 0])
+            for part in np.array_split(rows, max(1, len(rows) // samples)):
+                S = J[part, m, :, :p].reshape(-1, p)
+                rest = np.eye(len(S)) - S @ C @ S.T
+                found.append(np.linalg.solve(rest, errors[part, m].ravel()).reshape(-1, n_y))
+        return np.concatenate(found)
 
     def _path(self, drift: Drift, K: Array, x: Array) -> tuple[Array, Array]:
         """Return the states (K + 1, M, n_x) before and after the corrections by a gain."""
