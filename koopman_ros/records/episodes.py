@@ -33,8 +33,8 @@ from koopman_ros.records.segments import Clock, NO_STAMP, Segment, Times
 from koopman_ros.records.series import check_places, outliers_and_steps, stamped_number
 
 # A gap is longer than this many usual periods.
-_GAP_PERIODS = 3.5
-_SHORTEST = 10
+GAP_PERIODS = 3.5
+SHORTEST = 10
 _CHECKED = 1000  # messages between two looks for a complete portion
 # The plant's time, where it is simulated, and how far receipts may differ from it.
 _CLOCK, _CLOCK_TYPE = '/clock', 'rosgraph_msgs/msg/Clock'
@@ -226,7 +226,7 @@ class _BagImport:
         stamps, x = samples.stamps, samples.x
         has_inputs = all(any(len(segment.of(place)) or place in segment.applied
                              for place in places_of(signal)) for signal in self.inputs)
-        if len(stamps) < _SHORTEST or not has_inputs:
+        if len(stamps) < SHORTEST or not has_inputs:
             dropped['too short, or without any input'] += x.size
             return
         spike = self._leaps(x)[0]
@@ -248,15 +248,15 @@ class _BagImport:
             dropped['before the first input'] += n_x * int(np.sum(~started))
             dropped['after the last input'] += n_x * int(np.sum(~within))
             rows = rows[started & within]
-            if len(rows) < _SHORTEST:
-                dropped[f'in a segment of fewer than {_SHORTEST}'] += n_x * len(rows)
+            if len(rows) < SHORTEST:
+                dropped[f'in a segment of fewer than {SHORTEST}'] += n_x * len(rows)
                 continue
             yield self._episode(stamps[rows], x[rows], applied)
 
     def _ends(self, stamps: Times, x: Array, period: float) -> NDArray[np.int64]:
         """Return where episodes end, at gaps and jumps, and note these."""
         jump = self._leaps(x)[1]
-        gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
+        gap = np.diff(stamps, prepend=stamps[0]) > GAP_PERIODS * period
         ends = np.flatnonzero(gap | jump.any(axis=1))
         for end in ends.tolist():
             at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
@@ -323,7 +323,7 @@ class _BagImport:
                  stamps: Times, period: float) -> Applied:
         """Return the applied input over the time of some measurements."""
         usual = float(np.median(np.diff(measured[0]))) if len(measured[0]) > 1 else 0.0
-        reach = _GAP_PERIODS * max(period, usual)
+        reach = GAP_PERIODS * max(period, usual)
         near = (measured[0] >= stamps[0] - reach) & (measured[0] <= stamps[-1] + reach)
         times, values = measured[0][near], measured[1][near]
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
