@@ -9,6 +9,7 @@ import os
 from setuptools import find_packages, setup
 
 PACKAGE = 'koopman_ros'
+TRAIN = ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm']
 
 
 def _data_files() -> list[tuple[str, list[str]]]:
@@ -52,7 +53,9 @@ setup(
         'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
         # the predictive law: solver of quadratic programs, and compiler
         'mpc': ['daqp', 'numba'],
-        'train': ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm'],
+        'train': TRAIN,
+        # learning from tables, without ROS
+        'learn': [*TRAIN, 'matplotlib', 'pandas', 'pyarrow'],
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
