@@ -144,6 +144,15 @@ class Episode:
     def __len__(self) -> int:
         return len(self.time)
 
+    def interpolated(self) -> Array:
+        """Return the states (N, n_x), lines where one was not measured; 0 where it never was."""
+        x = self.x.copy()
+        for column in x.T[np.isnan(x).any(axis=0)]:
+            known = ~np.isnan(column)
+            column[~known] = np.interp(self.time[~known], self.time[known], column[known]) if (
+                known.any()) else 0.0
+        return x
+
     def inputs_at(self, times: Array) -> Array:
         """Return the inputs (n, n_u) that act from `times` (n,) on."""
         u: Array = self.u[np.searchsorted(self.input_time, times, side='right') - 1]

@@ -54,7 +54,7 @@ class TrainingJob(Job):
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()
         self._cancelled = False
-        super().__init__('koopman_ros.learning.__main__', task=json.dumps(dict(task)))
+        super().__init__('koopman_ros.learning.training_process', task=json.dumps(dict(task)))
 
     def poll(self) -> JobState:
         """Read the output of the process since the last call, and return its state."""

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
-from koopman_ros.core.units import conversion, SECONDS_PER_TIME_UNIT, shown, unit_label
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 from koopman_ros.learning.identification import Drift, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
@@ -125,7 +125,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *,
     # the measured states first, where that is not their order already
     order = [*measured, *(i for i in range(len(states)) if i not in measured)]
     some = states.only([states.names[i] for i in measured])
-    episodes = tuple(_as_named(one, record.plant, some, inputs) for one in record.episodes)
+    record = record.of(*(dict(zip(own.names, own.units, strict=True)) for own in (some, inputs)))
+    episodes = record.episodes
     if init < 1:
         raise ValueError(f'init = {init} must be at least 1 sample')
     indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
@@ -164,25 +165,6 @@ def _drift(model: AnyModel, plant: PlantDescription) -> tuple[Rate, Coordinates,
     drift = model.drift if isinstance(model, Identified) else model
     factor = seconds / SECONDS_PER_TIME_UNIT[drift.box.time_unit]
     return lambda x, u: factor * drift.rate(x, u), drift.box.states, drift.box.inputs
-
-
-def _as_named(episode: Episode, plant: PlantDescription, states: Coordinates,
-              inputs: Coordinates) -> Episode:
-    """Return an episode with the signals of a model, in its order and units."""
-    if missing := [name for name in inputs.names if name not in plant.input_names]:
-        raise ValueError(f'the record has no input {missing[0]}, it has '
-                         f'{", ".join(plant.input_names)}: read it')
-
-    def taken(values: Array, names: Sequence[str], units: Sequence[str], of: Coordinates) -> Array:
-        return np.column_stack([
-            conversion(units[names.index(name)], unit)(values[:, names.index(name)])
-            for name, unit in zip(of.names, of.units, strict=True)])
-
-    linear = dict(zip(plant.input_names, episode.linear, strict=False))
-    return Episode(
-        episode.time, taken(episode.x, plant.state_names, plant.state_units, states),
-        episode.input_time, taken(episode.u, plant.input_names, plant.input_units, inputs),
-        tuple(linear[name] for name in inputs.names) if linear else ())
 
 
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,

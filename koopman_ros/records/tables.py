@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import base_name, place
-from koopman_ros.core.units import check_unit, conversion, NANOSECONDS
+from koopman_ros.core.units import check_unit, Conversion, conversion, NANOSECONDS
 from koopman_ros.records.episodes import GAP_PERIODS, loop_episodes, SHORTEST
 from koopman_ros.records.import_spec import (
     break_notes,
@@ -52,6 +52,34 @@ class Record:
     sources: tuple[str, ...]  #: names of the files
 
     __repr__ = short_repr
+
+    def of(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> Record:
+        """
+        Return the record with some signals alone, in their order and units.
+
+        :param states: units by name; inputs likewise.
+        :raises ValueError: for a signal that the record does not have, or a unit of another kind.
+        """
+        about, taken = self.plant, []
+        for kind, wanted, names, units in (
+                ('state', states, about.state_names, about.state_units),
+                ('input', inputs, about.input_names, about.input_units)):
+            if missing := [name for name in wanted if name not in names]:
+                raise ValueError(f'the record has no {kind} {missing[0]}, it has '
+                                 f'{", ".join(names)}: name one of them')
+            columns = [names.index(name) for name in wanted]
+            taken.append((columns, [_conversion(name, units[j], unit) for j, (name, unit) in zip(
+                columns, wanted.items(), strict=True)]))
+        (of_x, in_x), (of_u, in_u) = taken
+        return replace(self, plant=replace(
+            about, state_names=tuple(states), state_units=tuple(states.values()),
+            input_names=tuple(inputs), input_units=tuple(inputs.values()), B=None,
+            nominal_state=np.full(len(states), np.nan), nominal_input=np.full(len(inputs), np.nan),
+        ), episodes=tuple(replace(
+            one, x=np.column_stack([to(one.x[:, j]) for j, to in zip(of_x, in_x, strict=True)]),
+            u=np.column_stack([to(one.u[:, j]) for j, to in zip(of_u, in_u, strict=True)]),
+            linear=tuple(one.linear[j] for j in of_u) if one.linear else ())
+            for one in self.episodes))
 
     def __str__(self) -> str:
         """Show the signals, the episodes and the report."""
@@ -146,6 +174,14 @@ def _signals(names: Names) -> tuple[_Signal, ...]:
                              'level = LT101.PV [m]')
         found.append(_Signal(match[1] or match[2], match[2], match[3] or ''))
     return tuple(found)
+
+
+def _conversion(name: str, unit: str, wanted: str) -> Conversion:
+    try:
+        return conversion(unit, wanted)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}; read it as '{name} [unit]', in its own unit"
+                         ) from error
 
 
 def _is_bag(source: Source) -> bool:
@@ -337,7 +373,7 @@ class _Table:
         if missing and signal in self.states:
             self.report.note(f'{self.label}: {signal.name} was measured in '
                              f'{len(values) - missing} of {len(values)} rows')
-        return conversion(unit or signal.unit, signal.unit)(values)
+        return _conversion(signal.name, unit or signal.unit, signal.unit)(values)
 
     def _in_order(self, seconds: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the rows with a time, each time once, and the oldest first."""

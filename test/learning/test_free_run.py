@@ -89,8 +89,8 @@ def test_a_model_that_diverges_says_so(tmp_path):
 
 @pytest.mark.parametrize(('signals', 'options', 'words'), [
     (('force', 'position'), {}, 'none of the states position, speed, it has force'),
-    (('position', 'speed'), {}, 'no input force'),
-    (('position [s]', 'force'), {}, 'cannot be converted'),
+    (('position [m]', 'speed'), {}, 'no input force'),
+    (('position [s]', 'force'), {}, r"position: .* as 'position \[unit\]'"),
     (('position [m]', 'force [N]'), {'init': 0}, 'init = 0'),
 ])
 def test_refuses_a_record_of_other_signals(signals, options, words):

@@ -95,7 +95,3 @@ def _wait_for_end_of_input(stop: threading.Event) -> None:
 
 def _print(**values: object) -> None:
     print(json.dumps(values), flush=True)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
