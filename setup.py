@@ -93,6 +93,7 @@ setup(
             'player = koopman_ros.process_entry:player',
             'replay = koopman_ros.process_entry:replay',
             'panel = koopman_ros.process_entry:panel',
+            'learn = koopman_ros.process_entry:learn',
             'koopman_ros = koopman_ros.process_entry:command_line',
         ],
     },

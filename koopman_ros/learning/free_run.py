@@ -61,6 +61,11 @@ class FreeRun:
             *(f'{name}: error {rmse:.4g} {unit}, fit {fit:.1f} %' for name, unit, rmse, fit in zip(
                 self.names, self.units, self.rmse, self.fit, strict=True))])
 
+    def error_text(self) -> str:
+        """Return the errors in a line."""
+        return ', '.join(f'{rmse:.4g} {unit} in {name}' for name, unit, rmse in zip(
+            self.names, self.units, self.rmse, strict=True))
+
     @property
     def diverged(self) -> bool:
         """Whether an episode cannot be simulated to its end."""

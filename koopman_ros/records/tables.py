@@ -280,6 +280,8 @@ def _with_unit(table: Any, signal: _Signal, report: ImportReport) -> _Signal:
 def _seconds(table: Any, name: str, period: float) -> Array:
     """Return the times (R,) of the rows of a table in s, NaN where there is none."""
     import pandas as pd
+    if period < 0.0:
+        raise ValueError(f'period = {period} s must be above 0 s, or 0 for a column of times')
     if period:
         if name:
             raise ValueError(f'both time = {name!r} and period = {period} s are given: give one')

@@ -10,6 +10,7 @@ from scipy.signal import cont2discrete
 from koopman_ros.core.datasets import Episode
 from koopman_ros.learning import compare_classes, evaluate_model, learn_lift, simulate, Thresholds
 from koopman_ros.learning.identification import DriftModel, Identified
+from koopman_ros.learning.pipeline import _failed_test
 from koopman_ros.model import Box, Coordinates, linearised_model, Provenance
 from koopman_ros.records import read
 
@@ -85,6 +86,17 @@ def test_a_model_that_diverges_says_so(tmp_path):
     assert run.diverged
     assert run.rmse[0] == np.inf
     run.draw(tmp_path / 'run.png')
+
+
+@pytest.mark.parametrize(('slope', 'words'), [
+    (A, ''), (A * [[1.0, 1.0], [1.4, 1.0]], 'above that of the best linear model'),
+    (30.0 * np.eye(2), 'error of its free run, inf m in position')])
+def test_a_model_is_refused_whose_free_run_is_worse_than_that_of_the_linear_model(slope, words):
+    test = read(table(), 'position [m]', 'force [N]')
+    found = Identified(drift(), '', drift(A * [[1.0, 1.0], [1.1, 1.0]]), (), np.ones(2), (), (), 1)
+    reasons = _failed_test({'test': simulate(lifted(slope=slope), test, init=5)}, found, test)
+    assert len(reasons) == bool(words)
+    assert words in ''.join(reasons)
 
 
 @pytest.mark.parametrize(('signals', 'options', 'words'), [
