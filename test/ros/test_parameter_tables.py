@@ -341,9 +341,10 @@ def test_values_that_do_not_fit_together_are_refused(
 
 
 def test_equations_of_a_trainer_are_those_of_its_task() -> None:
-    table, signals = trainer_table(load(model_path(reactor.MODEL))), Signals({'T': 'K'}, {'u': '1'})
+    table = trainer_table(load(model_path(reactor.MODEL)))
     fields = table.snapshot({'physical_model': 'two_state', 'estimated_constants': [
-        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training(signals)
+        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training(
+            Signals({'T': 'K'}, {'u': '1'}))
     assert fields['physical_model'] == 'two_state'
     assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
                                    'reaction_enthalpy': None}
