@@ -35,12 +35,12 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 	@touch $@
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
-	$(INSTALL) --editable '.[ros,demo,train,test,bench]'
+	$(INSTALL) --editable '.[ros,learn,test,bench]'
 	$(COMPILE)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
-	$(INSTALL) --editable '.[demo,train]'
+	$(INSTALL) --editable '.[learn]'
 	@touch $@
 
 $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp

@@ -98,12 +98,13 @@ class Episode:
     A command is held until the next one; an input that was measured behind a slow actuator is
     linear from sample to sample.
 
-    :raises ValueError: on unequal lengths, times that do not rise, values that are not finite,
-        or an input that is not known at the first measurement.
+    :raises ValueError: on unequal lengths, times that do not rise, values that are infinite,
+        times at which no state was measured, or an input that is not known at the first one.
     """
 
     time: Array  #: (N,) times of the measurements, rising, in time units
-    x: Array  #: (N, n_x) measured states, in state units, with their noise
+    #: (N, n_x) measured states, in state units, with their noise; NaN where one was not measured
+    x: Array
     #: (M,) times from which each input was held, or at which it was measured, rising, the first
     #: not later than the first measurement
     input_time: Array
@@ -126,7 +127,8 @@ class Episode:
             if t.ndim != 1 or v.ndim != 2 or len(t) != len(v) or len(t) == 0:
                 raise ValueError(f'incompatible {times} and {values}: expected (n,) and (n, m) '
                                  f'with n > 0, got {t.shape} and {v.shape}')
-            if not (np.all(np.isfinite(t)) and np.all(np.isfinite(v))):
+            missing = np.all(np.isnan(v), axis=1) if values == 'x' else np.isnan(v)
+            if not np.all(np.isfinite(t)) or np.any(missing) or np.any(np.isinf(v)):
                 raise ValueError(f'{times} or {values} hold values that are not finite: drop them')
             if not np.all(np.diff(t) > 0.0):
                 raise ValueError(f'{times} must rise: sort the samples and drop repeated ones')
@@ -141,6 +143,15 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def interpolated(self) -> Array:
+        """Return the states (N, n_x), lines where one was not measured; 0 where it never was."""
+        x = self.x.copy()
+        for column in x.T[np.isnan(x).any(axis=0)]:
+            known = ~np.isnan(column)
+            column[~known] = np.interp(self.time[~known], self.time[known], column[known]) if (
+                known.any()) else 0.0
+        return x
 
     def inputs_at(self, times: Array) -> Array:
         """Return the inputs (n, n_u) that act from `times` (n,) on."""

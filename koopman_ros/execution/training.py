@@ -5,16 +5,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 import json
 import queue
 import signal
+import sys
+import time
 from typing import Any
 
 from koopman_ros.execution.job import Job
 
 _CANCELLED = 'cancelled, nothing was written'
+_LINE_PERIOD = 5.0  # s between plain lines of progress
+_BAR_WIDTH = 30
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,30 @@ class JobState:
         return bool(self.summary and not self.summary['accepted'])
 
 
+class TrainingProgress:
+    """
+    How far a training is: a bar on a terminal, else a line every five seconds.
+
+    :param say: prints such a line.
+    """
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._last_line = time.monotonic()
+
+    def show(self, state: JobState) -> None:
+        """Show a state of the training."""
+        if sys.stderr.isatty():
+            full = round(_BAR_WIDTH * state.share)
+            bar = '#' * full + '-' * (_BAR_WIDTH - full)
+            text, end = ('', '\n') if state.ended else (state.text, '')
+            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
+                  file=sys.stderr, flush=True)
+        elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
+            self._last_line = time.monotonic()
+            self._say(f'{100.0 * state.share:.0f} %: {state.text}')
+
+
 class TrainingJob(Job):
     """
     A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`.
@@ -54,7 +82,7 @@ class TrainingJob(Job):
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()
         self._cancelled = False
-        super().__init__('koopman_ros.learning.__main__', task=json.dumps(dict(task)))
+        super().__init__('koopman_ros.learning.training_process', task=json.dumps(dict(task)))
 
     def poll(self) -> JobState:
         """Read the output of the process since the last call, and return its state."""
@@ -92,7 +120,7 @@ class TrainingJob(Job):
     def _conclusion(self, said: Mapping[str, Any]) -> JobState:
         """Return the state by the last line of a training."""
         if 'summary' in said:
-            return JobState(1.0, _in_words(said['summary']), True, said['summary'])
+            return JobState(1.0, outcome_text(said['summary']), True, said['summary'])
         if 'stopped' in said:
             return JobState(self.state.share, _CANCELLED, True)
         return JobState(self.state.share, f'training failed: {said["error"]}', True)
@@ -117,7 +145,8 @@ class TrainingJob(Job):
         return replace(self.state, text=text, ended=True)
 
 
-def _in_words(summary: Mapping[str, Any]) -> str:
+def outcome_text(summary: Mapping[str, Any]) -> str:
+    """Return the result of a training in a sentence."""
     if not summary['accepted']:
         reasons = '; '.join(summary['reasons'])
         kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''

@@ -102,8 +102,9 @@ def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: in
     """
     Learn a lift of an estimated drift; the arguments are those of :func:`learning.train`.
 
-    :param plant: names, units and the nominal point. Where it is not known, or the episodes do not
-        surround it, a steady state in the middle of their range is taken.
+    :param plant: names, units and the nominal point, as given to the identification: unmeasured
+        states are added. Where the nominal point is not known, or the episodes do not surround
+        it, a steady state in the middle of their range is taken.
     :raises TrainingFailed: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
@@ -116,14 +117,17 @@ def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescrip
                                                                     DriftSamples]:
     """Return the plant with its estimated nominal point and B, and samples of the drift."""
     samples = drift_samples(found.drift, found.fitted)
+    states = found.drift.box.states
     lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
-    within = (plant.nominal_state > lower) & (plant.nominal_state < upper)
-    x, u = steady_point(found.drift,
-                        np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
+    # a plant of the measured states has nothing to say of the others
+    nominal = np.append(plant.nominal_state, np.full(len(states) - len(plant.state_names), np.nan))
+    within = (nominal > lower) & (nominal < upper)
+    x, u = steady_point(found.drift, np.where(within, nominal, 0.5 * (lower + upper)),
                         np.where(np.isfinite(plant.nominal_input), plant.nominal_input,
                                  found.drift.box.inputs.center))
     drift = found.drift
-    return replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
+    return replace(plant, state_names=states.names, state_units=states.units,
+                   nominal_state=x, nominal_input=u, input_matrix_degree=0,
                    B=drift.input_matrix_at if drift.varying_input_matrix else (
                        drift.input_matrix)), samples
 

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Retraining from bags to the model file."""
+"""Retraining from bags, or from a record that was read, to the model file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import os
 from pathlib import Path
@@ -28,6 +28,7 @@ from koopman_ros.learning.acceptance import (
 )
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import compare_classes
+from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
@@ -42,12 +43,18 @@ from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
-from koopman_ros.learning.record import read_record, RecordSource, Reduction
+from koopman_ros.learning.record import (
+    read_record,
+    RecordSource,
+    reduced,
+    Reduction,
+    TrainingRecord,
+)
 from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plants import plant_class
-from koopman_ros.records import ImportReport
+from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
 
 # A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
@@ -78,6 +85,8 @@ class Retrained:
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
     reduction: Reduction | None = None  #: the part of a long record that is used
+    #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
+    free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -156,11 +165,16 @@ class Retrained:
                 'closed_loop_cost_beside_linear': check.median_ratio,
                 'worst_closed_loop_cost_beside_linear': check.worst_ratio,
             }
+        figures['free_runs'] = {name: {
+            'error': dict(zip(run.names, map(float, run.rmse), strict=True)),
+            'fit_percent': dict(zip(run.names, map(float, run.fit), strict=True))}
+            for name, run in self.free_runs.items()}
         finite_figures: dict[str, object] = finite(figures)
         return finite_figures
 
 
-def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
+def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False, *,
+            record: Record | None = None, test: Record | None = None) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -169,6 +183,9 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     training makes of a sibling's would be refused, training starts again without the sibling.
     The result does not depend on the executor of the task.
 
+    :param record: to learn from, in place of the bags of the task.
+    :param test: a record that takes no part in the training. The new model is refused if its free
+        run errs more there than that of the best linear model.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
@@ -178,10 +195,11 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     """
     checked_device(task.device)
     with backend_of(task.executor) as backend:
-        return _retrain(backend, task, on_progress)
+        return _retrain(backend, task, on_progress, record, test)
 
 
-def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> Retrained:
+def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
+             given: Record | None, test: Record | None) -> Retrained:
     progress, thresholds = _Progress(on_progress), _checked(task)
     current, sibling = (load(path) if path else None
                         for path in (task.model, task.warm_start_model))
@@ -189,13 +207,10 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
-    source = RecordSource(
-        task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
-        least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    progress('read', 0.0, 'reading bags')
-    record = read_record(source, task.most_samples, task.seed,
-                         hidden=bool(task.unmeasured_states or task.physical_model),
-                         tick=progress.reading(2 * source.size()), backend=backend)
+    units = [{one.name: one.unit for one in some} for some in (states, inputs)]
+    test = None if test is None else test.of(*units)
+    record = (_read(backend, task, states, inputs, current, progress) if given is None else
+              reduced(given.of(*units), task.most_samples, task.seed, hidden=_hidden(task)))
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(record.account.lines()))
@@ -204,6 +219,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
     found = _estimate(task, plant, episodes, methods, progress, backend)
+    recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
+                      tuple(record.episodes), record.account, task.bags)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
     box = found.drift.box
@@ -221,7 +238,10 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
-    decision = replace(decision, warnings=(
+    runs = {name: simulate(learned, one) for name, one in (
+        ('record', recorded), ('test', test)) if one is not None}
+    decision = replace(decision, reasons=(
+        *decision.reasons, *_failed_test(runs, found, test)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'it is not compared with the present model {task.model}, which has other states'
@@ -232,7 +252,36 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
-                   reasons=decision.reasons, model_file=str(path))
+                   reasons=decision.reasons, model_file=str(path), free_runs=runs)
+
+
+def _hidden(task: TrainingTask) -> bool:
+    return bool(task.unmeasured_states or task.physical_model)
+
+
+def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
+          inputs: Sequence[RecordedInput], current: LiftedModel | None, progress: _Progress
+          ) -> TrainingRecord:
+    """Read the bags of a task."""
+    source = RecordSource(
+        task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
+        least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
+    progress('read', 0.0, 'reading bags')
+    return read_record(source, task.most_samples, task.seed, hidden=_hidden(task),
+                       tick=progress.reading(2 * source.size()), backend=backend)
+
+
+def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | None
+                 ) -> tuple[str, ...]:
+    """Say that the free run over the test record errs more than the best linear model's."""
+    if test is None:
+        return ()
+    own, linear = runs['test'], simulate(found.linear, test)
+    scale = found.drift.box.states.only(own.names).scale
+    if not np.sum((own.rmse / scale) ** 2) > np.sum((linear.rmse / scale) ** 2):
+        return ()
+    return (f'on {", ".join(test.sources) or "the test record"} the error of its free run, '
+            f'{own.error_text()}, is above that of the best linear model, {linear.error_text()}',)
 
 
 def _checked(task: TrainingTask) -> Thresholds:

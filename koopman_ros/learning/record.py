@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading of bags for a retraining, of a long record in memory that does not grow with it."""
+"""Reading of a record for a retraining; of long bags in memory that does not grow with them."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selecti
 from koopman_ros.records import (
     ImportReport,
     loop_episodes,
+    Record,
     RecordedInput,
     RecordedState,
     stream_episodes,
@@ -127,13 +128,36 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
         account.add(own)
     if not survey.count:
         return TrainingRecord([], account)
-    start = Selection(survey.lower, survey.upper, survey.group(most), most,
-                      SEGMENT * (_LONGER if hidden else 1))
-    found = reduce(Selection.merged, each(_selected, (source, start, seed)))
+    found = reduce(Selection.merged, each(_selected, (
+        source, _selection(survey, most, hidden), seed)))
+    return _chosen(survey, found, account)
+
+
+def reduced(record: Record, most: int, seed: int, *, hidden: bool = False) -> TrainingRecord:
+    """Return the episodes of a record in memory, selected as by :func:`read_record`."""
+    episodes, about = list(record.episodes), record.plant
+    if sum(map(len, episodes)) <= most:
+        return TrainingRecord(episodes, record.report)
+    survey = RecordStatistics.empty(len(about.state_names), len(about.input_names))
+    for episode in episodes:
+        survey.add(episode)
+    selection = _selection(survey, most, hidden)
+    rng = np.random.default_rng([seed, 0])
+    for episode in episodes:
+        selection.offer(0, episode, rng)
+    return _chosen(survey, selection, record.report)
+
+
+def _selection(survey: RecordStatistics, most: int, hidden: bool) -> Selection:
+    return Selection(survey.lower, survey.upper, survey.group(most), most,
+                     SEGMENT * (_LONGER if hidden else 1))
+
+
+def _chosen(survey: RecordStatistics, found: Selection, account: ImportReport) -> TrainingRecord:
     episodes = found.episodes()
     return TrainingRecord(episodes, account, Reduction(
-        survey.count, start.group, found.offered, len(episodes),
-        start.group * sum(map(len, episodes))))
+        survey.count, found.group, found.offered, len(episodes),
+        found.group * sum(map(len, episodes))))
 
 
 def _streamed(source: RecordSource, bag: str, account: ImportReport, tell: Tell

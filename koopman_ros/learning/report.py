@@ -22,16 +22,25 @@ from koopman_ros.model_classes import BEST
 
 
 def write_report(retrained: Retrained) -> list[Path]:
-    """Write ``<output>.json``, ``.md`` and, with matplotlib, ``.png``; return the files."""
+    """
+    Write ``<output>.json``, ``.md`` and, with matplotlib, pictures; return the files.
+
+    The pictures are ``.png``, and ``.free_run.png`` and ``.test.png`` of free runs.
+    """
     base = Path(retrained.task.output)
-    picture = base.with_suffix('.png')
-    drawn = _draw(picture, retrained)
+    pictures = {'Data, drift and prediction': base.with_suffix('.png')}
+    drawn = _draw(pictures['Data, drift and prediction'], retrained)
+    for name, run in retrained.free_runs.items() if drawn else ():
+        path = base.with_suffix('.free_run.png' if name == 'record' else f'.{name}.png')
+        run.draw(path)
+        pictures[f'Free run on the {name}'.replace('test', 'test record')] = path
     written = [write_figures(base.with_suffix('.json'), retrained.summary()),
                write_page(base.with_suffix('.md'), 'Retraining',
                           [*_sections(retrained),
-                           f'![Data, drift and prediction]({picture.name})' if drawn else ''],
+                           *(f'![{title}]({path.name})' for title, path in pictures.items()
+                             if drawn)],
                           ('numpy', 'scipy', 'torch'))]
-    return [*written, *([picture] if drawn else [])]
+    return [*written, *(pictures.values() if drawn else [])]
 
 
 def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -112,6 +121,13 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                     ('the best linear model', decision.linear_rmse)) if rmse is not None),
                 range(1, 1 + len(states)))
     yield 'The noise of the measurements is part of each.'
+    yield '## Free run'
+    yield ('Simulations by the inputs alone, from starts fitted to the first samples of each '
+           'episode. The fit is the explained share of the motion.')
+    yield table(('record', 'state', 'error', 'fit [%]'), (
+        (name, state, f'{rmse:.5g} {unit}', f'{fit:.1f}')
+        for name, run in retrained.free_runs.items() for state, unit, rmse, fit in zip(
+            run.names, run.units, run.rmse, run.fit, strict=True)), (2, 3))
     eigenvalues = ', '.join(f'{value:.3g}' for value in learned.model.eigenvalues)
     own = learned.model.states
     yield 'Set-points can be given within ' + ', '.join(

@@ -240,9 +240,13 @@ class TrainerParameters:
         return {name: (low, high) for name, low, high in zip(
             names, lows.tolist(), highs.tolist(), strict=True) if low < high}
 
-    def training(self) -> dict[str, Any]:
+    def training(self, signals: Signals) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""
-        return {'model_class': self.model_class, 'coordinates': self.lifted_dimension,
+        gains = np.reshape(self.input_matrix, (-1, len(signals.inputs))).tolist() if (
+            self.input_matrix != (0.0,)) else []
+        return {'input_gain': {state: dict(zip(signals.inputs, row, strict=True))
+                               for state, row in zip(signals.states, gains, strict=False)},
+                'model_class': self.model_class, 'coordinates': self.lifted_dimension,
                 'seed': self.training_seed, 'starts': self.restarts,
                 'most_samples': self.training_samples,
                 'input_matrix_degree': self.input_matrix_degree,

@@ -11,14 +11,14 @@ from typing import Any
 
 import rclpy
 
-from koopman_ros.execution.training import JobState, TrainingJob
+from koopman_ros.execution.training import JobState, TrainingJob, TrainingProgress
 from koopman_ros.parameters.signal_topics import SIGNALS, SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.ros.managed import one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import init
-from koopman_ros.ros.training import POLL_PERIOD, present_lift, task_fields, TrainingProgress
+from koopman_ros.ros.training import POLL_PERIOD, present_lift, task_fields
 
 
 def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:

@@ -88,6 +88,8 @@ def test_cut_leaves_no_interval_out():
     ({'x': [['1 V'], ['2 V'], ['3 V']]}, 'x must be numbers'),
     ({'time': [], 'x': np.zeros((0, 1))}, 'with n > 0'),
     ({'x': [[1.0], [np.nan], [2.0]]}, 'not finite: drop them'),
+    ({'x': [[1.0, np.nan], [np.nan, np.inf], [2.0, 3.0]]}, 'not finite: drop them'),
+    ({'u': [[1.0], [np.nan]]}, 'not finite: drop them'),
     ({'input_time': [0.0, np.inf]}, 'not finite: drop them'),
     ({'time': [0.0, 1.0, 1.0]}, 'time must rise: sort the samples'),
     ({'input_time': [0.0, 0.0]}, 'input_time must rise'),

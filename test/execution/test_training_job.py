@@ -127,8 +127,8 @@ def test_figures_of_signals_are_told_one_by_one() -> None:
     summary = {'accepted': True, 'model_class': 'free lift', 'model_file': 'new',
                'units': {'low': 'm', 'high': 'Pa'}, 'heldout_error': {'low': 0.25, 'high': 3.0},
                'heldout_error_of_present_lift': {'low': 1.0, 'high': 3.0}}
-    words = training._in_words(summary)
+    words = training.outcome_text(summary)
     assert 'accepted: error on held-out records 0.25 m in low, 3 Pa in high, that' in words
     assert '1 m in low, 3 Pa in high' in words
     summary['heldout_error_of_present_lift']['low'] = None
-    assert 'infinite, as it diverges' in training._in_words(summary)
+    assert 'infinite, as it diverges' in training.outcome_text(summary)

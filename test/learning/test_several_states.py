@@ -120,7 +120,7 @@ def test_summary_and_report_name_the_signals(retrained):
     assert 0.25 < figures['coverage']['pump_1, pump_2'] < 0.5
     metrics = load(retrained.model_file).provenance.metrics
     assert metrics['noise_level_2'] == figures['noise']['level_2']
-    page, picture = write_report(retrained)[1:]
+    page, picture, _ = write_report(retrained)[1:]
     assert '| prediction by | error of level_1 [m] | error of level_2 [m] |' in page.read_text()
     assert picture.read_bytes().startswith(b'\x89PNG')
 

@@ -19,7 +19,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.signal_topics import plant_defaults
+from koopman_ros.parameters.signal_topics import plant_defaults, Signals
 from koopman_ros.parameters.table import (
     ConfigurationError,
     group,
@@ -343,7 +343,8 @@ def test_values_that_do_not_fit_together_are_refused(
 def test_equations_of_a_trainer_are_those_of_its_task() -> None:
     table = trainer_table(load(model_path(reactor.MODEL)))
     fields = table.snapshot({'physical_model': 'two_state', 'estimated_constants': [
-        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training()
+        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training(
+            Signals({'T': 'K'}, {'u': '1'}))
     assert fields['physical_model'] == 'two_state'
     assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
                                    'reaction_enthalpy': None}

@@ -1,0 +1,444 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Records from tables (CSV, Parquet, MAT, DataFrame) and bags, as episodes with units."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+import os
+from pathlib import Path
+import re
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.message_fields import base_name, place
+from koopman_ros.core.units import check_unit, Conversion, conversion, NANOSECONDS
+from koopman_ros.records.episodes import GAP_PERIODS, loop_episodes, SHORTEST
+from koopman_ros.records.import_spec import (
+    break_notes,
+    ImportReport,
+    RecordedInput,
+    RecordedState,
+)
+from koopman_ros.records.series import outliers_and_steps
+
+#: A file or folder, a DataFrame, or columns by name.
+Source: TypeAlias = Any
+#: Names of signals: ``'level'``, ``'level [m]'``, ``'level = LT101.PV [m]'``.
+Names: TypeAlias = str | Sequence[str]
+
+_SIGNAL = re.compile(r'\s*(?:(\w+)\s*=\s*)?(.+?)\s*(?:\[([^\[\]]+)\])?\s*')
+_BAGS = ('.mcap', '.db3')
+_TIME_NAMES = ('time', 't', 'timestamp', 'datetime', 'date')
+# Numbers without a unit are seconds unless they cannot be: no record is 30 years long, and no
+# clock shows the year 5138. ROS and pandas count nanoseconds since 1970.
+_LONGEST, _LATEST, _EPOCH_NS = 1e9, 1e11, 1e17
+
+
+@dataclass(frozen=True)
+class Record:
+    """Measurements of a plant, with the names and units of its signals."""
+
+    plant: PlantDescription  #: its nominal point is NaN and its B None, as they are not known yet
+    episodes: tuple[Episode, ...]  #: times in s since the first measurement of each
+    report: ImportReport  #: counts of measurements used and dropped, and notes
+    sources: tuple[str, ...]  #: names of the files
+
+    __repr__ = short_repr
+
+    def of(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> Record:
+        """
+        Return the record with some signals alone, in their order and units.
+
+        :param states: units by name; inputs likewise.
+        :raises ValueError: for a signal that the record does not have, or a unit of another kind.
+        """
+        about, taken = self.plant, []
+        for kind, wanted, names, units in (
+                ('state', states, about.state_names, about.state_units),
+                ('input', inputs, about.input_names, about.input_units)):
+            if missing := [name for name in wanted if name not in names]:
+                raise ValueError(f'the record has no {kind} {missing[0]}, it has '
+                                 f'{", ".join(names)}: name one of them')
+            columns = [names.index(name) for name in wanted]
+            taken.append((columns, [_conversion(name, units[j], unit) for j, (name, unit) in zip(
+                columns, wanted.items(), strict=True)]))
+        (of_x, in_x), (of_u, in_u) = taken
+        return replace(self, plant=replace(
+            about, state_names=tuple(states), state_units=tuple(states.values()),
+            input_names=tuple(inputs), input_units=tuple(inputs.values()), B=None,
+            nominal_state=np.full(len(states), np.nan), nominal_input=np.full(len(inputs), np.nan),
+        ), episodes=tuple(replace(
+            one, x=np.column_stack([to(one.x[:, j]) for j, to in zip(of_x, in_x, strict=True)]),
+            u=np.column_stack([to(one.u[:, j]) for j, to in zip(of_u, in_u, strict=True)]),
+            linear=tuple(one.linear[j] for j in of_u) if one.linear else ())
+            for one in self.episodes))
+
+    def __str__(self) -> str:
+        """Show the signals, the episodes and the report."""
+        about = self.plant
+        signals = ', '.join(f'{name} [{unit}]' for name, unit in zip(
+            (*about.state_names, *about.input_names), (*about.state_units, *about.input_units),
+            strict=True))
+        lengths = [f'{len(one)} measurements in {one.time[-1]:.6g} s' for one in self.episodes]
+        return '\n  '.join([signals, *lengths, *self.report.lines()])
+
+
+@dataclass(frozen=True)
+class _Signal:
+    """A signal to be read: its name, its unit, or an empty text for that of the column."""
+
+    name: str
+    column: str
+    unit: str
+
+
+def read(source: Source, states: Names, inputs: Names, *, time: str = '', period: float = 0.0,
+         linear: Names = (), tolerance: float = 0.0, name: str = '') -> Record:
+    """
+    Read a record of a plant from tables or bags.
+
+    A signal is the column of its name, with the unit in the header or in the argument::
+
+        record = read('day_1.csv', states='level', inputs='pump')          # level [m], pump [V]
+        record = read(frame, ['temperature [K]'], ['heater = HC12.OUT [percent]'])
+
+    Where both have a unit, values are converted to that of the argument. A signal without a unit
+    has the unit 1. A cell without a number is a missing measurement of that signal alone: NaN in
+    the episodes, so that a signal from the laboratory counts at its own times. An input without a
+    number keeps its last value. A new episode begins at a gap of 3.5 usual periods, where time is
+    set back, and where a state jumps as after a reset; spikes of a single sample are dropped.
+
+    :param source: a .csv, .parquet or .mat file, a bag, a DataFrame, columns by name, or a list
+        of them. Columns of a two-dimensional array y of a .mat file are y_1, y_2 and so on.
+    :param states: measured signals, ``name``, ``name [unit]`` or ``name = column [unit]``.
+    :param inputs: inputs that acted from the time of their row on. In a bag, an input is its
+        commands and its measurements, on the usual topics of its name.
+    :param time: column of the time, by default ``time`` or an index of dates. Dates and durations
+        are recognised; numbers are seconds, or of the unit in brackets: ns, us, ms, s, min, h, d.
+    :param period: time between rows in s, in place of a column.
+    :param linear: inputs that are linear from row to row, such as measurements of a slow actuator.
+    :param tolerance: largest difference in s between the stamps of one sample in a bag.
+    :param name: of the plant; by default that of the first file.
+    :raises BagReadError: for a bag that cannot be read.
+    :raises ValueError: for a table without such a column, with times that cannot be in seconds, or
+        of another kind.
+    """
+    sources = source if isinstance(source, list | tuple) else [source]
+    of_states, of_inputs = _signals(states), _signals(inputs)
+    report, episodes = ImportReport(), []
+    for number, one in enumerate(sources):
+        label = os.fspath(one) if isinstance(one, str | os.PathLike) else f'table {number + 1}'
+        if _is_bag(one):
+            found, own = loop_episodes(
+                [one], [_recorded_state(signal) for signal in of_states],
+                [_recorded_input(signal) for signal in of_inputs],
+                tolerance_ns=round(tolerance * NANOSECONDS))
+            report.add(own)
+            episodes += found
+            continue
+        table = _table(one)
+        of_states, of_inputs = (tuple(_with_unit(table, signal, report) for signal in some)
+                                for some in (of_states, of_inputs))
+        episodes += _Table(label, of_states, of_inputs, _names(linear), report).episodes(
+            table, _seconds(table, time, period))
+    files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
+    if not episodes:
+        raise ValueError('the record holds no usable segment of measurements: '
+                         + '; '.join(report.lines()))
+    plant = PlantDescription(
+        name or Path(files[0] if files else 'plant').stem,
+        tuple(one.name for one in of_states), tuple(one.unit for one in of_states),
+        tuple(one.name for one in of_inputs), tuple(one.unit for one in of_inputs),
+        's', np.full(len(of_states), np.nan), np.full(len(of_inputs), np.nan), None)
+    return Record(plant, tuple(episodes), report, files)
+
+
+def _names(names: Names) -> list[str]:
+    return [names] if isinstance(names, str) else list(names)
+
+
+def _signals(names: Names) -> tuple[_Signal, ...]:
+    found = []
+    for text in _names(names):
+        match = _SIGNAL.fullmatch(text)
+        if match is None:
+            raise ValueError(f'{text!r} names no signal: write level, level [m], or '
+                             'level = LT101.PV [m]')
+        found.append(_Signal(match[1] or match[2], match[2], match[3] or ''))
+    return tuple(found)
+
+
+def _conversion(name: str, unit: str, wanted: str) -> Conversion:
+    try:
+        return conversion(unit, wanted)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}; read it as '{name} [unit]', in its own unit"
+                         ) from error
+
+
+def _is_bag(source: Source) -> bool:
+    return isinstance(source, str | os.PathLike) and (
+        Path(source).is_dir() or Path(source).suffix in _BAGS)
+
+
+def _recorded_state(signal: _Signal) -> RecordedState:
+    unit = _unit_in_bag(signal)
+    return RecordedState(signal.name, unit, place(f'/{signal.column}', signal.name, unit))
+
+
+def _recorded_input(signal: _Signal) -> RecordedInput:
+    unit = _unit_in_bag(signal)
+    command = f'/{base_name(signal.column, unit)}_setpoint'
+    return RecordedInput(signal.name, unit, place(command, signal.name, unit),
+                         place(f'/{signal.column}', signal.name, unit))
+
+
+def _unit_in_bag(signal: _Signal) -> str:
+    if not signal.unit:
+        raise ValueError(f"{signal.name} has no unit, and bags have none: write '{signal.name} "
+                         "[m]', or 1 in the brackets for none")
+    check_unit(signal.unit)
+    return signal.unit
+
+
+def _table(source: Source) -> Any:
+    """Return a source as a DataFrame."""
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise ValueError('tables are read by pandas, which is not installed: pip install '
+                         'pandas') from error
+    if isinstance(source, pd.DataFrame):
+        return source
+    if isinstance(source, Mapping):
+        return _columns(source)
+    kind = Path(source).suffix.lower()
+    if kind == '.csv':
+        with Path(source).open(encoding='utf-8-sig') as file:
+            head, row = file.readline(), file.readline()
+        separator = max(',;\t', key=head.count)
+        return pd.read_csv(source, sep=separator, skipinitialspace=True, encoding='utf-8-sig',
+                           decimal=',' if separator == ';' and ',' in row else '.')
+    if kind == '.parquet':
+        try:
+            return pd.read_parquet(source)
+        except ImportError as error:
+            raise ValueError('Parquet is read by pyarrow, which is not installed: pip install '
+                             'pyarrow') from error
+    if kind == '.mat':
+        from scipy.io import loadmat
+        try:
+            return _columns(loadmat(source, squeeze_me=True))
+        except NotImplementedError as error:
+            raise ValueError(f'{source} is a MAT file of version 7.3, which SciPy does not read: '
+                             "save it with '-v7'") from error
+    raise ValueError(f'{source} is no record: give a .csv, .parquet, .mat or .mcap file, or the '
+                     'folder of a bag')
+
+
+def _columns(arrays: Mapping[str, Any]) -> Any:
+    """Return arrays of one or two dimensions as columns; shorter ones end with NaN."""
+    import pandas as pd
+    columns: dict[str, Any] = {}
+    for name, array in arrays.items():
+        values = np.asarray(array)
+        if name.startswith('__') or values.ndim not in (1, 2):
+            continue
+        columns |= {name: values} if values.ndim == 1 else {
+            f'{name}_{j + 1}': values[:, j] for j in range(values.shape[1])}
+    return pd.DataFrame({name: pd.Series(values) for name, values in columns.items()})
+
+
+def _header(table: Any, column: str) -> tuple[Any, str] | None:
+    """Return the header of a column as it stands, with its unit, or None for no such column."""
+    for header in table.columns:
+        match = _SIGNAL.fullmatch(str(header))
+        if column in (str(header), match and match[2]):
+            return header, (match and match[3]) or ''
+    return None
+
+
+def _with_unit(table: Any, signal: _Signal, report: ImportReport) -> _Signal:
+    """Return a signal with its unit, that of its column where the request has none."""
+    found = _header(table, signal.column)
+    if found is None:
+        raise ValueError(f'the record has no column {signal.column!r}, it has '
+                         f'{", ".join(map(repr, map(str, table.columns)))}: name one of them')
+    if not (signal.unit or found[1]):
+        report.note(f"{signal.name} has no unit, 1 is taken: write '{signal.name} [m]' for m")
+    return replace(signal, unit=signal.unit or found[1] or '1')
+
+
+def _seconds(table: Any, name: str, period: float) -> Array:
+    """Return the times (R,) of the rows of a table in s, NaN where there is none."""
+    import pandas as pd
+    if period < 0.0:
+        raise ValueError(f'period = {period} s must be above 0 s, or 0 for a column of times')
+    if period:
+        if name:
+            raise ValueError(f'both time = {name!r} and period = {period} s are given: give one')
+        return period * np.arange(len(table), dtype=np.float64)
+    unit = ''
+    if name or not isinstance(table.index, pd.DatetimeIndex | pd.TimedeltaIndex):
+        (wanted,) = _signals(name) if name else (_Signal('', '', ''),)
+        names = [wanted.column] if name else [
+            one for one in map(str, table.columns) if re.split(r'[\s\[]', one.strip().lower())[0]
+            in _TIME_NAMES]
+        found = _header(table, names[0]) if names else None
+        if found is None and not (name and name == table.index.name):
+            raise ValueError(f'the record has no column {name or "time"!r}, it has '
+                             f'{", ".join(map(repr, map(str, table.columns)))}: name that of the '
+                             'times, or give the period of the rows in s')
+        column = table.index.to_series() if found is None else table[found[0]]
+        unit = wanted.unit or (found[1] if found else '')
+    else:
+        column = table.index.to_series()
+    if not len(column.dropna()):
+        raise ValueError(f'the column {column.name!r} holds no times: name another one')
+    if pd.api.types.is_numeric_dtype(column):
+        return _numbers_in_seconds(column.to_numpy(), unit, str(column.name))
+    if not pd.api.types.is_timedelta64_dtype(column):
+        # whole seconds may be written without a fraction, others with one
+        iso = pd.to_datetime(column, format='ISO8601', errors='coerce')
+        try:
+            column = pd.to_datetime(column) if iso.isna().any() else iso
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'the column {column.name!r} holds neither numbers nor dates: name '
+                             'that of the times') from error
+        column = column - column.dropna().iloc[0]
+    return column.dt.total_seconds().to_numpy(dtype=np.float64)
+
+
+def _numbers_in_seconds(numbers: Any, unit: str, name: str) -> Array:
+    # whole nanoseconds since 1970 have more digits than a double
+    first = numbers[np.isfinite(numbers)][0]
+    since = np.asarray(numbers - first, dtype=np.float64)
+    if unit:
+        return conversion(unit, 's')(since)
+    if abs(float(first)) >= _EPOCH_NS:
+        return since / NANOSECONDS
+    span = float(np.nanmax(since) - np.nanmin(since))
+    if span >= _LONGEST or abs(float(first)) >= _LATEST:
+        raise ValueError(f'the times in {name!r} go from {first} to {first + span:.6g}, which can '
+                         f"be no seconds: give their unit, as in time='{name} [ns]'")
+    return since
+
+
+@dataclass(frozen=True)
+class _Table:
+    """The import of one table: its rows in the units of the signals, cut into episodes."""
+
+    label: str
+    states: Sequence[_Signal]
+    inputs: Sequence[_Signal]
+    linear: Sequence[str]
+    report: ImportReport
+
+    def episodes(self, table: Any, seconds: Array) -> Iterator[Episode]:
+        """Yield the episodes of a table whose rows have these times (R,)."""
+        x, u = (np.column_stack([self._values(table, one) for one in some])
+                for some in (self.states, self.inputs))
+        self.report.measurements += int(np.sum(np.isfinite(x)))
+        seconds, x, u = self._in_order(seconds, x, u)
+        jump = self._without_spikes(x)
+        u, known = self._held(u)
+        self._drop('before the first input', x[:known])
+        seconds, x, u, jump = seconds[known:], x[known:], u[known:], jump[known:]
+        linear = tuple(one.name in self.linear for one in self.inputs)
+        for rows in np.split(np.arange(len(seconds)), self._ends(seconds, x, jump)):
+            measured = rows[np.isfinite(x[rows]).any(axis=1)]
+            if len(measured) < SHORTEST:
+                self._drop(f'in a segment of fewer than {SHORTEST}', x[measured])
+                continue
+            self.report.used += int(np.sum(np.isfinite(x[measured])))
+            origin = seconds[measured[0]]
+            yield Episode(seconds[measured] - origin, x[measured], seconds[rows] - origin, u[rows],
+                          linear if any(linear) else ()).part(0, len(measured))
+
+    def _values(self, table: Any, signal: _Signal) -> Array:
+        """Return the numbers (R,) of a column in the unit of the signal, NaN for none."""
+        import pandas as pd
+        header, unit = _header(table, signal.column) or ('', '')
+        values = pd.to_numeric(table[header], errors='coerce').to_numpy(dtype=np.float64)
+        values = np.where(np.isfinite(values), values, np.nan)
+        missing = int(np.sum(np.isnan(values)))
+        if missing == len(values):
+            raise ValueError(f'the column {str(header)!r} holds no number: name another one')
+        if missing and signal in self.states:
+            self.report.note(f'{self.label}: {signal.name} was measured in '
+                             f'{len(values) - missing} of {len(values)} rows')
+        return _conversion(signal.name, unit or signal.unit, signal.unit)(values)
+
+    def _in_order(self, seconds: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Return the rows with a time, each time once, and the oldest first."""
+        timed = np.isfinite(seconds)
+        self._drop('without a time', x[~timed])
+        seconds, x, u = seconds[timed], x[timed], u[timed]
+        if len(seconds) > 1 and np.median(np.diff(seconds)) < 0.0:
+            seconds, x, u = seconds[::-1], x[::-1], u[::-1]
+        first = np.flatnonzero(np.diff(seconds, prepend=-np.inf))
+        if len(first) < len(seconds):
+            import pandas as pd
+            # signals may have a row each; of several values of one signal the first one counts
+            number = np.cumsum(np.diff(seconds, prepend=-np.inf) != 0.0)
+            merged = np.array(pd.DataFrame(np.hstack([x, u])).groupby(number).first())
+            repeated = int(np.sum(np.isfinite(x)) - np.sum(np.isfinite(merged[:, :x.shape[1]])))
+            self.report.dropped['measurement with a repeated time'] += repeated
+            x, u = np.hsplit(merged, [x.shape[1]])
+        return seconds[first], x, u
+
+    def _without_spikes(self, x: Array) -> NDArray[np.int64]:
+        """Replace spikes by NaN in place; return the state that jumps in each row, -1 for none."""
+        jumps = np.full(len(x), -1)
+        for j, signal in enumerate(self.states):
+            rows = np.flatnonzero(np.isfinite(x[:, j]))
+            spike, jump = outliers_and_steps(x[rows, j])
+            x[rows[spike], j] = np.nan
+            jumps[rows[jump]] = j
+            if spike.any():
+                self.report.dropped[f'spike of a single sample ({signal.name})'] += int(
+                    np.sum(spike))
+        return jumps
+
+    def _held(self, u: Array) -> tuple[Array, int]:
+        """Return the inputs (R, n_u) without gaps, and the first row in which all are known."""
+        rows = np.where(np.isfinite(u), np.arange(len(u))[:, None], -1)
+        last = np.maximum.accumulate(rows, axis=0)
+        known = int(np.argmax((last >= 0).all(axis=1)))
+        for j, signal in enumerate(self.inputs):
+            if missing := int(np.sum(rows[known:, j] < 0)):
+                self.report.note(f'{self.label}: {signal.name} has no value in {missing} rows, '
+                                 'where the value before is held')
+        return np.take_along_axis(u, np.maximum(last, 0), axis=0), known
+
+    def _ends(self, seconds: Array, x: Array, jump: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the rows at which a new episode begins, and note the reasons."""
+        step = np.diff(seconds, prepend=seconds[:1])
+        usual = float(np.median(step[step > 0.0])) if np.any(step > 0.0) else 0.0
+        ends = np.flatnonzero((step < 0.0) | (step > GAP_PERIODS * usual) | (jump >= 0))
+        ends = ends[ends > 0]
+        breaks: defaultdict[str, list[tuple[float, str]]] = defaultdict(list)
+        for end in ends.tolist():
+            at = f'at {seconds[end - 1]:.3f} s'
+            if step[end] < 0.0:
+                breaks['set back'].append((-step[end], f'{-step[end]:.3f} s'))
+            elif step[end] > GAP_PERIODS * usual:
+                breaks['gap'].append((step[end], f'{step[end]:.3f} s {at}'))
+            else:
+                j = int(jump[end])
+                breaks['jump'].append((
+                    abs(x[end, j]), f'{x[end, j]:.6g} {self.states[j].unit} {at}'))
+        self.report.notes += break_notes(self.label, breaks)
+        return ends
+
+    def _drop(self, reason: str, x: Array) -> None:
+        if count := int(np.sum(np.isfinite(x))):
+            self.report.dropped[reason] += count
