@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that runs in time, behind its actuators (range, delay, lag), and its sensor."""
+"""A plant that runs in time, behind its actuators and dead times, and its sensor."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ class Actuator:
 
     lower: float | Array = -np.inf  #: lowest value that each input reaches, in input units
     upper: float | Array = np.inf  #: highest such value
-    delay: float | Array = 0.0  #: how long after it was given a command takes effect, in s
+    delay: float | Array = 0.0  #: how long after it was given a command is applied, in s
     lag: float | Array = 0.0  #: time constant with which the input then follows, in s
+    dead_time: float | Array = 0.0  #: how long after it was applied an input acts, in s
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +49,21 @@ class Process:
         """What the input follows (n_u,)."""
         return self.u if self.command is None else self.command
 
+    @property
+    def applied(self) -> Array:
+        """Input (n_u,) that is applied, as a sensor has it, and acts after its dead time."""
+        dead = np.broadcast_to(self.actuator.dead_time, self.u.shape)
+        if not dead.any():
+            return self.u
+        # what acts a dead time later depends on no later command
+        ahead = replace(self, system=_at_rest(self.system))
+        return np.array([ahead.until(self.time_ns + round(seconds * NANOSECONDS)).u[i]
+                         for i, seconds in enumerate(dead.tolist())])
+
     def commanded(self, command: Array, time_ns: int) -> Process:
         """Return the process with a command given, in place of any that would act later."""
-        delays = np.broadcast_to(self.actuator.delay, command.shape).tolist()
+        delays = np.broadcast_to(
+            np.add(self.actuator.delay, self.actuator.dead_time), command.shape).tolist()
         effect_ns = [time_ns + round(delay * NANOSECONDS) for delay in delays]
         earlier = [entry for entry in self.pending if entry[0] < effect_ns[entry[1]]]
         new = zip(effect_ns, range(len(command)), command.tolist(), strict=True)
@@ -95,6 +108,13 @@ def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Arr
     if time_ns == 0:
         return x
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
+
+
+def _at_rest(system: ControlAffineSystem) -> ControlAffineSystem:
+    """Return a plant with these signals whose state does not move."""
+    n = system.n_x
+    return replace(system, drift=np.zeros_like, B=np.zeros((n, system.n_u)),
+                   drift_jacobian=lambda x: np.zeros((*x.shape, n)))
 
 
 def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> ControlAffineSystem:
