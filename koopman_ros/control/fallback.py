@@ -36,6 +36,9 @@ from koopman_ros.tuning import InputLimits, Tuning
 
 # Between the shortest dead time and the longest one a law is evaluated so many times at most.
 _MOST_EVALUATIONS = 20
+# A prediction takes steps of at least this share of the fastest time constant, and an estimator at
+# most so many of them at once.
+_PREDICTION_STEP, _MOST_STEPS = 0.1, 10
 
 
 class _NotPredictedError(Exception):
@@ -181,18 +184,23 @@ class FallbackLevel:
 
     def _predicted(self, estimate: Estimate, pieces: list[tuple[float, Array]]) -> Estimate:
         """Predict an estimate under inputs (n_u,) that act for so many seconds one by one."""
-        model, ahead = self.model, 0.0
-        # estimators predict some time constants at once
+        model, ahead, gathered, impulse = self.model, 0.0, 0.0, np.zeros(self.model.n_u)
         rate = model.linearised.fastest_rate / model.seconds_per_time_unit
-        for seconds, u in pieces:
-            count = max(1, math.ceil(seconds * rate))
+        step = _PREDICTION_STEP / rate if rate > 0.0 else math.inf
+        for k, (seconds, u) in enumerate(pieces, 1):
+            # of short pieces the mean acts as they do one by one
+            gathered, impulse = gathered + seconds, impulse + seconds * u
+            if gathered < step and k < len(pieces):
+                continue
+            count = max(1, math.ceil(gathered / (_MOST_STEPS * step)))
+            v = model.inputs.to_deviation(impulse / gathered)
             for _ in range(count):
-                found = self.estimator.predict(
-                    estimate, model.inputs.to_deviation(u), seconds / count)
-                ahead += seconds / count
+                found = self.estimator.predict(estimate, v, gathered / count)
+                ahead += gathered / count
                 if found is None or not found.finite:
                     raise _NotPredictedError(ahead)
                 estimate = found
+            gathered, impulse = 0.0, np.zeros(model.n_u)
         return estimate
 
     def _checked(self, result: Any) -> LawResult:
