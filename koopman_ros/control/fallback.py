@@ -131,7 +131,7 @@ class FallbackLevel:
             if target is None:
                 return None, LawResult(None, reason(StatusCode.NO_STEADY_STATE))
             target = self._within_reach(target, estimate.w)
-            if pending is not None and any(pending.dead_ns):
+            if pending is not None and any(pending.dead_ns) and pending.applied.values:
                 return target, self._ahead(estimate, target, memory, interval, previous, pending)
             return target, self._checked(
                 self.law.compute(estimate, target, memory, interval, previous))

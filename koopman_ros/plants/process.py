@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -52,13 +53,24 @@ class Process:
     @property
     def applied(self) -> Array:
         """Input (n_u,) that is applied, as a sensor has it, and acts after its dead time."""
-        dead = np.broadcast_to(self.actuator.dead_time, self.u.shape)
+        dead, lag = (np.broadcast_to(value, self.u.shape)
+                     for value in (self.actuator.dead_time, self.actuator.lag))
         if not dead.any():
             return self.u
         # what acts a dead time later depends on no later command
-        ahead = replace(self, system=_at_rest(self.system))
-        return np.array([ahead.until(self.time_ns + round(seconds * NANOSECONDS)).u[i]
-                         for i, seconds in enumerate(dead.tolist())])
+        end_ns = [self.time_ns + round(seconds * NANOSECONDS) for seconds in dead.tolist()]
+        u, goal, since_ns = self.u.copy(), np.array(self.followed), [self.time_ns] * len(dead)
+        ends = ((end, i, np.nan) for i, end in enumerate(end_ns))
+        for due, i, command in (*self.pending, *ends):
+            if not since_ns[i] <= due <= end_ns[i]:
+                continue
+            if due > since_ns[i]:
+                reached = np.clip(goal, self.actuator.lower, self.actuator.upper)[i]
+                seconds = (due - since_ns[i]) / NANOSECONDS
+                u[i] = reached + (math.exp(-seconds / lag[i]) * (u[i] - reached)
+                                  if lag[i] > 0.0 else 0.0)
+            goal[i], since_ns[i] = command, due
+        return u
 
     def commanded(self, command: Array, time_ns: int) -> Process:
         """Return the process with a command given, in place of any that would act later."""
@@ -108,13 +120,6 @@ def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Arr
     if time_ns == 0:
         return x
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
-
-
-def _at_rest(system: ControlAffineSystem) -> ControlAffineSystem:
-    """Return a plant with these signals whose state does not move."""
-    n = system.n_x
-    return replace(system, drift=np.zeros_like, B=np.zeros((n, system.n_u)),
-                   drift_jacobian=lambda x: np.zeros((*x.shape, n)))
 
 
 def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> ControlAffineSystem:
