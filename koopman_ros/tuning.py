@@ -21,7 +21,7 @@ from koopman_ros.core.declaration import (
     value_column,
 )
 from koopman_ros.core.plugins import short_name
-from koopman_ros.model import LiftedModel
+from koopman_ros.model import LiftedModel, LONGEST_DEAD_TIME
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,9 @@ class Tuning:
         'inputs', 1.0, 'Cost of the squared deviation of this input from its steady value.',
         '1/({unit})^2', maximum=1e12, open_minimum=True, name='weight')
     limits: InputLimits = nested(InputLimits)
+    dead_time: Array = column(
+        'inputs', -1.0, 'Dead time between this input, as commanded or measured, and its effect; '
+        '-1: that of the model.', 's', -1.0, LONGEST_DEAD_TIME)
     sensor: SensorLimits = nested(SensorLimits)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point, at most as many as there are inputs; an empty '
@@ -138,6 +141,10 @@ class Tuning:
     plugins: Mapping[str, Any] = plugin_parameters()
 
     __repr__ = short_repr
+
+    def dead_times(self, model: LiftedModel) -> Array:
+        """Return the dead time (n_u,) of each input of a model in s."""
+        return np.where(self.dead_time < 0.0, model.dead_time, self.dead_time)
 
     def of_plugin(self, name: str, kind: type[Any]) -> Any:
         """Return the own parameters of a plug-in by its name; those of `kind` by default."""

@@ -160,7 +160,8 @@ class Controller(ControlStep):
         applied = numbers('applied input', applied, self.model.inputs.names)
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
-        return replace(state, command=read_only(self.tuning.limits.within(applied)))
+        return replace(state, command=read_only(self.tuning.limits.within(applied)),
+                       applied=state.applied.corrected(applied))
 
     def switch_to(self, predecessor: Controller, state: State) -> State:
         """
@@ -184,7 +185,8 @@ class Controller(ControlStep):
                     return state
                 now = level.compute(
                     state.setpoint.active, state.estimate, None, usual_interval(state),
-                    state.target, state.own_command)[1]
+                    state.target, state.own_command,
+                    self.estimation.pending(state, state.commanded_ns or 0))[1]
                 return state if now.u is None else replace(
                     state, law_input=now.u, law_memory=now.memory, transfer=with_step(
                         state.transfer, state.law_input - now.u))

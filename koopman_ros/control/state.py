@@ -21,7 +21,7 @@ from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.status import Reason
-from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
+from koopman_ros.estimation import Accepted, AppliedInputs, Estimate, Estimator, Innovation
 
 
 class Mode(Enum):
@@ -44,6 +44,8 @@ class State:
     former_ns: int | None = None  #: newest stamp before the stamps went back, or None
     command: Array | None = None  #: (n_u,) last command, or None before the first
     commanded_ns: int | None = None  #: when it was given, or None
+    #: what was applied, as far back as it still acts; empty before the first command
+    applied: AppliedInputs = field(default_factory=AppliedInputs)
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
     accepted: Accepted | None = None  #: what is remembered of the measurements
     #: state and disturbance, in the deviations of the acting level's model

@@ -33,13 +33,17 @@ def usual_interval(state: State) -> float:
     return 0.0 if math.isinf(state.interval) else state.interval
 
 
-def afresh(state: State) -> State:
-    """Return the state after the clock was set back: what was timed by it has lost its meaning."""
+def afresh(state: State, by_ns: int) -> State:
+    """
+    Return the state after the clock was set: what was timed by it has lost its meaning.
+
+    :param by_ns: how far it was set, by which inputs under way act at other times.
+    """
     supervisor = replace(state.supervisor, bad_since_ns=None, better_since_ns=None)
     newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
         state.time_ns, state.former_ns)
     return replace(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
-                   supervisor=supervisor, recovery=None,
+                   applied=state.applied.shifted(by_ns), supervisor=supervisor, recovery=None,
                    setpoint=replace(state.setpoint, scheduled=()))
 
 

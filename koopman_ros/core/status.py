@@ -112,6 +112,8 @@ class StatusCode(Enum):
     STATE_LEAVES = 'state_leaves', (
         '{signal} would go to {value:value}, outside the trained range {lower:value} to '
         '{upper:value}')
+    NOT_PREDICTED = 'not_predicted', (
+        'the model gives no state {seconds:.3g} s ahead, when the command acts')
     NO_STEADY_STATE = 'no_steady_state', 'the model has no steady state there'
     SCHEDULE_FULL = 'schedule_full', (
         '{most} set-points are scheduled already: wait until some have taken effect, or send '

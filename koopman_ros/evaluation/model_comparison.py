@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import itertools
 
 import numpy as np
@@ -97,7 +97,7 @@ class PredictionWindows:
     """N measurements in M windows of K steps each."""
 
     x: Array  #: (N, n_y) measured, in units
-    u: Array  #: (N - 1, n_u) inputs held between them, in units
+    u: Array  #: (N - 1, n_u) inputs applied between them, in units
     steps: Array  #: (N - 1,) time between them, in s
     places: NDArray[np.intp]  #: (M, K) which steps are in a window
 
@@ -111,6 +111,23 @@ class PredictionWindows:
         """How far (n_x,) the signals moved: root mean square distance from a window's mean."""
         x = self.x[self.places]
         return rms(np.mean(np.square(x - x.mean(axis=1, keepdims=True)), axis=1))
+
+    def delayed(self, dead_time: Array) -> PredictionWindows:
+        """
+        Return the same with the inputs that acted, each so long (n_u,) after it was applied, in s.
+
+        The first one is taken to have been applied before, too.
+        """
+        if not dead_time.any():
+            return self
+        times = np.concatenate(([0.0], np.cumsum(self.steps)))
+        impulse = np.vstack((np.zeros_like(self.u[:1]), np.cumsum(
+            self.u * self.steps[:, None], axis=0)))
+        acted = np.column_stack([
+            np.diff(np.interp(times - dead, np.append(-dead, times),
+                              np.append(-dead * first, column))) / self.steps
+            for dead, first, column in zip(dead_time.tolist(), self.u[0], impulse.T, strict=True)])
+        return replace(self, u=acted)
 
     def squares(self, model: LiftedModel, size: Array) -> Array:
         """
@@ -237,8 +254,9 @@ def compare(present: Controller, candidate: Controller,
         np.abs(present.measured.C) @ (box.upper - box.lower)))
     whole = present.measured.all_states and candidate.measured.all_states
     with np.errstate(all='ignore'):
-        own, new = (windows.squares(one.model, negligible) if whole else _predicted(one, windows)
-                    for one in (present, candidate))
+        own, new = (acted.squares(one.model, negligible) if whole else _predicted(one, acted)
+                    for one in (present, candidate)
+                    for acted in (windows.delayed(one.tuning.dead_times(one.model)),))
     known = np.isfinite(own).all(axis=1)
     if not known.any():
         return None

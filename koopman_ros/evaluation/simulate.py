@@ -41,6 +41,10 @@ class Plant(Protocol):
     def u(self) -> Array:
         """Input (n_u,) that acts."""
 
+    @property
+    def applied(self) -> Array:
+        """Input (n_u,) as it is measured, which acts after its dead time."""
+
     def commanded(self, command: Array, time_ns: int) -> Self:
         """Return the plant with a command (n_u,) given at its present time."""
 
@@ -82,8 +86,8 @@ def exchange(controller: Controller) -> Change:
 
 
 def restart(loop: Loop) -> Loop:
-    """Start the controller anew; it finds the input that acts."""
-    return replace(loop, state=loop.controller.initialise(State(), loop.plant.u))
+    """Start the controller anew; it finds the input that is applied."""
+    return replace(loop, state=loop.controller.initialise(State(), loop.plant.applied))
 
 
 def perfect(value: Array, _: float) -> Array:
@@ -138,7 +142,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     :param noise: (n_y,) standard deviations of what is added to y; none by default.
     :param seed: of the noise.
     :param sensor: what it makes of that, by value and time: a bias, a fault, silence.
-    :param input_sensor: the same of the input that acts; None where it is not measured.
+    :param input_sensor: the same of the applied input; None where it is not measured.
     :param state: of the controller at the start; knowing nothing by default.
     :param stamp: the stamp of a measurement at a time of the plant, both in ns.
     :param stop: ends the simulation when it is true of state, command and report.
@@ -173,7 +177,8 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
             y = y + noise * np.random.default_rng((seed, number)).standard_normal(len(noise))
         received = sensor(y, seconds)
         event = Silence(stamp(time_ns)) if received is None else Measurement(
-            stamp(time_ns), received, None if input_sensor is None else input_sensor(u, seconds))
+            stamp(time_ns), received, None if input_sensor is None else input_sensor(
+                loop.plant.applied, seconds))
         loop, command, report = _answered(loop, event)
         assert report is not None  # of a measurement as of silence
         reports.append(report)

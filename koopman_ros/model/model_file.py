@@ -146,6 +146,8 @@ def _description(model: LiftedModel) -> dict[str, Any]:
         'states': _signals(model.states), 'time_unit': model.time_unit}
     if isinstance(model.observables, NetworkObservables):
         about['identity'] = model.observables.identity
+    if model.dead_time.any():
+        about['dead_time'] = model.dead_time.tolist()
     if model.training_states is not None:
         about['fill_distance'] = model.training_states.fill_distance
     return about
@@ -244,7 +246,9 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
         readout=tensors.pop('readout', None),
         input_terms=None if terms is None else InputTerms(terms),
         pre_feedback=tensors.pop('pre_feedback', None),
-        verified_loops=tried)
+        verified_loops=tried,
+        dead_time=np.array(_of_type(list, about, 'dead_time') if 'dead_time' in about else 0.0,
+                           dtype=np.float64))
     if tensors:
         raise ValueError(f'it holds unknown arrays: {", ".join(sorted(tensors))}')
     return model

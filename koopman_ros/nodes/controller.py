@@ -22,6 +22,7 @@ from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.estimation import AppliedInputs
 from koopman_ros.evaluation import MeasurementBuffer
 from koopman_ros.event_log import records
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
@@ -89,6 +90,7 @@ class ControllerNode(ManagedNode):
         self._loaded: LoadedModel | None = loaded
         # (n_u,) last command before the node became inactive, which is still in force at the plant
         self._last_command: Array | None = None
+        self._applied = AppliedInputs()  # what may still act then
 
     def configure(self) -> None:
         """Load the model and create the loop, which does not command yet."""
@@ -156,7 +158,7 @@ class ControllerNode(ManagedNode):
         """Begin to command, from the present inputs; earlier set-point requests are kept."""
         with self._loop.lock:
             self._timing, self._received = Timing(self), time.monotonic()
-            self._loop.begin(self._timing)
+            self._loop.begin(self._timing, self._applied)
             self._measurements.begin(
                 self._timing, lambda: self._settings.measurement_timeout or _SOURCES_WINDOW,
                 lambda: self._loop.state.command is not None)
@@ -169,6 +171,7 @@ class ControllerNode(ManagedNode):
             self._measurements.end()
             if self._loop.state.command is not None:
                 self._last_command = self._loop.state.command
+                self._applied = self._loop.state.applied
 
     def complete(self) -> None:
         """Stop watchdog and model reload before the middleware shuts down."""

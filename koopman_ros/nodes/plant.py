@@ -216,7 +216,7 @@ class PlantNode(ManagedNode):
         stamp, frame_id = stamp_message(self._plant.process.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
-        self._applied.send(self._plant.process.u, stamp, frame_id)
+        self._applied.send(self._plant.process.applied, stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
         self._states.send(measured, stamp, frame_id, variance, resolution)
 

@@ -144,6 +144,13 @@ def _dynamics(model: LiftedModel) -> dict[str, Any]:
             'observer_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
 
 
+def _longest_dead_time(model: LiftedModel, given: Mapping[str, Any]) -> float:
+    named = (given.get(f'{name}.dead_time') for name in model.inputs.names)
+    return max((seconds if isinstance(seconds, float) and seconds >= 0.0 else known
+                for seconds, known in zip(named, model.dead_time.tolist(), strict=True)),
+               default=0.0)
+
+
 def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
              ) -> ParameterTable[ControllerParameters]:
     """
@@ -175,6 +182,11 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         defaults |= {f'{name}.weight': 1.0 / scale ** 2
                      for name, scale in zip(one.names, one.scale.tolist(), strict=True)
                      if name in signals.units}
+    defaults |= {**own, 'system': system}
+    if dead_time := _longest_dead_time(model, {**defaults, **given}):
+        # the maximum sensitivity stays below 2, and the dead time may be twice as long
+        defaults['observer_bandwidth'] = min(
+            defaults['observer_bandwidth'], float(f'{1.0 / dead_time:.2g}'))
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),
@@ -182,8 +194,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         signals={'states': signals.every, 'measured': signals.states,
                  'controlled': {name: signals.states[name] for name in signals.controlled},
                  'inputs': signals.inputs},
-        plugins=_plugin_parameters({**own, **given}),
-        defaults={**defaults, **own, 'system': system})
+        plugins=_plugin_parameters({**own, **given}), defaults=defaults)
 
 
 @dataclass(frozen=True)

@@ -66,10 +66,14 @@ class InputParameters(CommandedPlaces):
     max: float = signal_value(
         UNBOUNDED, 'Highest value that the actuator reaches.')
     delay: float = parameter(
-        0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
+        0.0, 'Delay between a command and its application, which the measured input shows.', 's',
+        0.0, 3600.0)
     lag: float = parameter(
         0.0, 'Time constant with which the input follows its command; 0: at once.', 's', 0.0,
         3600.0)
+    dead_time: float = parameter(
+        0.0, 'Dead time between the applied input and its effect, which the measured input does '
+        'not show.', 's', 0.0, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -154,8 +158,8 @@ class PlantTable(ParameterTable[PlantParameters]):
         units = self.described.inputs
         tuned = values.inputs
         return Actuator(in_own_units(tuned, 'min', units), in_own_units(tuned, 'max', units),
-                        np.array([tuned[name].delay for name in units]),
-                        np.array([tuned[name].lag for name in units]))
+                        *(np.array([getattr(tuned[name], one) for name in units])
+                          for one in ('delay', 'lag', 'dead_time')))
 
     def _build(self, values: PlantParameters) -> None:
         """Build what a plant starts with, down to the tolerances of its integration."""

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that runs in time, behind its actuators (range, delay, lag), and its sensor."""
+"""A plant that runs in time, behind its actuators and dead times, and its sensor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -24,8 +25,9 @@ class Actuator:
 
     lower: float | Array = -np.inf  #: lowest value that each input reaches, in input units
     upper: float | Array = np.inf  #: highest such value
-    delay: float | Array = 0.0  #: how long after it was given a command takes effect, in s
+    delay: float | Array = 0.0  #: how long after it was given a command is applied, in s
     lag: float | Array = 0.0  #: time constant with which the input then follows, in s
+    dead_time: float | Array = 0.0  #: how long after it was applied an input acts, in s
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +50,32 @@ class Process:
         """What the input follows (n_u,)."""
         return self.u if self.command is None else self.command
 
+    @property
+    def applied(self) -> Array:
+        """Input (n_u,) that is applied, as a sensor has it, and acts after its dead time."""
+        dead, lag = (np.broadcast_to(value, self.u.shape)
+                     for value in (self.actuator.dead_time, self.actuator.lag))
+        if not dead.any():
+            return self.u
+        # what acts a dead time later depends on no later command
+        end_ns = [self.time_ns + round(seconds * NANOSECONDS) for seconds in dead.tolist()]
+        u, goal, since_ns = self.u.copy(), np.array(self.followed), [self.time_ns] * len(dead)
+        ends = ((end, i, np.nan) for i, end in enumerate(end_ns))
+        for due, i, command in (*self.pending, *ends):
+            if not since_ns[i] <= due <= end_ns[i]:
+                continue
+            if due > since_ns[i]:
+                reached = np.clip(goal, self.actuator.lower, self.actuator.upper)[i]
+                seconds = (due - since_ns[i]) / NANOSECONDS
+                u[i] = reached + (math.exp(-seconds / lag[i]) * (u[i] - reached)
+                                  if lag[i] > 0.0 else 0.0)
+            goal[i], since_ns[i] = command, due
+        return u
+
     def commanded(self, command: Array, time_ns: int) -> Process:
         """Return the process with a command given, in place of any that would act later."""
-        delays = np.broadcast_to(self.actuator.delay, command.shape).tolist()
+        delays = np.broadcast_to(
+            np.add(self.actuator.delay, self.actuator.dead_time), command.shape).tolist()
         effect_ns = [time_ns + round(delay * NANOSECONDS) for delay in delays]
         earlier = [entry for entry in self.pending if entry[0] < effect_ns[entry[1]]]
         new = zip(effect_ns, range(len(command)), command.tolist(), strict=True)

@@ -83,4 +83,4 @@ class SimulatedPlant:
         """Return states and inputs with their names and units."""
         inputs = {base_name(name, unit): unit for name, unit in self.signals.inputs.items()}
         return {**values_by_name(self.signals.states, self.process.x.tolist()),
-                **values_by_name(inputs, self.process.u.tolist())}
+                **values_by_name(inputs, self.process.applied.tolist())}

@@ -276,13 +276,15 @@ def test_eigenvalues_come_slowest_first_and_every_mode_has_to_decay(A, slowest_f
 def test_a_printed_model_shows_its_ranges_rates_and_verdict():
     model = exact_two_state_model()
     model = replace(model, provenance=replace(
-        model.provenance, metrics={'rx': 0.25}, accepted=False, reasons=('too few loops',)))
+        model.provenance, metrics={'rx': 0.25}, accepted=False, reasons=('too few loops',)),
+        dead_time=np.array([7.5]))
     lines = str(model).splitlines()
     for name, unit in zip(model.states.names, model.states.units, strict=True):
         assert sum(f'state {name}: trained from' in line and line.endswith(unit)
                    for line in lines) == 1
     assert f'{model.eigenvalues.real[0]:.4g} per {model.time_unit}' in str(model)
     assert '  held-out rx: 0.25' in lines
+    assert f'  dead time of {model.inputs.names[0]}: 7.5 s' in lines
     assert lines[-1] == '  acceptance: refused (too few loops)'
 
 
@@ -360,7 +362,8 @@ def test_violation_counts_half_widths(value, violation):
 
 
 def test_model_without_inputs():
-    model = replace(random_lift(), inputs=coordinates('u', 0), B=np.zeros((2, 0)))
+    model = replace(random_lift(), inputs=coordinates('u', 0), B=np.zeros((2, 0)),
+                    dead_time=np.zeros(0))
     assert model.n_u == 0
     assert model.inputs.violation(np.zeros(0)) == 0.0
 

@@ -64,6 +64,7 @@ MODELS = {
         with_origin(plant='R\xfchrkessel \u53cd\u5fdc', method='m' * 200, seed=2 ** 128 - 1),
         states=replace(PLAIN.states, units=('\N{DEGREE SIGN}C', 'K'))),
     'untrained': with_origin(seed=None, metrics={}),
+    'dead time': replace(random_lift(n_u=2), dead_time=np.array([0.0, 12.3])),
     'largest': random_lift(32, 32, identity=False, n_free=32, n_u=32),
     'linear': linearised_model(np.diag([-1.0, -2.0]), np.ones((2, 1)), PLAIN.states,
                                PLAIN.inputs, 's', PLAIN.provenance),
@@ -174,6 +175,10 @@ HUGE, INFINITE = 10 ** 400, float('inf')
 # Changes of a part of the description, and words of the refusal.
 DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
     ('', {'identity': 1}, 'identity must be a bool'), ('', {'identity': False}, 'incompatible A'),
+    *(('', {'dead_time': value}, words) for value, words in (
+        (3.0, 'dead_time must be a list'), ([1.0, 2.0], 'incompatible dead_time'),
+        ([-0.1], 'dead time of u0 must be 0 to 86400 s'), ([9e4], 'got 90000 s'),
+        ([INFINITE], 'dead_time must be finite'), ([None], ''))),
     ('', {'time_unit': 'h'}, 'time_unit'), ('', {'states': []}, ''), ('', {'provenance': 3}, ''),
     ('states', {'units': ['K']}, 'incompatible units'),
     ('states', {'names': ['T'], 'units': ['K']}, 'incompatible center'),
