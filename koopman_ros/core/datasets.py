@@ -179,6 +179,26 @@ class Episode:
         """Return the inputs (n, n_u) at `times` (n,), before any other change."""
         return np.where(self.linear, self.inputs_at(times), u) if any(self.linear) else u
 
+    def delayed(self, dead_time: Array) -> Episode | None:
+        """
+        Return the episode with each input as it acts, later by its dead time (n_u,).
+
+        It begins where all inputs are known; None where nothing is left of it.
+        """
+        if not np.any(dead_time):
+            return self
+        shifted = self.input_time[:, None] + dead_time
+        first = np.searchsorted(self.time, shifted[0].max())
+        if len(self) - first < 2:
+            return None
+        knots = np.unique(shifted)
+        knots = knots[knots >= shifted[0].max()]
+        u = np.empty((len(knots), self.u.shape[1]))
+        for j, own in enumerate(shifted.T):
+            u[:, j] = np.interp(knots, own, self.u[:, j]) if any(self.linear[j:j + 1]) else (
+                self.u[np.searchsorted(own, knots, side='right') - 1, j])
+        return Episode(self.time[first:], self.x[first:], knots, u, self.linear)
+
     def part(self, start: int, stop: int) -> Episode:
         """Return the measurements `start` to `stop` with the inputs that acted on them."""
         time = self.time[start:stop]

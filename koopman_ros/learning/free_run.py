@@ -122,7 +122,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *,
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """
-    rate, states, inputs = _drift(model, record.plant)
+    rate, states, inputs, dead_time = _drift(model, record.plant)
     measured = [i for i, name in enumerate(states.names) if name in record.plant.state_names]
     if not measured:
         raise ValueError(f'the record has none of the states {", ".join(states.names)}, it has '
@@ -131,7 +131,11 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *,
     order = [*measured, *(i for i in range(len(states)) if i not in measured)]
     some = states.only([states.names[i] for i in measured])
     record = record.of(*(dict(zip(own.names, own.units, strict=True)) for own in (some, inputs)))
-    episodes = record.episodes
+    episodes = tuple(late for episode in record.episodes
+                     if (late := episode.delayed(dead_time)) is not None)
+    if not episodes:
+        raise ValueError('no episode of the record is longer than the dead time of the model, '
+                         f'{max(dead_time):g} {record.plant.time_unit}')
     if init < 1:
         raise ValueError(f'init = {init} must be at least 1 sample')
     indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
@@ -160,16 +164,20 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *,
     return found
 
 
-def _drift(model: AnyModel, plant: PlantDescription) -> tuple[Rate, Coordinates, Coordinates]:
-    """Return a model's rate per time unit of a plant, with its states and inputs."""
+def _drift(model: AnyModel, plant: PlantDescription
+           ) -> tuple[Rate, Coordinates, Coordinates, Array]:
+    """Return rate, states, inputs and dead times of a model, in the time unit of a plant."""
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     if isinstance(model, Trained | ClassComparison):
         model = model.model
     if isinstance(model, LiftedModel):
-        return lifted_rate(model, seconds), model.states, model.inputs
+        return (lifted_rate(model, seconds), model.states, model.inputs,
+                model.dead_time / seconds)
     drift = model.drift if isinstance(model, Identified) else model
     factor = seconds / SECONDS_PER_TIME_UNIT[drift.box.time_unit]
-    return lambda x, u: factor * drift.rate(x, u), drift.box.states, drift.box.inputs
+    dead_time = model.dead_time if isinstance(model, Identified) else np.empty(0)
+    return (lambda x, u: factor * drift.rate(x, u), drift.box.states, drift.box.inputs,
+            dead_time / factor if len(dead_time) else np.zeros(len(drift.box.inputs)))
 
 
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,

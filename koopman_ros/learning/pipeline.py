@@ -32,6 +32,7 @@ from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
+    find_dead_times,
     IdentificationMethod,
     Identified,
     identify,
@@ -95,6 +96,13 @@ class Retrained:
         """Whether the lift may be used."""
         return not self.reasons
 
+    @property
+    def dead_time(self) -> Array:
+        """Dead times (n_u,) of the inputs, in s."""
+        found = self.found
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * (
+            found.dead_time if len(found.dead_time) else np.zeros(len(found.drift.box.inputs)))
+
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""
         box = self.found.drift.box
@@ -138,6 +146,7 @@ class Retrained:
             'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
+            'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
             'constants': {one.name: {
                 'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
@@ -218,7 +227,11 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
-    found = _estimate(task, plant, episodes, methods, progress, backend)
+    dead_time = _dead_time(task, plant, episodes, progress)
+    episodes = [late for episode in episodes
+                if (late := episode.delayed(dead_time / seconds)) is not None]
+    found = replace(_estimate(task, plant, episodes, methods, progress, backend),
+                    dead_time=dead_time / seconds)
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(record.episodes), record.account, task.bags)
     if found.hidden:
@@ -238,6 +251,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
+    learned = learned.with_model(replace(learned.model, dead_time=dead_time))
     runs = {name: simulate(learned, one) for name, one in (
         ('record', recorded), ('test', test)) if one is not None}
     decision = replace(decision, reasons=(
@@ -269,6 +283,25 @@ def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
     progress('read', 0.0, 'reading bags')
     return read_record(source, task.most_samples, task.seed, hidden=_hidden(task),
                        tick=progress.reading(2 * source.size()), backend=backend)
+
+
+def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode],
+               progress: _Progress) -> Array:
+    """Return the dead times (n_u,) as the task has them, or as the record tells them, in s."""
+    names, seconds = plant.input_names, SECONDS_PER_TIME_UNIT[plant.time_unit]
+    if unknown := ', '.join(name for name in task.dead_time if name not in names):
+        raise ValueError(f'dead_time names {unknown}: the inputs are {", ".join(names)}')
+    given = np.array([task.dead_time.get(name, 0.0) for name in names])
+    if not (np.all(np.isfinite(given)) and np.all(given >= 0.0)):
+        raise ValueError(f'dead_time is {dict(task.dead_time)}, must be 0 s or more')
+    known = [name in task.dead_time for name in names]
+    late = [one for episode in episodes if (one := episode.delayed(given / seconds)) is not None]
+    if not late:
+        raise ValueError(f'no episode is longer than dead_time = {max(given):g} s: record longer')
+    if task.physical_model or all(known):
+        return given
+    return given + seconds * find_dead_times(
+        late, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
 
 
 def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | None

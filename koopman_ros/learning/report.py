@@ -75,6 +75,8 @@ def _sections(retrained: Retrained) -> Iterator[str]:
           'each)' for (first, second), share in retrained.coverage.items()),
         *(f'noise of {name} from sample to sample: {noise:.3g} {unit}' for name, noise, unit in
           zip(states.names, found.noise, states.units, strict=True)),
+        *(f'dead time of {name}: {seconds:.4g} s'
+          for name, seconds in zip(inputs.names, retrained.dead_time.tolist(), strict=True)),
         f'{len(found.fitted)} segments to estimate and learn from, '
         f'{len(found.held_out)} held out to judge by'])
     yield '## Estimates of the drift'
@@ -93,8 +95,9 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                     ((one.name, one.unit, f'{one.value:.6g}', f'{one.standard_error:.2g}',
                       f'{one.lower:.6g} to {one.upper:.6g}', one.standing.value)
                      for one in found.constants), (2, 3))
-    yield 'Errors on the segments to choose by' + (
-        ', of the next measurement foreseen:' if found.hidden or found.constants else ':')
+    yield ('Errors on the segments to choose by, of the next measurement foreseen:'
+           if found.constants else 'Errors of simulations, at samples left out of the fit in turn:'
+           if found.hidden else 'Errors on the segments to choose by:')
     yield table(('degree', 'method', *errors),
                 (('' if score.degree is None else score.degree, score.method,
                   *(f'{error:.5g}' for error in score.rmse),

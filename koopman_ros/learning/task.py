@@ -49,6 +49,8 @@ class TrainingTask:
     input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
     input_matrix_degree: int = 0
+    #: dead time of inputs by name, in s; of those not named it is found from the record
+    dead_time: Mapping[str, float] = field(default_factory=dict)
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
     #: not compared with the present one, which has other states
     unmeasured_states: int = 0

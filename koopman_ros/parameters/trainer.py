@@ -193,7 +193,11 @@ class TrainerParameters:
     safe_value: Array = value_column(
         'inputs', 0.0, 'Safe value, at which the experiment starts and ends.')
     delay: Array = column(
-        'inputs', 0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
+        'inputs', 0.0, 'Delay between a command and its application, where that is not recorded.',
+        's', 0.0, 3600.0)
+    dead_time: Array = column(
+        'inputs', -1.0, 'Dead time between the applied input and its effect; -1: found from the '
+        'record.', 's', -1.0, 86400.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
@@ -249,6 +253,8 @@ class TrainerParameters:
                 'model_class': self.model_class, 'coordinates': self.lifted_dimension,
                 'seed': self.training_seed, 'starts': self.restarts,
                 'most_samples': self.training_samples,
+                'dead_time': {name: seconds for name, seconds in zip(
+                    signals.inputs, self.dead_time.tolist(), strict=True) if seconds >= 0.0},
                 'input_matrix_degree': self.input_matrix_degree,
                 'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
                 'constants': named_ranges(self.estimated_constants),

@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 import itertools
 import math
@@ -143,6 +143,9 @@ class Identified:
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()
     warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
+    #: (n_u,) by which the inputs of the segments are later than those of the record, in time
+    #: units; empty for none
+    dead_time: Array = field(default_factory=lambda: np.empty(0))
 
     __repr__ = short_repr
 
