@@ -36,6 +36,7 @@ Names: TypeAlias = str | Sequence[str]
 
 _SIGNAL = re.compile(r'\s*(?:(\w+)\s*=\s*)?(.+?)\s*(?:\[([^\[\]]+)\])?\s*')
 _BAGS = ('.mcap', '.db3')
+_LOOK = 2 ** 16  # characters of a CSV file in which a decimal comma is looked for
 _TIME_NAMES = ('time', 't', 'timestamp', 'datetime', 'date')
 # Numbers without a unit are seconds unless they cannot be: no record is 30 years long, and no
 # clock shows the year 5138. ROS and pandas count nanoseconds since 1970.
@@ -223,10 +224,10 @@ def _table(source: Source) -> Any:
     kind = Path(source).suffix.lower()
     if kind == '.csv':
         with Path(source).open(encoding='utf-8-sig') as file:
-            head, row = file.readline(), file.readline()
+            head, rows = file.readline(), file.read(_LOOK)
         separator = max(',;\t', key=head.count)
         return pd.read_csv(source, sep=separator, skipinitialspace=True, encoding='utf-8-sig',
-                           decimal=',' if separator == ';' and ',' in row else '.')
+                           decimal=',' if separator == ';' and ',' in rows else '.')
     if kind == '.parquet':
         try:
             return pd.read_parquet(source)
@@ -266,12 +267,16 @@ def _header(table: Any, column: str) -> tuple[Any, str] | None:
     return None
 
 
+def _headers(table: Any) -> str:
+    return ', '.join(map(repr, map(str, table.columns)))
+
+
 def _with_unit(table: Any, signal: _Signal, report: ImportReport) -> _Signal:
     """Return a signal with its unit, that of its column where the request has none."""
     found = _header(table, signal.column)
     if found is None:
-        raise ValueError(f'the record has no column {signal.column!r}, it has '
-                         f'{", ".join(map(repr, map(str, table.columns)))}: name one of them')
+        raise ValueError(f'the record has no column {signal.column!r}, it has {_headers(table)}: '
+                         'name one of them')
     if not (signal.unit or found[1]):
         report.note(f"{signal.name} has no unit, 1 is taken: write '{signal.name} [m]' for m")
     return replace(signal, unit=signal.unit or found[1] or '1')
@@ -286,35 +291,42 @@ def _seconds(table: Any, name: str, period: float) -> Array:
         if name:
             raise ValueError(f'both time = {name!r} and period = {period} s are given: give one')
         return period * np.arange(len(table), dtype=np.float64)
-    unit = ''
-    if name or not isinstance(table.index, pd.DatetimeIndex | pd.TimedeltaIndex):
-        (wanted,) = _signals(name) if name else (_Signal('', '', ''),)
-        names = [wanted.column] if name else [
-            one for one in map(str, table.columns) if re.split(r'[\s\[]', one.strip().lower())[0]
-            in _TIME_NAMES]
-        found = _header(table, names[0]) if names else None
-        if found is None and not (name and name == table.index.name):
-            raise ValueError(f'the record has no column {name or "time"!r}, it has '
-                             f'{", ".join(map(repr, map(str, table.columns)))}: name that of the '
-                             'times, or give the period of the rows in s')
-        column = table.index.to_series() if found is None else table[found[0]]
-        unit = wanted.unit or (found[1] if found else '')
-    else:
-        column = table.index.to_series()
+    column, unit = _time_column(table, name)
+    label = str(column.name)
     if not len(column.dropna()):
-        raise ValueError(f'the column {column.name!r} holds no times: name another one')
-    if pd.api.types.is_numeric_dtype(column):
-        return _numbers_in_seconds(column.to_numpy(), unit, str(column.name))
-    if not pd.api.types.is_timedelta64_dtype(column):
+        raise ValueError(f'the column {label!r} holds no times: name another one')
+    kinds = pd.api.types
+    if not (kinds.is_datetime64_any_dtype(column) or kinds.is_timedelta64_dtype(column)):
+        numbers = pd.to_numeric(column, errors='coerce')
+        if 2 * numbers.notna().sum() > len(column):
+            return _numbers_in_seconds(numbers.to_numpy(), unit, label)
         # whole seconds may be written without a fraction, others with one
-        iso = pd.to_datetime(column, format='ISO8601', errors='coerce')
+        dates = pd.to_datetime(column, format='ISO8601', errors='coerce')
         try:
-            column = pd.to_datetime(column) if iso.isna().any() else iso
+            column = pd.to_datetime(column) if (dates.isna() & column.notna()).any() else dates
         except (TypeError, ValueError) as error:
-            raise ValueError(f'the column {column.name!r} holds neither numbers nor dates: name '
-                             'that of the times') from error
+            raise ValueError(f'the column {label!r} holds neither numbers nor dates: name that of '
+                             'the times') from error
+    if not kinds.is_timedelta64_dtype(column):
         column = column - column.dropna().iloc[0]
     return column.dt.total_seconds().to_numpy(dtype=np.float64)
+
+
+def _time_column(table: Any, name: str) -> tuple[Any, str]:
+    """Return the column of the times, or the index, and its unit, empty for none."""
+    import pandas as pd
+    index = table.index.to_series()
+    if not name and isinstance(table.index, pd.DatetimeIndex | pd.TimedeltaIndex):
+        return index, ''
+    (wanted,) = _signals(name or next(
+        (one for one in map(str, table.columns)
+         if re.split(r'[\s\[]', one.strip().lower())[0] in _TIME_NAMES), 'time'))
+    if (found := _header(table, wanted.column)) is not None:
+        return table[found[0]], wanted.unit or found[1]
+    if name and wanted.column == table.index.name:
+        return index, wanted.unit
+    raise ValueError(f'the record has no column {wanted.column!r}, it has {_headers(table)}: name '
+                     'that of the times, or give the period of the rows in s')
 
 
 def _numbers_in_seconds(numbers: Any, unit: str, name: str) -> Array:
