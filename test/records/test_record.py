@@ -190,6 +190,19 @@ def test_several_tables_are_episodes_of_one_record(tmp_path):
     assert (record.plant.name, record.sources) == ('tank', (str(tmp_path / 'a.csv'),))
 
 
+@pytest.mark.parametrize(('arguments', 'words'), [
+    ((frame(time=SECONDS), [], 'pump'), 'at least one of each'),
+    ((frame(time=SECONDS), 'level', ['pump', 'level']), 'level is named twice'),
+    ((frame(time=SECONDS), ' ', 'pump'), 'names no signal'),
+    ((np.zeros((9, 2)), 'level', 'pump'), 'a ndarray is no record'),
+    ((frame(time=SECONDS), 'level', 'pump', 'valve'), 'linear names valve'),
+])
+def test_refuses_signals_and_sources_that_are_none(arguments, words):
+    source, states, inputs, *linear = arguments
+    with pytest.raises(ValueError, match=words):
+        read(source, states, inputs, linear=linear)
+
+
 @pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
 def test_refuses_other_files(tmp_path, file):
     (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
