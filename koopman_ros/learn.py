@@ -44,10 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Learn, print the result, and return the exit code."""
     options = vars(_parser().parse_args(arguments))
     try:
-        present = _loaded(options['model'])
+        present = _loaded(options.get('model', ''))
         record, test = (read(files, *_wanted(options, present), time=options['time'],
                              period=options['period'], linear=options['linear'],
-                             tolerance=options['synchronisation_tolerance'])
+                             tolerance=options.get('synchronisation_tolerance', 0.0))
                         if files else None for files in (options['record'], options['test']))
         assert record is not None
         print(record, flush=True)
@@ -83,8 +83,8 @@ def _parser() -> argparse.ArgumentParser:
             row.range_text if not row.choices else '', '' if many or row.default == '' else
             f'default: {default or "the name of the record"}')))
         options.add_argument(
-            f'--{row.name}', type=type(default[0] if many else default), default=default,
-            nargs='+' if many else None, choices=row.choices or None,
+            f'--{row.name}', type=type(default[0] if many else default),
+            default=argparse.SUPPRESS, nargs='+' if many else None, choices=row.choices or None,
             metavar=None if row.choices else row.name.upper(), help=(
                 f'{row.description}{f" [{row.unit}]" if row.unit else ""}'
                 f'{f" ({notes})" if notes else ""}').replace('%', '%%'))
@@ -129,7 +129,7 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
     given = {name: tuple(value) if isinstance(value, list) else value
              for name, value in options.items() if name in _OPTIONS}
     settings = table.snapshot({
-        **given, 'model_output': given['model_output'] or f'{about.name}.safetensors'})
+        **_DEFAULTS, 'model_output': f'{about.name}.safetensors', **given})
     if reason := table.check(settings):
         raise ValueError(reason)
     # tables have no topics: those that the names would usually have stand for them

@@ -147,10 +147,9 @@ class Episode:
     def interpolated(self) -> Array:
         """Return the states (N, n_x), lines where one was not measured; 0 where it never was."""
         x = self.x.copy()
-        for column in x.T[np.isnan(x).any(axis=0)]:
-            known = ~np.isnan(column)
-            column[~known] = np.interp(self.time[~known], self.time[known], column[known]) if (
-                known.any()) else 0.0
+        for j in np.flatnonzero(np.isnan(x).any(axis=0)):
+            known = ~np.isnan(x[:, j])
+            x[:, j] = np.interp(self.time, self.time[known], x[known, j]) if known.any() else 0.0
         return x
 
     def inputs_at(self, times: Array) -> Array:

@@ -136,7 +136,7 @@ class Box:
         """
         Return the range of some values.
 
-        :param x: (N, n_x) states, and u (N, n_u) inputs, in their units.
+        :param x: (N, n_x) states, NaN for a missing one, and u (N, n_u) inputs, in their units.
         :param nominal: whether deviations are from the nominal point or from the middle.
         :raises ValueError: when a state or an input never moves, or the sizes do not fit.
         """
@@ -145,7 +145,7 @@ class Box:
                 raise ValueError(f'incompatible {what}: expected one row a sample, got an array '
                                  f'{np.shape(given)}')
         states, inputs = (
-            Coordinates.spanning(names, units, np.min(values, axis=0), np.max(values, axis=0),
+            Coordinates.spanning(names, units, np.fmin.reduce(values), np.fmax.reduce(values),
                                  center if nominal else None)
             for names, units, center, values in (
                 (plant.state_names, plant.state_units, plant.nominal_state, x),

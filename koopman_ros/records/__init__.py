@@ -13,8 +13,8 @@ from koopman_ros.records.message_definitions import (
     MessageDefinitionError,
 )
 from koopman_ros.records.reader import BagSummary, in_log_order, read_messages, summary
+from koopman_ros.records.record import read, Record
 from koopman_ros.records.series import read_series, Series
-from koopman_ros.records.tables import read, Record
 from koopman_ros.records.writer import BagWriter
 
 __all__ = [

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records from tables (CSV, Parquet, MAT, DataFrame) and bags, as episodes with units."""
+"""Tables (CSV, Parquet, MAT, DataFrame) as episodes: columns, units, times, missing values."""
 
 from __future__ import annotations
 
@@ -16,26 +16,18 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array, short_repr
-from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.message_fields import base_name, place
-from koopman_ros.core.units import check_unit, Conversion, conversion, NANOSECONDS
-from koopman_ros.records.episodes import GAP_PERIODS, loop_episodes, SHORTEST
-from koopman_ros.records.import_spec import (
-    break_notes,
-    ImportReport,
-    RecordedInput,
-    RecordedState,
-)
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode
+from koopman_ros.core.units import Conversion, conversion, NANOSECONDS
+from koopman_ros.records.episodes import GAP_PERIODS, SHORTEST
+from koopman_ros.records.import_spec import break_notes, ImportReport
 from koopman_ros.records.series import outliers_and_steps
 
 #: A file or folder, a DataFrame, or columns by name.
 Source: TypeAlias = Any
-#: Names of signals: ``'level'``, ``'level [m]'``, ``'level = LT101.PV [m]'``.
-Names: TypeAlias = str | Sequence[str]
 
-_SIGNAL = re.compile(r'\s*(?:(\w+)\s*=\s*)?(.+?)\s*(?:\[([^\[\]]+)\])?\s*')
-_BAGS = ('.mcap', '.db3')
+_SIGNAL = re.compile(r'\s*(?:(\w+)\s*=\s*)?(\S.*?)\s*(?:\[([^\[\]]+)\])?\s*')
+_LOOK = 2 ** 16  # characters of a CSV file in which a decimal comma is looked for
 _TIME_NAMES = ('time', 't', 'timestamp', 'datetime', 'date')
 # Numbers without a unit are seconds unless they cannot be: no record is 30 years long, and no
 # clock shows the year 5138. ROS and pandas count nanoseconds since 1970.
@@ -43,140 +35,25 @@ _LONGEST, _LATEST, _EPOCH_NS = 1e9, 1e11, 1e17
 
 
 @dataclass(frozen=True)
-class Record:
-    """Measurements of a plant, with the names and units of its signals."""
-
-    plant: PlantDescription  #: its nominal point is NaN and its B None, as they are not known yet
-    episodes: tuple[Episode, ...]  #: times in s since the first measurement of each
-    report: ImportReport  #: counts of measurements used and dropped, and notes
-    sources: tuple[str, ...]  #: names of the files
-
-    __repr__ = short_repr
-
-    def of(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> Record:
-        """
-        Return the record with some signals alone, in their order and units.
-
-        :param states: units by name; inputs likewise.
-        :raises ValueError: for a signal that the record does not have, or a unit of another kind.
-        """
-        about, taken = self.plant, []
-        for kind, wanted, names, units in (
-                ('state', states, about.state_names, about.state_units),
-                ('input', inputs, about.input_names, about.input_units)):
-            if missing := [name for name in wanted if name not in names]:
-                raise ValueError(f'the record has no {kind} {missing[0]}, it has '
-                                 f'{", ".join(names)}: name one of them')
-            columns = [names.index(name) for name in wanted]
-            taken.append((columns, [_conversion(name, units[j], unit) for j, (name, unit) in zip(
-                columns, wanted.items(), strict=True)]))
-        (of_x, in_x), (of_u, in_u) = taken
-        return replace(self, plant=replace(
-            about, state_names=tuple(states), state_units=tuple(states.values()),
-            input_names=tuple(inputs), input_units=tuple(inputs.values()), B=None,
-            nominal_state=np.full(len(states), np.nan), nominal_input=np.full(len(inputs), np.nan),
-        ), episodes=tuple(replace(
-            one, x=np.column_stack([to(one.x[:, j]) for j, to in zip(of_x, in_x, strict=True)]),
-            u=np.column_stack([to(one.u[:, j]) for j, to in zip(of_u, in_u, strict=True)]),
-            linear=tuple(one.linear[j] for j in of_u) if one.linear else ())
-            for one in self.episodes))
-
-    def __str__(self) -> str:
-        """Show the signals, the episodes and the report."""
-        about = self.plant
-        signals = ', '.join(f'{name} [{unit}]' for name, unit in zip(
-            (*about.state_names, *about.input_names), (*about.state_units, *about.input_units),
-            strict=True))
-        lengths = [f'{len(one)} measurements in {one.time[-1]:.6g} s' for one in self.episodes]
-        return '\n  '.join([signals, *lengths, *self.report.lines()])
-
-
-@dataclass(frozen=True)
-class _Signal:
-    """A signal to be read: its name, its unit, or an empty text for that of the column."""
+class SignalColumn:
+    """A signal to be read."""
 
     name: str
-    column: str
-    unit: str
+    column: str  #: its name in the table, without a unit
+    unit: str  #: empty for that of the column
 
-
-def read(source: Source, states: Names, inputs: Names, *, time: str = '', period: float = 0.0,
-         linear: Names = (), tolerance: float = 0.0, name: str = '') -> Record:
-    """
-    Read a record of a plant from tables or bags.
-
-    A signal is the column of its name, with the unit in the header or in the argument::
-
-        record = read('day_1.csv', states='level', inputs='pump')          # level [m], pump [V]
-        record = read(frame, ['temperature [K]'], ['heater = HC12.OUT [percent]'])
-
-    Where both have a unit, values are converted to that of the argument. A signal without a unit
-    has the unit 1. A cell without a number is a missing measurement of that signal alone: NaN in
-    the episodes, so that a signal from the laboratory counts at its own times. An input without a
-    number keeps its last value. A new episode begins at a gap of 3.5 usual periods, where time is
-    set back, and where a state jumps as after a reset; spikes of a single sample are dropped.
-
-    :param source: a .csv, .parquet or .mat file, a bag, a DataFrame, columns by name, or a list
-        of them. Columns of a two-dimensional array y of a .mat file are y_1, y_2 and so on.
-    :param states: measured signals, ``name``, ``name [unit]`` or ``name = column [unit]``.
-    :param inputs: inputs that acted from the time of their row on. In a bag, an input is its
-        commands and its measurements, on the usual topics of its name.
-    :param time: column of the time, by default ``time`` or an index of dates. Dates and durations
-        are recognised; numbers are seconds, or of the unit in brackets: ns, us, ms, s, min, h, d.
-    :param period: time between rows in s, in place of a column.
-    :param linear: inputs that are linear from row to row, such as measurements of a slow actuator.
-    :param tolerance: largest difference in s between the stamps of one sample in a bag.
-    :param name: of the plant; by default that of the first file.
-    :raises BagReadError: for a bag that cannot be read.
-    :raises ValueError: for a table without such a column, with times that cannot be in seconds, or
-        of another kind.
-    """
-    sources = source if isinstance(source, list | tuple) else [source]
-    of_states, of_inputs = _signals(states), _signals(inputs)
-    report, episodes = ImportReport(), []
-    for number, one in enumerate(sources):
-        label = os.fspath(one) if isinstance(one, str | os.PathLike) else f'table {number + 1}'
-        if _is_bag(one):
-            found, own = loop_episodes(
-                [one], [_recorded_state(signal) for signal in of_states],
-                [_recorded_input(signal) for signal in of_inputs],
-                tolerance_ns=round(tolerance * NANOSECONDS))
-            report.add(own)
-            episodes += found
-            continue
-        table = _table(one)
-        of_states, of_inputs = (tuple(_with_unit(table, signal, report) for signal in some)
-                                for some in (of_states, of_inputs))
-        episodes += _Table(label, of_states, of_inputs, _names(linear), report).episodes(
-            table, _seconds(table, time, period))
-    files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
-    if not episodes:
-        raise ValueError('the record holds no usable segment of measurements: '
-                         + '; '.join(report.lines()))
-    plant = PlantDescription(
-        name or Path(files[0] if files else 'plant').stem,
-        tuple(one.name for one in of_states), tuple(one.unit for one in of_states),
-        tuple(one.name for one in of_inputs), tuple(one.unit for one in of_inputs),
-        's', np.full(len(of_states), np.nan), np.full(len(of_inputs), np.nan), None)
-    return Record(plant, tuple(episodes), report, files)
-
-
-def _names(names: Names) -> list[str]:
-    return [names] if isinstance(names, str) else list(names)
-
-
-def _signals(names: Names) -> tuple[_Signal, ...]:
-    found = []
-    for text in _names(names):
+    @classmethod
+    def of(cls, text: str) -> SignalColumn:
+        """Return a signal that is written ``level``, ``level [m]`` or ``level = LT101.PV [m]``."""
         match = _SIGNAL.fullmatch(text)
         if match is None:
             raise ValueError(f'{text!r} names no signal: write level, level [m], or '
                              'level = LT101.PV [m]')
-        found.append(_Signal(match[1] or match[2], match[2], match[3] or ''))
-    return tuple(found)
+        return cls(match[1] or match[2], match[2], match[3] or '')
 
 
-def _conversion(name: str, unit: str, wanted: str) -> Conversion:
+def conversion_of(name: str, unit: str, wanted: str) -> Conversion:
+    """Return the conversion of a signal; ValueError with its name where there is none."""
     try:
         return conversion(unit, wanted)
     except ValueError as error:
@@ -184,32 +61,7 @@ def _conversion(name: str, unit: str, wanted: str) -> Conversion:
                          ) from error
 
 
-def _is_bag(source: Source) -> bool:
-    return isinstance(source, str | os.PathLike) and (
-        Path(source).is_dir() or Path(source).suffix in _BAGS)
-
-
-def _recorded_state(signal: _Signal) -> RecordedState:
-    unit = _unit_in_bag(signal)
-    return RecordedState(signal.name, unit, place(f'/{signal.column}', signal.name, unit))
-
-
-def _recorded_input(signal: _Signal) -> RecordedInput:
-    unit = _unit_in_bag(signal)
-    command = f'/{base_name(signal.column, unit)}_setpoint'
-    return RecordedInput(signal.name, unit, place(command, signal.name, unit),
-                         place(f'/{signal.column}', signal.name, unit))
-
-
-def _unit_in_bag(signal: _Signal) -> str:
-    if not signal.unit:
-        raise ValueError(f"{signal.name} has no unit, and bags have none: write '{signal.name} "
-                         "[m]', or 1 in the brackets for none")
-    check_unit(signal.unit)
-    return signal.unit
-
-
-def _table(source: Source) -> Any:
+def table_of(source: Source) -> Any:
     """Return a source as a DataFrame."""
     try:
         import pandas as pd
@@ -220,13 +72,13 @@ def _table(source: Source) -> Any:
         return source
     if isinstance(source, Mapping):
         return _columns(source)
-    kind = Path(source).suffix.lower()
+    kind = Path(source).suffix.lower() if isinstance(source, str | os.PathLike) else ''
     if kind == '.csv':
         with Path(source).open(encoding='utf-8-sig') as file:
-            head, row = file.readline(), file.readline()
+            head, rows = file.readline(), file.read(_LOOK)
         separator = max(',;\t', key=head.count)
         return pd.read_csv(source, sep=separator, skipinitialspace=True, encoding='utf-8-sig',
-                           decimal=',' if separator == ';' and ',' in row else '.')
+                           decimal=',' if separator == ';' and ',' in rows else '.')
     if kind == '.parquet':
         try:
             return pd.read_parquet(source)
@@ -240,8 +92,9 @@ def _table(source: Source) -> Any:
         except NotImplementedError as error:
             raise ValueError(f'{source} is a MAT file of version 7.3, which SciPy does not read: '
                              "save it with '-v7'") from error
-    raise ValueError(f'{source} is no record: give a .csv, .parquet, .mat or .mcap file, or the '
-                     'folder of a bag')
+    what = f'a {type(source).__name__}' if not isinstance(source, str | os.PathLike) else source
+    raise ValueError(f'{what} is no record: give a .csv, .parquet, .mat or .mcap file, the folder '
+                     'of a bag, a DataFrame of pandas, or columns by name')
 
 
 def _columns(arrays: Mapping[str, Any]) -> Any:
@@ -266,18 +119,22 @@ def _header(table: Any, column: str) -> tuple[Any, str] | None:
     return None
 
 
-def _with_unit(table: Any, signal: _Signal, report: ImportReport) -> _Signal:
+def _headers(table: Any) -> str:
+    return ', '.join(map(repr, map(str, table.columns)))
+
+
+def with_unit(table: Any, signal: SignalColumn, report: ImportReport) -> SignalColumn:
     """Return a signal with its unit, that of its column where the request has none."""
     found = _header(table, signal.column)
     if found is None:
-        raise ValueError(f'the record has no column {signal.column!r}, it has '
-                         f'{", ".join(map(repr, map(str, table.columns)))}: name one of them')
+        raise ValueError(f'the record has no column {signal.column!r}, it has {_headers(table)}: '
+                         'name one of them')
     if not (signal.unit or found[1]):
         report.note(f"{signal.name} has no unit, 1 is taken: write '{signal.name} [m]' for m")
     return replace(signal, unit=signal.unit or found[1] or '1')
 
 
-def _seconds(table: Any, name: str, period: float) -> Array:
+def seconds_of(table: Any, name: str, period: float) -> Array:
     """Return the times (R,) of the rows of a table in s, NaN where there is none."""
     import pandas as pd
     if period < 0.0:
@@ -286,35 +143,42 @@ def _seconds(table: Any, name: str, period: float) -> Array:
         if name:
             raise ValueError(f'both time = {name!r} and period = {period} s are given: give one')
         return period * np.arange(len(table), dtype=np.float64)
-    unit = ''
-    if name or not isinstance(table.index, pd.DatetimeIndex | pd.TimedeltaIndex):
-        (wanted,) = _signals(name) if name else (_Signal('', '', ''),)
-        names = [wanted.column] if name else [
-            one for one in map(str, table.columns) if re.split(r'[\s\[]', one.strip().lower())[0]
-            in _TIME_NAMES]
-        found = _header(table, names[0]) if names else None
-        if found is None and not (name and name == table.index.name):
-            raise ValueError(f'the record has no column {name or "time"!r}, it has '
-                             f'{", ".join(map(repr, map(str, table.columns)))}: name that of the '
-                             'times, or give the period of the rows in s')
-        column = table.index.to_series() if found is None else table[found[0]]
-        unit = wanted.unit or (found[1] if found else '')
-    else:
-        column = table.index.to_series()
+    column, unit = _time_column(table, name)
+    label = str(column.name)
     if not len(column.dropna()):
-        raise ValueError(f'the column {column.name!r} holds no times: name another one')
-    if pd.api.types.is_numeric_dtype(column):
-        return _numbers_in_seconds(column.to_numpy(), unit, str(column.name))
-    if not pd.api.types.is_timedelta64_dtype(column):
+        raise ValueError(f'the column {label!r} holds no times: name another one')
+    kinds = pd.api.types
+    if not (kinds.is_datetime64_any_dtype(column) or kinds.is_timedelta64_dtype(column)):
+        numbers = pd.to_numeric(column, errors='coerce')
+        if 2 * numbers.notna().sum() > len(column):
+            return _numbers_in_seconds(numbers.to_numpy(), unit, label)
         # whole seconds may be written without a fraction, others with one
-        iso = pd.to_datetime(column, format='ISO8601', errors='coerce')
+        dates = pd.to_datetime(column, format='ISO8601', errors='coerce')
         try:
-            column = pd.to_datetime(column) if iso.isna().any() else iso
+            column = pd.to_datetime(column) if (dates.isna() & column.notna()).any() else dates
         except (TypeError, ValueError) as error:
-            raise ValueError(f'the column {column.name!r} holds neither numbers nor dates: name '
-                             'that of the times') from error
+            raise ValueError(f'the column {label!r} holds neither numbers nor dates: name that of '
+                             'the times') from error
+    if not kinds.is_timedelta64_dtype(column):
         column = column - column.dropna().iloc[0]
     return column.dt.total_seconds().to_numpy(dtype=np.float64)
+
+
+def _time_column(table: Any, name: str) -> tuple[Any, str]:
+    """Return the column of the times, or the index, and its unit, empty for none."""
+    import pandas as pd
+    index = table.index.to_series()
+    if not name and isinstance(table.index, pd.DatetimeIndex | pd.TimedeltaIndex):
+        return index, ''
+    wanted = SignalColumn.of(name or next(
+        (one for one in map(str, table.columns)
+         if re.split(r'[\s\[]', one.strip().lower())[0] in _TIME_NAMES), 'time'))
+    if (found := _header(table, wanted.column)) is not None:
+        return table[found[0]], wanted.unit or found[1]
+    if name and wanted.column == table.index.name:
+        return index, wanted.unit
+    raise ValueError(f'the record has no column {wanted.column!r}, it has {_headers(table)}: name '
+                     'that of the times, or give the period of the rows in s')
 
 
 def _numbers_in_seconds(numbers: Any, unit: str, name: str) -> Array:
@@ -333,12 +197,12 @@ def _numbers_in_seconds(numbers: Any, unit: str, name: str) -> Array:
 
 
 @dataclass(frozen=True)
-class _Table:
+class TableImport:
     """The import of one table: its rows in the units of the signals, cut into episodes."""
 
     label: str
-    states: Sequence[_Signal]
-    inputs: Sequence[_Signal]
+    states: Sequence[SignalColumn]
+    inputs: Sequence[SignalColumn]
     linear: Sequence[str]
     report: ImportReport
 
@@ -363,7 +227,7 @@ class _Table:
             yield Episode(seconds[measured] - origin, x[measured], seconds[rows] - origin, u[rows],
                           linear if any(linear) else ()).part(0, len(measured))
 
-    def _values(self, table: Any, signal: _Signal) -> Array:
+    def _values(self, table: Any, signal: SignalColumn) -> Array:
         """Return the numbers (R,) of a column in the unit of the signal, NaN for none."""
         import pandas as pd
         header, unit = _header(table, signal.column) or ('', '')
@@ -375,7 +239,7 @@ class _Table:
         if missing and signal in self.states:
             self.report.note(f'{self.label}: {signal.name} was measured in '
                              f'{len(values) - missing} of {len(values)} rows')
-        return _conversion(signal.name, unit or signal.unit, signal.unit)(values)
+        return conversion_of(signal.name, unit or signal.unit, signal.unit)(values)
 
     def _in_order(self, seconds: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the rows with a time, each time once, and the oldest first."""

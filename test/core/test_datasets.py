@@ -102,6 +102,14 @@ def test_refuses_what_is_no_episode(changes, words):
         Episode(**{name: np.array(value) for name, value in {**good, **changes}.items()})
 
 
+def test_missing_states_are_interpolated():
+    nan = np.nan
+    x = np.array([[nan, 1.0, nan], [2.0, nan, nan], [8.0, 4.0, nan]])
+    episode = Episode(np.array([0.0, 1.0, 4.0]), x, np.zeros(1), np.zeros((1, 1)))
+    assert episode.interpolated().tolist() == [[2.0, 1.0, 0.0], [2.0, 1.75, 0.0], [8.0, 4.0, 0.0]]
+    assert np.isnan(episode.x[0, 0])
+
+
 # Samples.
 
 

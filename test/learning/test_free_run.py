@@ -3,19 +3,22 @@
 
 """Free runs of models on records, against the exact solution of an oscillator."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.learning import compare_classes, evaluate_model, learn_lift, simulate, Thresholds
-from koopman_ros.learning.identification import DriftModel, Identified
+from koopman_ros.learning.identification import DriftModel, Identified, identify
 from koopman_ros.learning.pipeline import _failed_test
 from koopman_ros.model import Box, Coordinates, linearised_model, Provenance
 from koopman_ros.records import read
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]])
 N, PERIOD = 200, 0.1
+RECORDS = Path(__file__).parents[2] / '../shared/records'
 STATES = Coordinates.spanning(('position', 'speed'), ('m', 'm/s'), -2.0 * np.ones(2),
                               2.0 * np.ones(2))
 INPUTS = Coordinates.spanning(('force',), ('N',), -np.ones(1), np.ones(1))
@@ -108,6 +111,17 @@ def test_a_model_is_refused_whose_free_run_is_worse_than_that_of_the_linear_mode
 def test_refuses_a_record_of_other_signals(signals, options, words):
     with pytest.raises(ValueError, match=words):
         simulate(lifted(), read(table(), *signals), **options)
+
+
+@pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')
+def test_a_linear_model_of_two_heaters_follows_them_on_another_day():
+    signals = ['temperature_1 [K]', 'temperature_2 [K]'], ['heater_1', 'heater_2']
+    days, other = (read([RECORDS / f'tclab_{name}.csv' for name in names], *signals)
+                   for names in (('energy', 'mimo'), ('hybrid',)))
+    run = simulate(identify(days.plant, days.episodes, degrees=(1,)), other)
+    assert np.all(run.rmse < [4.0, 6.0])
+    # of a motion by 30 K and 20 K
+    assert run.fit[0] > 50.0
 
 
 def test_an_identification_with_unmeasured_states_is_learned_and_simulated_as_it_is():

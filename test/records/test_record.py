@@ -102,6 +102,17 @@ def test_refuses_times_and_columns_that_are_none(columns, options, words):
         read(frame(**columns), 'level', 'pump', **options)
 
 
+@pytest.mark.parametrize(('second', 'point'), [('s;m;V', '.'), ('0;1;2', ',')])
+def test_a_row_of_units_below_the_header_and_late_decimal_commas_are_understood(
+        tmp_path, second, point):
+    rows = [f'{t:g};{x:g};{u:g}'.replace('.', point) for t, x, u in zip(
+        SECONDS, LEVEL, PUMP, strict=True)][point == ',':]
+    (tmp_path / 'day.csv').write_text('\n'.join(['time;level;pump', second, *rows]))
+    record = read(tmp_path / 'day.csv', 'level [m]', 'pump [V]')
+    assert record.episodes[0].time == pytest.approx(SECONDS)
+    assert record.episodes[0].x[:, 0] == pytest.approx(LEVEL, rel=1e-5)
+
+
 def test_a_signal_may_have_another_column_name_and_unit():
     table = pd.DataFrame({'time': SECONDS, 'TI-101.PV [degC]': 20.0 + LEVEL, 'HC12': PUMP})
     record = read(table, 'temperature = TI-101.PV [K]', 'heater = HC12')
@@ -177,6 +188,19 @@ def test_several_tables_are_episodes_of_one_record(tmp_path):
     record = read([tmp_path / 'a.csv', frame(time=SECONDS)], 'level', 'pump', name='tank')
     assert list(map(len, record.episodes)) == [N, N]
     assert (record.plant.name, record.sources) == ('tank', (str(tmp_path / 'a.csv'),))
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    ((frame(time=SECONDS), [], 'pump'), 'at least one of each'),
+    ((frame(time=SECONDS), 'level', ['pump', 'level']), 'level is named twice'),
+    ((frame(time=SECONDS), ' ', 'pump'), 'names no signal'),
+    ((np.zeros((9, 2)), 'level', 'pump'), 'a ndarray is no record'),
+    ((frame(time=SECONDS), 'level', 'pump', 'valve'), 'linear names valve'),
+])
+def test_refuses_signals_and_sources_that_are_none(arguments, words):
+    source, states, inputs, *linear = arguments
+    with pytest.raises(ValueError, match=words):
+        read(source, states, inputs, linear=linear)
 
 
 @pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
