@@ -35,7 +35,7 @@ def plot_law_check(check: ClosedLoopTest, path: Path) -> Path:
         for i, axes in enumerate(panels):
             draw_loops(axes, check, i)
         legend(figure, panels, min(n, 2))
-        figure.suptitle(f'{check.loops} closed loops over the box:\nthe model is '
+        figure.suptitle(f'{check.loops} closed loops:\nthe model is '
                         f'{"accepted" if check.accepted else "refused"} as a controller')
     return path
 

@@ -262,13 +262,16 @@ class _Problem(Generic[_Model]):
         J = np.concatenate([S for _, S in self._sensitivities(model, K, before, after, q)])
         J /= self.deviation[:, None]
         matrix = normal_equations(self.add_residuals, torch.from_numpy(theta)).matrix.numpy()
-        # starts are always fitted: nothing but the first samples tells them
         C = (np.linalg.pinv(matrix, hermitian=True) / self.count)[:p, :p]
+        # a start is always fitted, within the range: nothing but the first samples tells it
+        prior = np.mean(errors[self._counted[..., 0]] ** 2) * np.eye(q - p)
         found = []
         for m in range(M):
             rows = np.flatnonzero(self._counted[:, m, 0])
             for part in np.array_split(rows, max(1, len(rows) // samples)):
-                S = J[part, m, :, :p].reshape(-1, p)
+                S, start = np.split(J[part, m].reshape(-1, q), [p], axis=1)
+                if self.smooth:
+                    S = S - start @ np.linalg.solve(start.T @ start + prior, start.T @ S)
                 rest = np.eye(len(S)) - S @ C @ S.T
                 found.append(np.linalg.solve(rest, errors[part, m].ravel()).reshape(-1, n_y))
         return np.concatenate(found)
