@@ -121,12 +121,6 @@ def test_names_with_underscores_are_in_the_sources(page: Path) -> None:
             assert set(re.findall(r'\b[a-z]\w*_\w+\b', code)) <= _words(), code
 
 
-@each_page
-def test_make_targets_are_in_the_makefile(page: Path) -> None:
-    targets = set(re.findall(r'^([a-z-]+):.*##', (ROOT / 'Makefile').read_text(), re.MULTILINE))
-    assert set(re.findall(r'(?:`|^)make ([a-z-]+)', page.read_text(), re.MULTILINE)) <= targets
-
-
 def test_pages_and_packages_are_listed_and_short() -> None:
     listed = re.findall(r'^[\w/-]+$', (ROOT / 'docs' / 'index.md').read_text(), re.MULTILINE)
     assert {str(page.relative_to(ROOT / 'docs').with_suffix(''))
@@ -233,6 +227,7 @@ def test_operation_quotes_what_diagnostics_say() -> None:
 
 # Programs of others, which do nothing here.
 FOREIGN = ('sudo', 'git', 'rosdep', 'colcon', 'pip', 'dask')
+ANY = 'any'  # node that has the parameters of all
 # In place of a program: notes name and arguments.
 STUB = f"""#!/bin/sh
 printf '%s\\0' "${{0##*/}}" "$@" >> "$NOTES"; printf '\\n\\0' >> "$NOTES"
@@ -266,7 +261,13 @@ def _commands(page: Path, folder: Path) -> Iterator[list[str]]:
             (folder / found[1]).write_text(block)
         assert kind != 'bash'
     script = ''.join(block for kind, block in blocks if kind == 'sh')
-    spans = [code for code in _inline_code(page) if re.match(r'(make|python|ros2 topic) ', code)]
+    spans = [code for code in _inline_code(page) if re.match(
+        r'(\w+=\S+ )?(make|python|ros2 topic|ros2 run koopman_ros(?! <)) ', code)]
+    # parameters without a node
+    spans += [f'ros2 run koopman_ros {ANY} --ros-args {found[1] or "-p "}{found[2]}'
+              for code in _inline_code(page)
+              if (found := re.fullmatch(r'(-p )?([^ ]+:=[^.<][^<]*)', code))
+              and not re.search(r'name:=|module:|-r ', code)]
     notes = folder / 'notes'
     notes.touch()
     done = subprocess.run(
@@ -327,7 +328,7 @@ def _check_command(command: list[str], folder: Path) -> None:
 
 def _check_node(program: str, arguments: list[str], folder: Path) -> None:
     """Check a node's parameters as ROS reads them."""
-    assert program in node_descriptions.PROGRAMS, program
+    assert program in (*node_descriptions.PROGRAMS, ANY), program
     namespaces = ['']
     if arguments[:1] == ['--loops']:
         assert node_descriptions.PROGRAMS[program].many
@@ -339,7 +340,8 @@ def _check_node(program: str, arguments: list[str], folder: Path) -> None:
         # a plug-in declares its own
         plugins = [one.partition(':')[2] for one in given.get('fallback_order', ()) if ':' in one]
         # a file is for all nodes
-        readers = node_descriptions.PROGRAMS if '--params-file' in arguments else (program,)
+        readers = (node_descriptions.PROGRAMS if program == ANY or '--params-file' in arguments
+                   else (program,))
         for name, value in given.items():
             if name.partition('.')[0] not in ('qos_overrides', *plugins):
                 rows = [row for reader in readers if (row := _row(
