@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from functools import cache
 from importlib.util import find_spec
+import json
 from pathlib import Path
 import re
 import shutil
@@ -105,6 +106,56 @@ def test_tables_of_results_name_their_command(page: Path) -> None:
     for section in sections:
         if '\n|' in section:
             assert re.search(r'`make [a-z]|[Mm]easured once', head + section), section
+
+
+STEP = 'set-point −10 K'
+DISTURBANCES = {  # names in the summary of the rows on the page
+    'UA −20 %; +20 %': ('UA −20 %, in the loop', 'UA +20 %, in the loop'),
+    'C_A −10 %; +10 %': ('C_A −10 %, in the loop', 'C_A +10 %, in the loop'),
+    'T_i −5 K; +5 K': ('T_i −5 K, in the loop', 'T_i +5 K, in the loop'),
+    STEP: (STEP,),
+    '…, UA −20 %; +20 % throughout': (
+        f'{STEP}, UA −20 % all along', f'{STEP}, UA +20 % all along'),
+    '…, coolant lag 5; 10; 20 s': tuple(f'{STEP}, coolant lags by {n} s' for n in (5, 10, 20)),
+    '…, lag, measured': tuple(
+        f'{STEP}, coolant lags by {n} s, measured' for n in (5, 10, 20)),
+    '…, coolant 1; 10 s delay': (f'{STEP}, coolant one sample late', f'{STEP}, coolant 10 s late'),
+    '…, delay, measured': (
+        f'{STEP}, coolant one sample late, measured', f'{STEP}, coolant 10 s late, measured'),
+    '…, coolant stuck at 298 K or above for 15 min; after it': (
+        f'{STEP}, coolant stuck at 298.15 K for 15 min, after its end',),
+    '…, stuck, measured': (
+        f'{STEP}, coolant stuck at 298.15 K for 15 min, after its end, measured',),
+    'sensor +2 K wrong': ('sensor bias +2 K',)}
+
+
+def test_robustness_has_the_figures_of_its_summary() -> None:
+    summary = json.loads((ROOT / 'docs/results/robustness.json').read_text())
+    rows = [[cell.strip('*') for cell in row] for row in _rows('results/robustness.md')]
+
+    margins = [row for row in rows if len(row) == 4 and row[0][:1].isdecimal()]
+    assert len(margins) == 6
+    for label, *cells in margins:
+        at = f'coolant_weight={"0.1" if "," in label else "1"}/bandwidth={label.split(",")[0]}/'
+        for cell, name in zip(cells, ('gain', 'phase_degrees', 'delay_seconds'), strict=True):
+            _agrees(cell, min(place[name] for key, place in summary['margins'].items()
+                              if key.startswith(at) and place[name] is not None))
+
+    disturbances = {row[0]: row[1:] for row in rows if row[0] in DISTURBANCES}
+    for label, names in DISTURBANCES.items():
+        for cell, figure in zip(disturbances[label], (
+                'largest_kelvin', 'seconds_to_0.2_kelvin', 'disturbance_kelvin'), strict=True):
+            shown = cell.partition(' (')[0].split('; ')
+            for one, name in zip(shown * (len(names) // len(shown)), names, strict=True):
+                _agrees(one, summary['disturbances'][name][figure])
+
+    noise = [row for row in rows if len(row) == 5 and row[0][:1].isdecimal()]
+    assert len(noise) == 7
+    for label, *cells in noise:
+        found = summary['noise'][f'bandwidth={label.split()[0]}']
+        for cell, name in zip(cells, ('coolant', 'coolant_change', 'temperature',
+                                      'fouled_to_0.2'), strict=True):
+            _agrees(cell, found[f'{name}_kelvin'])
 
 
 @each_page
@@ -402,6 +453,15 @@ def _services() -> dict[str, str]:
     """Return the types of the services by the table of the interfaces."""
     return {row[0].strip('`'): row[1].replace('/', '/srv/')
             for row in _rows('reference/interfaces.md') if 'std_srvs/' in row[1]}
+
+
+def _agrees(cell: str, value: float | None) -> None:
+    """Compare a figure with a value, to its last digit."""
+    if value is None:
+        assert cell.startswith('never'), cell
+        return
+    number = cell.replace('−', '-')
+    assert float(number) == pytest.approx(value, abs=0.501 * 0.1 ** len(cell.partition('.')[2]))
 
 
 def _anchors(page: Path) -> set[str]:
