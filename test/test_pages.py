@@ -158,6 +158,24 @@ def test_robustness_has_the_figures_of_its_summary() -> None:
             _agrees(cell, found[f'{name}_kelvin'])
 
 
+def test_table_of_other_controllers_has_the_figures_of_its_summary() -> None:
+    plants = json.loads((ROOT / 'docs/results/partly_measured.json').read_text())['plants']
+    head, *rows = [row for row in _rows('results/validation.md') if len(row) == 4
+                   and re.match('controller$|`(mpc|sdre)`$|do-mpc|LQG', row[0])]
+    assert len(rows) == 6
+    for row in rows:
+        for title, cell in zip(head[1:], row[1:], strict=True):
+            plant, unit = re.findall(r'\w+', title)
+            found = plants[plant][f'{row[0]}, lift' if '`' in row[0] else row[0]]
+            if cell == 'the same':
+                cell = rows[-2][row.index(cell)]
+            factor = 1e3 if unit == 'mm' else 1.0
+            for shown, value in zip(re.split('[;,] ', cell), (
+                    found['cost_mean'], found['cost_worst'], factor * found['offset_under_load'],
+                    factor * found['farthest_under_load']), strict=True):
+                _agrees(shown, value)
+
+
 @each_page
 def test_named_files_are_there(page: Path) -> None:
     for code in _inline_code(page):
