@@ -2,17 +2,16 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# All versions are locked, those of the tools that build the package, too (two names, because pip
-# changed its mind about which of them governs that).
+# All versions are locked, also those of the build tools (two names, for older and newer pip).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
-# The predictive law, which the first process would compile otherwise, a quarter of a minute.
+# Compile the predictive law ahead (15 s), otherwise the first process does.
 COMPILE := $(BIN)/python -c 'import koopman_ros.control.mpc.planner'
 # With this variable set, Python caches no byte code, and every process compiles the package again.
 unexport PYTHONDONTWRITEBYTECODE
-# All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
+# Use the packages of .venv, ROS 2 included, not those of a sourced ROS 2.
 unexport PYTHONPATH AMENT_PREFIX_PATH
-# The loop stays on this machine.
+# Keep the loop on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 # How many seeds each experiment is run from: make studies SEEDS=5
@@ -80,9 +79,9 @@ demo-saddle: SEEDS = 5
 demo-saddle: $(VENV)/saddle.stamp  ## learn an unstable reactor from its temperature under PI control, and hold it, SEEDS=5, a quarter of an hour -> out/demo-saddle
 	$(BIN)/python -m studies.saddle_act --seeds $(SEEDS)
 
-# Types are checked beside the tests. Tests across processes wait most of their time, so that there
-# are two workers more than cores; the longest files come first (test/conftest.py). A worker that was
-# ended is not replaced: its successor would be given the same test again, without end.
+# Types are checked in parallel with the tests. Tests with processes mostly wait, so there are two more
+# workers than cores; the longest files come first (test/conftest.py). A killed worker is not replaced:
+# its successor would get the same test again.
 test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on all cores
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sphinx over the pages, README and CONTRIBUTING among them, and the docstrings: `make docs`."""
+"""Sphinx configuration of `make docs`: pages, README, CONTRIBUTING and docstrings."""
 
 from pathlib import Path
 import sys
@@ -15,7 +15,7 @@ copyright = f'2026, {author}'  # noqa: A001
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.autosummary']
 templates_path = ['_templates']
-# the pages are written for GitHub, too: its fence and its anchors
+# fences and anchors as on GitHub, where the pages are also read
 myst_enable_extensions = ['dollarmath']
 myst_fence_as_directive = ['math']
 myst_heading_anchors = 3
@@ -24,7 +24,7 @@ myst_heading_anchors = 3
 autodoc_mock_imports = ['builtin_interfaces', 'cloudpickle', 'diagnostic_msgs', 'distributed',
                         'joblib', 'lifecycle_msgs', 'matplotlib', 'rcl_interfaces', 'rclpy',
                         'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'torch', 'tqdm',
-                        # of the panel
+                        # panel
                         'fastapi', 'nicegui', 'starlette', 'uvicorn']
 autodoc_typehints = 'description'
 autodoc_typehints_format = 'short'
@@ -33,20 +33,20 @@ autodoc_type_aliases = {'Array': 'Array', 'FloatArray': 'Array'}
 html_theme = 'furo'
 html_title = project
 
-# Pages that stand beside the folder, by the names that they have in it.
-BESIDE = {'index': 'README.md', 'contributing': 'CONTRIBUTING.md'}
+# Files outside docs/ that begin a page, by its name.
+OUTSIDE = {'index': 'README.md', 'contributing': 'CONTRIBUTING.md'}
 
 
 def setup(app):
-    """Have pages read from beside the folder."""
-    app.connect('source-read', _read_from_beside)
+    """Include files from outside docs/."""
+    app.connect('source-read', _include_outside)
 
 
-def _read_from_beside(_, page, content):
-    """Put a page from beside the folder before what stands in it, with its links led from here."""
-    source = ROOT / BESIDE.get(page, '')
+def _include_outside(_, page, content):
+    """Put a file from outside docs/ before a page, with its links adjusted."""
+    source = ROOT / OUTSIDE.get(page, '')
     if source.is_file():
         text = source.read_text().replace('](docs/', '](').replace('](LICENSE)', '](../LICENSE)')
-        for name, file in BESIDE.items():
+        for name, file in OUTSIDE.items():
             text = text.replace(f']({file}', f']({name}.md')
         content[0] = text + content[0]

@@ -7,22 +7,40 @@ import ast
 from collections.abc import Iterator
 from dataclasses import fields
 from functools import cache
+from importlib.util import find_spec
+import json
 from pathlib import Path
 import re
+import shutil
+import subprocess
+import textwrap
+from typing import Any
 
 from builtin_interfaces.msg import Time
+from lifecycle_msgs.msg import Transition
 import numpy as np
 import pytest
+import rclpy
+import yaml
 
 from koopman_ros.control.laws import Plan
 from koopman_ros.core.message_fields import KNOWN_TYPES, place
+from koopman_ros.model import load
+from koopman_ros.parameters.signal_topics import DEFAULT_SYSTEM, KINDS
+from koopman_ros.parameters.table import Specification
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
+from koopman_ros.testing import isolated_domain
+from support.nodes import type_support
+
+__all__ = ['type_support']
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/**/*.md'))]
 PARTS = 'koopman_ros|studies|benchmarks|examples|config|docs|test'
+MAKEFILE = (ROOT / 'Makefile').read_text()
+SYSTEMS = sorted(path.stem for path in ROOT.glob('config/plants/*.yaml'))
 each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
@@ -39,8 +57,123 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 @each_page
-def test_empty_texts_in_commands_have_the_quotes_that_ros_needs(page: Path) -> None:
-    assert not re.findall(r"-p [\w./]+:=(?:''|\"\"|(?=\s))", page.read_text())
+def test_commands_are_right_as_they_stand(page: Path, tmp_path: Path) -> None:
+    _check_commands(page, tmp_path)
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('make dmeo', 'dmeo'), ('make demo PLNAT=pendulum', 'PLNAT'),
+    ('ros2 run koopman_ros contoller', 'contoller'),
+    ('ros2 run koopman_ros controller --ros-args -p coolant.weight:=1.0', 'coolant.weight'),
+    ("ros2 run koopman_ros controller --ros-args -p system:=''", 'system:='),
+    ('ros2 run koopman_ros plant --ros-args -p speed:=fast', 'speed'),
+    ('ros2 run koopman_ros plant --ros-args --params-file none.yaml', 'none.yaml'),
+    ('ros2 param set /controller coolant_temperature.weight -1.0', 'must be'),
+    ("ros2 topic pub /setpoint sensor_msgs/msg/Temperature '{temprature: 45.0}'", 'temprature'),
+    ("ros2 topic pub /setpiont sensor_msgs/msg/Temperature '{temperature: 45.0}'", 'setpiont'),
+    ('ros2 topic echo /temprature', 'temprature'),
+    ("ros2 service call /trainer/record std_srvs/srv/Trigger '{data: true}'", 'record'),
+    ('ros2 launch koopman_ros loop.launch.py sistem:=two_tanks', 'sistem'),
+    ('.venv/bin/python examples/none.py', 'none.py'), ('python -m koopman_ros.none', 'none'),
+    ('rso2 topic list', 'rso2')])
+def test_wrong_commands_are_found(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / 'page.md').write_text(f'```sh\n{text}\n```\n')
+    with pytest.raises(Exception, match=words):
+        _check_commands(tmp_path / 'page.md', tmp_path)
+
+
+@each_page
+def test_python_on_pages_compiles_and_finds_what_it_imports(page: Path) -> None:
+    for block in re.findall(r'^```python\n(.*?)^```', page.read_text(), re.DOTALL | re.MULTILINE):
+        for node in ast.walk(ast.parse(textwrap.dedent(block))):
+            if isinstance(node, ast.ImportFrom):
+                exec(ast.unparse(node), {})
+
+
+def test_model_of_signals_alone_is_saved_as_the_page_has_it(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (block,) = re.findall(r'```python\n(.*?)```',
+                          (ROOT / 'docs/explanation/control_levels.md').read_text(), re.DOTALL)
+    exec(block, {})
+    assert load('signals.safetensors').states.names == ('temperature',)
+
+
+@pytest.mark.parametrize('page', sorted(ROOT.glob('docs/results/*.md')),
+                         ids=lambda page: page.stem)
+def test_tables_of_results_name_their_command(page: Path) -> None:
+    head, *sections = re.split('^## ', page.read_text(), flags=re.MULTILINE)
+    for section in sections:
+        if '\n|' in section:
+            assert re.search(r'`make [a-z]|[Mm]easured once', head + section), section
+
+
+STEP = 'set-point −10 K'
+DISTURBANCES = {  # names in the summary of the rows on the page
+    'UA −20 %; +20 %': ('UA −20 %, in the loop', 'UA +20 %, in the loop'),
+    'C_A −10 %; +10 %': ('C_A −10 %, in the loop', 'C_A +10 %, in the loop'),
+    'T_i −5 K; +5 K': ('T_i −5 K, in the loop', 'T_i +5 K, in the loop'),
+    STEP: (STEP,),
+    '…, UA −20 %; +20 % throughout': (
+        f'{STEP}, UA −20 % all along', f'{STEP}, UA +20 % all along'),
+    '…, coolant lag 5; 10; 20 s': tuple(f'{STEP}, coolant lags by {n} s' for n in (5, 10, 20)),
+    '…, lag, measured': tuple(
+        f'{STEP}, coolant lags by {n} s, measured' for n in (5, 10, 20)),
+    '…, coolant 1; 10 s delay': (f'{STEP}, coolant one sample late', f'{STEP}, coolant 10 s late'),
+    '…, delay, measured': (
+        f'{STEP}, coolant one sample late, measured', f'{STEP}, coolant 10 s late, measured'),
+    '…, coolant stuck at 298 K or above for 15 min; after it': (
+        f'{STEP}, coolant stuck at 298.15 K for 15 min, after its end',),
+    '…, stuck, measured': (
+        f'{STEP}, coolant stuck at 298.15 K for 15 min, after its end, measured',),
+    'sensor +2 K wrong': ('sensor bias +2 K',)}
+
+
+def test_robustness_has_the_figures_of_its_summary() -> None:
+    summary = json.loads((ROOT / 'docs/results/robustness.json').read_text())
+    rows = [[cell.strip('*') for cell in row] for row in _rows('results/robustness.md')]
+
+    margins = [row for row in rows if len(row) == 4 and row[0][:1].isdecimal()]
+    assert len(margins) == 6
+    for label, *cells in margins:
+        at = f'coolant_weight={"0.1" if "," in label else "1"}/bandwidth={label.split(",")[0]}/'
+        for cell, name in zip(cells, ('gain', 'phase_degrees', 'delay_seconds'), strict=True):
+            _agrees(cell, min(place[name] for key, place in summary['margins'].items()
+                              if key.startswith(at) and place[name] is not None))
+
+    disturbances = {row[0]: row[1:] for row in rows if row[0] in DISTURBANCES}
+    for label, names in DISTURBANCES.items():
+        for cell, figure in zip(disturbances[label], (
+                'largest_kelvin', 'seconds_to_0.2_kelvin', 'disturbance_kelvin'), strict=True):
+            shown = cell.partition(' (')[0].split('; ')
+            for one, name in zip(shown * (len(names) // len(shown)), names, strict=True):
+                _agrees(one, summary['disturbances'][name][figure])
+
+    noise = [row for row in rows if len(row) == 5 and row[0][:1].isdecimal()]
+    assert len(noise) == 7
+    for label, *cells in noise:
+        found = summary['noise'][f'bandwidth={label.split()[0]}']
+        for cell, name in zip(cells, ('coolant', 'coolant_change', 'temperature',
+                                      'fouled_to_0.2'), strict=True):
+            _agrees(cell, found[f'{name}_kelvin'])
+
+
+def test_table_of_other_controllers_has_the_figures_of_its_summary() -> None:
+    plants = json.loads((ROOT / 'docs/results/partly_measured.json').read_text())['plants']
+    head, *rows = [row for row in _rows('results/validation.md') if len(row) == 4
+                   and re.match('controller$|`(mpc|sdre)`$|do-mpc|LQG', row[0])]
+    assert len(rows) == 6
+    for row in rows:
+        for title, cell in zip(head[1:], row[1:], strict=True):
+            plant, unit = re.findall(r'\w+', title)
+            found = plants[plant][f'{row[0]}, lift' if '`' in row[0] else row[0]]
+            if cell == 'the same':
+                cell = rows[-2][row.index(cell)]
+            factor = 1e3 if unit == 'mm' else 1.0
+            for shown, value in zip(re.split('[;,] ', cell), (
+                    found['cost_mean'], found['cost_worst'], factor * found['offset_under_load'],
+                    factor * found['farthest_under_load']), strict=True):
+                _agrees(shown, value)
 
 
 @each_page
@@ -57,13 +190,7 @@ def test_names_with_underscores_are_in_the_sources(page: Path) -> None:
             assert set(re.findall(r'\b[a-z]\w*_\w+\b', code)) <= _words(), code
 
 
-@each_page
-def test_make_targets_are_in_the_makefile(page: Path) -> None:
-    targets = set(re.findall(r'^([a-z-]+):.*##', (ROOT / 'Makefile').read_text(), re.MULTILINE))
-    assert set(re.findall(r'(?:`|^)make ([a-z-]+)', page.read_text(), re.MULTILINE)) <= targets
-
-
-def test_pages_and_packages_are_listed_and_the_readme_is_short() -> None:
+def test_pages_and_packages_are_listed_and_short() -> None:
     listed = re.findall(r'^[\w/-]+$', (ROOT / 'docs' / 'index.md').read_text(), re.MULTILINE)
     assert {str(page.relative_to(ROOT / 'docs').with_suffix(''))
             for page in ROOT.glob('docs/**/*.md')
@@ -71,7 +198,10 @@ def test_pages_and_packages_are_listed_and_the_readme_is_short() -> None:
     text = (ROOT / 'CONTRIBUTING.md').read_text()
     for package in ROOT.glob('koopman_ros/*/__init__.py'):
         assert f' koopman_ros/{package.parent.name}/ ' in text
-    assert len((ROOT / 'README.md').read_text().splitlines()) <= 130
+    readme = (ROOT / 'README.md').read_text()
+    assert len(readme.splitlines()) <= 120
+    assert len(readme.split()) <= 700
+    assert sum(len(page.read_text().split()) for page in ROOT.glob('docs/**/*.md')) < 20_000
 
 
 def test_continuous_integration_runs_what_the_pages_say() -> None:
@@ -156,12 +286,200 @@ def test_interfaces_list_what_there_is_of_each_signal() -> None:
 
 
 def test_operation_quotes_what_diagnostics_say() -> None:
-    quotes = [quote for row in _rows('reference/faults.md') if len(row) == 5
+    quotes = [quote for row in _rows('reference/faults.md') if len(row) == 4
               for quote in re.findall('`(.+?)`', row[2])]
     assert len(quotes) > 15
     for quote in quotes:
         for part in quote.split('…'):
             assert any(part.strip(' ;:') in text for text in _texts()), quote
+
+
+# Programs of others, which do nothing here.
+FOREIGN = ('sudo', 'git', 'rosdep', 'colcon', 'pip', 'dask')
+ANY = 'any'  # node that has the parameters of all
+# In place of a program: notes name and arguments.
+STUB = f"""#!/bin/sh
+printf '%s\\0' "${{0##*/}}" "$@" >> "$NOTES"; printf '\\n\\0' >> "$NOTES"
+case "${{0##*/}} $1" in
+  'ros2 pkg') echo {ROOT};;
+  'colcon build') mkdir -p install && : > install/setup.bash;;
+esac
+"""
+
+
+def _check_commands(page: Path, folder: Path) -> None:
+    with isolated_domain():
+        for command in _commands(page, folder):
+            _check_command(command, folder)
+
+
+def _commands(page: Path, folder: Path) -> Iterator[list[str]]:
+    """Have a shell run the commands of a page in a folder; yield programs with arguments."""
+    programs = folder / '.venv' / 'bin'
+    programs.mkdir(parents=True)
+    for name in (*FOREIGN, 'make', 'ros2', 'koopman_ros', 'python', 'python3'):
+        (programs / name).write_text(STUB)
+        (programs / name).chmod(0o755)
+    for path in ROOT.glob('examples/oven/*.yaml'):
+        shutil.copy(path, folder)
+    (folder / 'loops.txt').write_text('line_1/reactor_1\nline_1/reactor_2\n')
+    blocks = re.findall(r'^```(\w+)\n(.*?)^```', page.read_text(), re.DOTALL | re.MULTILINE)
+    for kind, block in blocks:
+        # a block that begins with the name of a file is that file
+        if found := re.match(r'# ([\w]+\.(?:py|yaml))\b', block):
+            (folder / found[1]).write_text(block)
+        assert kind != 'bash'
+    script = ''.join(block for kind, block in blocks if kind == 'sh')
+    spans = [code for code in _inline_code(page) if re.match(
+        r'(\w+=\S+ )?(make|python|ros2 topic|ros2 run koopman_ros(?! <)) ', code)]
+    # parameters without a node
+    spans += [f'ros2 run koopman_ros {ANY} --ros-args {found[1] or "-p "}{found[2]}'
+              for code in _inline_code(page)
+              if (found := re.fullmatch(r'(-p )?([^ ]+:=[^.<][^<]*)', code))
+              and not re.search(r'name:=|module:|-r ', code)]
+    notes = folder / 'notes'
+    notes.touch()
+    done = subprocess.run(
+        ['bash', '-eu', '-c', '\n'.join((script, *spans))], cwd=folder, text=True,
+        capture_output=True, check=False, timeout=60, env={
+            'PATH': f'{programs}:/usr/bin:/bin', 'NOTES': str(notes)})
+    assert done.returncode == 0, done.stderr
+    for command in notes.read_text().split('\n\0')[:-1]:
+        yield command.split('\0')[:-1]
+
+
+def _check_command(command: list[str], folder: Path) -> None:
+    """Check a command against what the sources hold."""
+    match command:
+        case ['make', *words]:
+            for word in words:
+                name, variable, _ = word.partition('=')
+                assert (f'$({name}' in MAKEFILE if variable
+                        else re.search(rf'^{name}:', MAKEFILE, re.MULTILINE)), word
+        case ['ros2', 'run', 'koopman_ros', node, *arguments]:
+            _check_node(node, arguments, folder)
+        case (['ros2', 'param', 'set', node, name, value]
+              | ['koopman_ros', 'param', node, name, value]):
+            assert (row := _row(node.removeprefix('/'), DEFAULT_SYSTEM, name)), name
+            assert not _wrong(row, yaml.safe_load(value)), name
+        case ['ros2', 'topic', 'pub', *_, topic, kind, message]:
+            assert _topics()[topic.removeprefix('/')] == kind
+            topics.message_class(kind)(**yaml.safe_load(message))
+        case ['koopman_ros', 'pub', topic, message]:
+            topics.message_class(_topics()[topic.removeprefix('/')])(**yaml.safe_load(message))
+        case ['ros2', 'topic', 'echo', topic] | ['koopman_ros', 'echo', topic, '--count', _]:
+            assert topic.removeprefix('/') in _topics(), topic
+        case ['ros2', 'service', 'call', service, kind, *request]:
+            assert _services()[service] == kind, service
+            topics.message_class(kind).Request(**yaml.safe_load(*request or ['{}']))
+        case ['koopman_ros', 'call', service, request]:
+            topics.message_class(_services()[service]).Request(**yaml.safe_load(request))
+        case ['ros2', 'lifecycle', 'set', node, transition]:
+            assert '~/change_state' in node_descriptions.PROGRAMS[node.removeprefix('/')].serves
+            assert hasattr(Transition, f'TRANSITION_{transition.upper()}')
+        case ['ros2', 'launch', 'koopman_ros', file, *arguments]:
+            text = (ROOT / 'examples' / file).read_text()
+            for argument in arguments:
+                assert f"'{argument.partition(':=')[0]}'" in text, argument
+        case ['ros2', 'run', 'plotjuggler', 'plotjuggler', '-l', path]:
+            assert Path(path).is_file()
+        case ['python' | 'python3', '-m', module, *_]:
+            assert find_spec(module), module
+        case ['python', '-c', code]:
+            compile(code, 'page', 'exec')
+        case ['python', script, *_]:
+            assert (ROOT / script).is_file() or (folder / script).is_file(), script
+        case _:
+            assert (command[0] in FOREIGN
+                    or command[:2] in (['ros2', word] for word in ('pkg', 'bag', 'security'))
+                    or command == ['ros2', 'topic', 'info', '-v']), command
+
+
+def _check_node(program: str, arguments: list[str], folder: Path) -> None:
+    """Check a node's parameters as ROS reads them."""
+    assert program in (*node_descriptions.PROGRAMS, ANY), program
+    namespaces = ['']
+    if arguments[:1] == ['--loops']:
+        assert node_descriptions.PROGRAMS[program].many
+        namespaces = (folder / arguments[1]).read_text().split()
+        arguments = arguments[2:]
+    arguments = [str(folder / one) if one.endswith('.yaml') else one for one in arguments]
+    for namespace in namespaces:
+        given = _as_ros_reads(program, namespace, arguments)
+        # a plug-in declares its own
+        plugins = [one.partition(':')[2] for one in given.get('fallback_order', ()) if ':' in one]
+        # a file is for all nodes
+        readers = (node_descriptions.PROGRAMS if program == ANY or '--params-file' in arguments
+                   else (program,))
+        for name, value in given.items():
+            if name.partition('.')[0] not in ('qos_overrides', *plugins):
+                rows = [row for reader in readers if (row := _row(
+                    reader, given.get('system', DEFAULT_SYSTEM), name))]
+                assert rows, name
+                assert not _wrong(rows[0], value), name
+
+
+def _as_ros_reads(program: str, namespace: str, arguments: list[str]) -> dict[str, Any]:
+    """Return the values that rcl gives to a node of a name."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        node = rclpy.create_node(
+            program, namespace=namespace or None, context=context, cli_args=arguments,
+            start_parameter_services=False, enable_rosout=False,
+            automatically_declare_parameters_from_overrides=True)
+        values = {name: parameter.value for name, parameter in node.get_parameters_by_prefix(
+            '').items() if name not in ('use_sim_time', 'start_type_description_service')}
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
+    return values
+
+
+def _row(program: str, system: str, name: str) -> Specification | None:
+    """Return the row of a parameter; of a plant that is not shipped, that of another signal."""
+    if system in SYSTEMS:
+        return _rows_of(program, system).get(name)
+    rows = _rows_of(program, DEFAULT_SYSTEM)
+    _, dot, last = name.partition('.')
+    return rows.get(name) or next((row for other, row in rows.items()
+                                   if dot and other.partition('.')[2] == last), None)
+
+
+@cache
+def _rows_of(program: str, system: str) -> dict[str, Specification]:
+    return node_descriptions.tables(system)[program].rows
+
+
+def _wrong(row: Specification, value: Any) -> str:
+    """Return what is wrong with a value, as a node does."""
+    kind = type(row.default)
+    return ('' if isinstance(value, (list, tuple) if kind is tuple else kind)
+            else row.type_error(value)) or row.check(value)
+
+
+@cache
+def _topics() -> dict[str, str]:
+    """Return the types of the topics of all shipped plants."""
+    places = (place for system in SYSTEMS if (wiring := preset_wiring(system))
+              for kind in KINDS for place in getattr(wiring, kind).values())
+    return {place.topic: place.type for place in places}
+
+
+@cache
+def _services() -> dict[str, str]:
+    """Return the types of the services by the table of the interfaces."""
+    return {row[0].strip('`'): row[1].replace('/', '/srv/')
+            for row in _rows('reference/interfaces.md') if 'std_srvs/' in row[1]}
+
+
+def _agrees(cell: str, value: float | None) -> None:
+    """Compare a figure with a value, to its last digit."""
+    if value is None:
+        assert cell.startswith('never'), cell
+        return
+    number = cell.replace('−', '-')
+    assert float(number) == pytest.approx(value, abs=0.501 * 0.1 ** len(cell.partition('.')[2]))
 
 
 def _anchors(page: Path) -> set[str]:

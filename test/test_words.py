@@ -9,7 +9,7 @@ import re
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted((ROOT / 'docs').glob('**/*.md'))
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/**/*.md'))]
 ODD = '|'.join((
     'anew', 'afresh', 'asked for', 'beside', 'besides', 'goes by', 'go by', 'is told', 'are told',
     'tells? of', r'is said', 'are said', 'whoever', 'whose turn', 'somebody', 'nobody',

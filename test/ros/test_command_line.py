@@ -5,6 +5,9 @@
 
 from collections.abc import Iterator
 import os
+from pathlib import Path
+import re
+import shlex
 import subprocess
 import sys
 
@@ -21,7 +24,7 @@ PATIENCE = 60.0  # s, on a busy machine
 def harness(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
     with Harness(tmp_path_factory.mktemp('command_line')) as harness:
         harness.start('controller')
-        harness.start('plant')
+        harness.start('plant', {'speed': 10.0})
         yield harness
 
 
@@ -82,3 +85,12 @@ def test_what_cannot_be_done_has_a_reason(harness: Harness, words: tuple[str, ..
 
 def test_the_version_is_shown(harness: Harness) -> None:
     assert run(harness, '--version') == (0, f'{__version__}\n')
+
+
+def test_commands_of_the_page_succeed(harness: Harness) -> None:
+    page = Path(__file__).parents[2] / 'docs' / 'how-to' / 'operate.md'
+    commands = re.findall(r'^\.venv/bin/koopman_ros (.*)$', page.read_text(), re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands:
+        code, shown = run(harness, *shlex.split(command), '--timeout', '60')
+        assert code == 0, shown
