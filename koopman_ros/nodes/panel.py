@@ -347,7 +347,9 @@ class PanelNode(LoopNode):
             reply(_not_running(CONTROLLER))
             return
         accepted = 'accepted'
-        if not setpoint and (limited := self.view.limited(name, value)) != value:
+        if setpoint and self.snapshot.mode == 'manual':
+            accepted = 'accepted: the controller follows it only in automatic mode'
+        elif not setpoint and (limited := self.view.limited(name, value)) != value:
             accepted = f'limited to {limited:.6g} {printed(read)}'
         own = float(conversion(read, unit)(value))
         answered = self._repeated.send(name, place, unit, own)

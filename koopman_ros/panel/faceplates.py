@@ -77,7 +77,7 @@ class InputFaceplate(Faceplate):
 
     command: float
     applied: float  #: measured behind the actuator
-    manual: float  #: last accepted manual command
+    manual: float  #: requested in manual mode, within the limits, or the command
     disturbance: float  #: as a change of the input, in the signal's own unit
     own_unit: str  #: of the disturbance
 
@@ -132,8 +132,8 @@ class SignalValues:
             abnormal = 'at its lower limit'
         return InputFaceplate(
             self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
-            self.active, self.plan, command, applied, self.get('manual'), self.get('disturbance'),
-            self.unit)
+            self.active, self.plan, command, applied, self.get('manual', command),
+            self.get('disturbance'), self.unit)
 
 
 def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:

@@ -140,6 +140,20 @@ class PageLayout:
         for update in self._updates:
             update(now)
 
+    def card(self, title: str, name: str, role: str) -> Element:
+        """Return a card that is grey, with controls that do nothing, while a node is silent."""
+        found = card(title, name)
+
+        def show(now: Snapshot) -> None:
+            silent = any(one.role == role for one in now.silences)
+            if silent and 'inert' not in found.props:
+                found.props('inert')
+            elif not silent and 'inert' in found.props:
+                found.props(remove='inert')
+
+        self.follow(show)
+        return found
+
     # Actions.
 
     async def act(self, what: str, name: str = '', value: Any = None, old: Any = None) -> Answer:

@@ -12,7 +12,7 @@ import math
 from nicegui import ui
 
 from koopman_ros.core.units import printed
-from koopman_ros.panel.layout import AnswerLine, box, card, label, PageLayout, show_if
+from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
 from koopman_ros.panel.model_card import status_card
 from koopman_ros.panel.report_cards import comparison_card, report_card
 from koopman_ros.panel.requests import Answer
@@ -91,7 +91,7 @@ class _Task:
 
 
 def _model(page: PageLayout) -> None:
-    with card('active model', 'Model'):
+    with page.card('active model', 'Model', CONTROLLER):
         name = label('div', '', 'value')
         task, origin = _Task(columns=True), _Figures(columns=True)
         trained = label('div', '', 'quiet')
@@ -152,7 +152,7 @@ def _buttons(page: PageLayout, actions: Mapping[str, Callable[[], Awaitable[Answ
 
 
 def _recording(page: PageLayout) -> None:
-    with card('recording', 'Recording'):
+    with page.card('recording', 'Recording', TRAINER):
         task = _Task()
         record, stop = _buttons(page, {'Record': partial(page.act, 'record', TRAINER, True),
                                        'Stop': partial(page.act, 'record', TRAINER, False)})
@@ -168,7 +168,7 @@ def _recording(page: PageLayout) -> None:
 
 
 def _experiment(page: PageLayout) -> None:
-    with card('experiment', 'Experiment'):
+    with page.card('experiment', 'Experiment', TRAINER):
         task = _Task()
         limits = label('div', '', 'lines quiet')
 
@@ -214,7 +214,7 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
 
 
 def _training(page: PageLayout) -> None:
-    with card('training', 'Training'):
+    with page.card('training', 'Training', TRAINER):
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')

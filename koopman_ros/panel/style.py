@@ -28,6 +28,7 @@ a { color: var(--text); }
 .loose { align-items: start; }
 .card { background: var(--card); border: 1px solid var(--line); padding: 12px 14px;
   display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: anywhere; }
+.card[inert] > :not(h2) { opacity: .45; }
 .page h2 { font-size: 1.05rem; line-height: 1.3; margin: 0; font-weight: 600; }
 .row1 { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: baseline; }
 .between { justify-content: space-between; }

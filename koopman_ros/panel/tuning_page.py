@@ -34,9 +34,8 @@ def tuning_page(page: PageLayout) -> None:
 
 
 def _node(page: PageLayout, node: str) -> None:
-    with attribute(box('card', tag='section'), 'aria-label', f'Parameters of the {node}'):
-        with box('row1 between'):
-            label('h2', node)
+    with page.card(node, f'Parameters of the {node}', node):
+        with box('row1'):
             ui.button('Export YAML', on_click=lambda: ui.download.content(
                 exported(node, page.source.snapshot.parameters.get(node, {})),
                 f'{node}.yaml')).props('outline')
@@ -92,7 +91,9 @@ class _Row:
             with box(''):
                 with box('ask'):
                     self._field = page.control(attribute(
-                        ui.input().props('outlined dense'), 'aria-label', title))
+                        (ui.select(list(parameter.choices)) if parameter.choices and
+                         isinstance(parameter.value, str) else ui.input()).props(
+                             'outlined dense'), 'aria-label', title))
                     attribute(page.button('Set', self._submit), 'aria-label',
                               f'Set {parameter.name}')
                 self._answer = AnswerLine()

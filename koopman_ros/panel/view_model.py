@@ -181,10 +181,12 @@ class LoopViewModel:
                                            f'{printed(own.read)}')
             case 'manual_command' if fields['accepted']:
                 for own, value in zip(self._inputs.values(), fields['value'], strict=True):
-                    own.values['manual'] = own.shown(value)
+                    own.values['manual'] = self.limited(own.name, own.shown(value))
                 self._mark('manual', 'manual command')
             case 'mode':
                 self._mode = str(fields['mode'])
+                for own in self._inputs.values():
+                    own.values.pop('manual', None)
                 self._mark('mode', f'{self._mode} mode')
             case 'model':
                 self._mark('model', f'model {fields["model"]["name"]}')

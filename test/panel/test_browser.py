@@ -240,7 +240,6 @@ def test_the_reason_of_a_refusal_is_next_to_its_control(site: Site) -> None:
         before = float(own.input_value())
         expect(ask_setpoint(page, '80')).to_have_text(
             re.compile(r'✖ refused: outside 31\.85 to 53\.85 degC'))
-        own.press('Escape')
         expect(own).to_have_value(re.compile(rf'^{before:g}(\.0)?$'))
 
 
@@ -284,6 +283,12 @@ def test_manual_mode_is_confirmed_and_left_again(site: Site) -> None:
         own = face(page, 'coolant_temperature')
         expect(own.locator('.answer')).to_have_text('accepted')
         expect(own.locator('.big')).to_have_text('21.5')
+        by_hand.fill('45')
+        by_hand.press('Enter')
+        expect(own.locator('.answer')).to_have_text('limited to 32 °C')
+        expect(by_hand).to_have_value('32.0')
+        expect(own.get_by_role('slider')).to_have_attribute('aria-valuenow', '32')
+        expect(ask_setpoint(page, '47')).to_contain_text('only in automatic mode')
         page.get_by_role('button', name='Switch to automatic mode').click()
         expect(page.locator('header')).to_contain_text('AUTOMATIC')
 
@@ -398,6 +403,15 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
             given.fill(text)
             given.press('Enter')
             expect(row.locator('.answer')).to_have_text(said)
+        # parameters with a few possible values are lists
+        page.get_by_label('Parameters of the trainer').get_by_text('general', exact=True).click()
+        row = page.locator('[data-parameter="experiment_signal"]')
+        for choice in ('manual', 'setpoint'):
+            row.get_by_role('combobox').click()
+            page.get_by_role('option', name=choice, exact=True).click()
+            press(row, 'Set experiment_signal')
+            expect(row.locator('.answer')).to_have_text('set')
+            expect(row.get_by_role('combobox')).to_have_value(choice)
 
         def exported() -> str:
             with page.expect_download() as download:
@@ -430,6 +444,7 @@ def test_a_viewer_on_a_phone_sees_what_the_operator_does_and_cannot_act(site: Si
         ready(desk)
         expect(ask_setpoint(desk, '48')).to_have_text('accepted')
         expect(face(page, 'temperature').locator('.value')).to_have_text('48.0 °C')
+        expect(asked(page)).to_have_value('48.0')
         for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
             if path != '/':
                 page.goto(f'{site.url}{path}')
@@ -458,9 +473,15 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
         expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
         expect(ask_setpoint(page, '45')).to_have_text(
             '✖ refused: the controller is not running: start it')
+        for path, name in (('/', 'Controller'), ('/model', 'Model'),
+                           ('/tuning', 'Parameters of the controller')):
+            page.goto(f'{site.url}{path}')
+            expect(card(page, name)).to_have_attribute('inert', '')
+        page.goto(site.url)
         site.controller = site.ros.start('controller')
         expect(banner).to_be_hidden()
         expect(page.locator('header')).to_contain_text('AUTOMATIC')
+        expect(card(page, 'Controller')).not_to_have_attribute('inert', '')
 
 
 def test_a_page_finds_its_panel_again(site: Site) -> None:
