@@ -27,6 +27,7 @@ from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
     ERROR,
+    EXPERIMENT,
     LOST,
     OK,
     PLANT,
@@ -356,12 +357,47 @@ def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
-        ('controller: actuators', Priority.MEDIUM), (REQUESTS, Priority.LOW)]
-    status(own, REQUESTS, OK, 'in order', {}, NOW + 3.0)
-    own.advance(NOW + 9.0)
-    assert [alarm.key for alarm in own.snapshot(NOW + 9.0).standing
-            if alarm.state is not AlarmState.RETURNED and 'silence' not in alarm.key] == [
-        'controller: actuators']
+        ('controller: actuators', Priority.MEDIUM)]
+
+
+WAITING = {'measurements': '0'}
+LATE = {'measurements': '9', 'since last measurement [s]': '40'}
+
+
+@pytest.mark.parametrize(('task', 'level', 'message', 'values', 'plant', 'expected'), [
+    # the nodes of a loop start one after the other; later it is a fault
+    (CONTROL, WARN, 'waiting', WAITING, None, {5.0: '', 40.0: 'silence of plant: waiting'}),
+    (CONTROL, WARN, 'waiting', WAITING, 99.0, {5.0: '', 40.0: f'{CONTROL}: {CONTROL}: waiting'}),
+    ('', OK, '', {}, None, {5.0: '', 40.0: 'silence of controller: no message from the controller'
+                                           '; silence of plant: no measurement'}),
+    # the silence of a plant is one alarm, in the words of the controller
+    (CONTROL, ERROR, 'held', LATE, 2.0, {20.0: 'silence of plant: held'}),
+    (CONTROL, OK, 'automatic', LATE, 2.0, {20.0: 'silence of plant: no measurement'}),
+    # the operator who made a request reads the answer
+    (REQUESTS, WARN, 'request refused: outside', {}, 99.0, {5.0: '', 40.0: ''}),
+    (EXPERIMENT, WARN, 'refused: another node commands', {}, 99.0, {5.0: '', 40.0: ''}),
+    # what has ended stands until it is acknowledged, and no longer
+    (EXPERIMENT, ERROR, 'aborted: too hot', {}, 99.0, {
+        5.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot',
+        40.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot (returned)'}),
+    ('other: io', ERROR, '', {}, 99.0, {5.0: 'other: io: other: io: no reason was given'})])
+def test_a_condition_has_one_alarm(
+        task: str, level: int, message: str, values: Mapping[str, str], plant: float | None,
+        expected: Mapping[float, str]) -> None:
+    own = view()
+    for step in range(1, 401):
+        seconds = 0.1 * step
+        if plant is not None and seconds < plant:
+            measure(own, 50.0, seconds)
+        if task:
+            answered(own, wall=NOW + seconds)
+            status(own, task, level, message, values, NOW + seconds)
+        own.advance(NOW + seconds)
+        for moment in (moment for moment in expected if math.isclose(moment, seconds)):
+            assert '; '.join(
+                f'{alarm.key}: {alarm.text}' + (
+                    ' (returned)' if alarm.state is AlarmState.RETURNED else '')
+                for alarm in own.snapshot(NOW).standing) == expected[moment]
 
 
 def test_many_short_errors_are_an_alarm() -> None:
