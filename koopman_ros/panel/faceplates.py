@@ -24,6 +24,16 @@ def number(value: float, decimals: int) -> str:
     return f'{value:.{decimals}f}' if math.isfinite(value) else '–'
 
 
+def span_text(bounds: Range, decimals: int) -> str:
+    """Write a range; each number of these decimals within those written is in the range."""
+    # the slack is that of converted units
+    scale, slack = 10.0 ** decimals, 1e-6
+    low, high = (rounded(end * scale + side * slack) / scale if math.isfinite(end) else end
+                 for rounded, side, end in zip((math.ceil, math.floor), (-1, 1), bounds,
+                                               strict=True))
+    return f'{number(low, decimals)} to {number(high, decimals)}'
+
+
 def pen(kind: str, name: str) -> str:
     """Return the name of the pen of a signal."""
     suffix = {'active_setpoints': ' set-point', 'predicted': ' predicted', 'planned': ' planned',
@@ -53,6 +63,10 @@ class Faceplate:
     def text(self, value: float) -> str:
         """Write a value without the unit."""
         return number(value, self.decimals)
+
+    def span_text(self, bounds: Range) -> str:
+        """Write a range without the unit."""
+        return span_text(bounds, self.decimals)
 
     def share(self, value: float) -> float:
         """Return the place of a value on the bar, from 0 to 1."""

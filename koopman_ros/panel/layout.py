@@ -9,8 +9,9 @@ import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+import re
 import time
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 from nicegui import ui
 from nicegui.element import Element
@@ -28,6 +29,7 @@ _TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'M
          '/tuning': 'Tuning'}
 _TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
 _ADDRESSES = ('href', 'src')
+_DEGREES = re.compile(r'\bdeg(?=[CF]\b)')
 _Kind = TypeVar('_Kind', bound=Element)
 NOT_ALLOWED = Answer(False, 'view only: log in as operator to make changes')
 
@@ -182,12 +184,20 @@ class PageLayout:
         if control.enabled is not (enabled := self.enabled and possible):
             control.set_enabled(enabled)
 
-    async def confirm(self, question: str, yes: str, details: Sequence[str] = ()) -> bool:
-        """Return whether the visitor confirms; Escape cancels."""
+    async def confirm(self, question: str, yes: str, details: Sequence[str] = (),
+                      changes: Sequence[Sequence[str]] = ()) -> bool:
+        """
+        Return whether the visitor confirms; Escape cancels.
+
+        :param changes: rows of three cells: a title, and the values before and after.
+        """
         with ui.dialog() as dialog, box('card'):
             label('div', question, 'value')
             for line in details:
                 label('div', line)
+            with box('changes'):
+                for cell in (cell for row in changes for cell in row):
+                    label('div', cell)
             with box('row1'):
                 ui.button('Cancel', on_click=lambda: dialog.submit(False)).props(
                     'outline autofocus')
@@ -259,11 +269,15 @@ def card(title: str, name: str) -> Element:
 
 
 class _Label(ui.label):
-    """Text in an element of any tag."""
+    """Text in an element of any tag, with the degrees of nodes and files as people write them."""
 
     def __init__(self, tag: str, text: str) -> None:
-        super().__init__(text)
+        super().__init__()
         self.tag = tag
+        self.set_text(text)
+
+    def set_text(self, text: str) -> Self:
+        return super().set_text(_DEGREES.sub('°', text))
 
 
 def label(tag: str, text: str, classes: str = '') -> ui.label:

@@ -5,15 +5,23 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 import math
 
 from nicegui import ui
 
+from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import printed
+from koopman_ros.model import load
 from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
-from koopman_ros.panel.model_card import status_card
+from koopman_ros.panel.model_card import (
+    model_changes,
+    status_card,
+    training_card,
+    training_ranges,
+)
 from koopman_ros.panel.report_cards import comparison_card, report_card
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import (
@@ -31,6 +39,7 @@ from koopman_ros.panel.snapshot import (
 from koopman_ros.parameters.description import ParameterDescription
 
 _DONE = 'done [%]'
+_FORCE = 'load_refused_model'
 
 
 def model_page(page: PageLayout) -> None:
@@ -94,30 +103,45 @@ def _model(page: PageLayout) -> None:
     with page.card('active model', 'Model', CONTROLLER):
         name = label('div', '', 'value')
         task, origin = _Task(columns=True), _Figures(columns=True)
-        trained = label('div', '', 'quiet')
+        training = label('div', '', 'quiet')
 
         async def reload() -> None:
             answer.set_text('sent …')
             answer.show(await page.act('reload', CONTROLLER))
 
-        async def activate(new: str) -> None:
-            now = page.source.snapshot
-            if not await page.confirm(f'Activate model {new}?', 'Activate', [
-                    f'It replaces {now.status(CONTROL).values.get("model", "the active model")} '
-                    'if it predicts the recent measurements as well.',
-                    now.status(TRAINING).message]):
+        async def activate(name: str, rejected: bool = False) -> None:
+            now, view = page.source.snapshot, page.source.view
+            active = now.status(CONTROL).values.get('model', 'the active model')
+            details = [f'It replaces {active} if it predicts the recent measurements as well.']
+            changes = []
+            try:
+                new = await asyncio.to_thread(load, model_path(name))
+            except (OSError, ValueError) as error:
+                details.append(f'The panel cannot show what changes: {error}')
+            else:
+                rejected = new.provenance.accepted is False
+                changes = [('', 'active model', 'new model'), *model_changes(
+                    now, new, view.shown_ranges(training_ranges(new)))]
+            if rejected:
+                details.insert(0, '✖ Training rejected this model.')
+            if not await page.confirm(f'Activate model {name}?', 'Activate by force' if rejected
+                                      else 'Activate', details, changes):
                 return
-            answer.set_text('sent …')
             # the controller reads the file again even where its name is the same
-            answer.show(await page.act('parameters', CONTROLLER, {'model': new},
-                                       {'model': now.parameter(CONTROLLER, 'model')}))
+            wanted = {'model': name, **({_FORCE: True} if rejected else {})}
+            old = {key: now.parameter(CONTROLLER, key) for key in wanted}
+            answer.set_text('sent …')
+            answer.show(await page.act('parameters', CONTROLLER, wanted, old))
+            if old.get(_FORCE) is False:
+                # for this model alone
+                await page.act('parameters', CONTROLLER, {_FORCE: False}, {_FORCE: True})
 
-        def trained_model() -> str:
+        def trained() -> tuple[str, bool]:
             values = page.source.snapshot.status(TRAINING).values
-            return values.get('model_file', '') if values.get('accepted') == 'True' else ''
+            return values.get('model_file', ''), values.get('accepted') == 'False'
 
         with box('row1'):
-            new = page.button('Activate the new model …', lambda: activate(trained_model()))
+            new = page.button('', lambda: activate(*trained()))
             back = page.button('', lambda: activate(page.source.snapshot.previous_model))
             page.button('Reload model file', reload)
         answer = AnswerLine()
@@ -127,11 +151,12 @@ def _model(page: PageLayout) -> None:
         name.set_text(control.values.get('model', '–'))
         task.show(control, status_card(control.values))
         origin.show(now.model)
-        ranges = ', '.join(f'{face.label} {face.text(face.training[0])} to '
-                           f'{face.text(face.training[1])} {face.unit}'
+        ranges = ', '.join(f'{face.label} {face.span_text(face.training)} {face.unit}'
                            for face in (*now.states, *now.inputs) if face.training)
-        trained.set_text(f'Training range: {ranges or "not known"}')
-        show_if(new, bool(trained_model()))
+        training.set_text(f'Training range: {ranges or "not known"}')
+        file, rejected = trained()
+        show_if(new, bool(file))
+        new.set_text(f'Activate the {"rejected" if rejected else "new"} model …')
         show_if(back, bool(now.previous_model))
         back.set_text(f'Back to {now.previous_model} …')
 
@@ -184,7 +209,8 @@ def _experiment(page: PageLayout) -> None:
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
         page.allow(end, 'left [s]' in found.values)
-        task.show(found, found.values)
+        task.show(found, {'time left [s]' if key == 'left [s]' else key: value
+                          for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
 
     page.follow(show)
@@ -233,7 +259,6 @@ def _training(page: PageLayout) -> None:
         page.allow(cancel, running)
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)
         share.set_text('' if math.isnan(done) else f'{done:.0f} %')
-        task.show(found, {key.replace('_', ' '): value
-                          for key, value in found.values.items() if key != _DONE})
+        task.show(found, training_card(found.values))
 
     page.follow(show)

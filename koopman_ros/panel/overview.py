@@ -88,7 +88,7 @@ class _Bar:
         self._low.set_text(low)
         self._high.set_text(high)
         self._between.set_text('' if face.training is None else (
-            f'trained {face.text(face.training[0])} to {face.text(face.training[1])}'))
+            f'trained {face.span_text(face.training)}'))
 
 
 class _Faceplate:
@@ -225,8 +225,8 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
         own = now.inputs[at]
         plate.show(own, own.command, own.applied)
         applied.set_text(f'{own.text(own.applied)} {own.unit}')
-        limits = f'limits {own.text(own.limits[0])} to {own.text(own.limits[1])} {own.unit}' if (
-            own.limits) else 'limits not known'
+        limits = f'limits {own.span_text(own.limits)} {own.unit}' if own.limits else (
+            'limits not known')
         # no minus zero
         change = round(own.disturbance, own.decimals + 1) + 0.0
         disturbance = f' · disturbance {change:+.{own.decimals + 1}f} {own.own_unit}' if (

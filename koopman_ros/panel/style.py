@@ -27,7 +27,7 @@ a { color: var(--text); }
   grid-template-columns: repeat(auto-fit, minmax(min(320px, 100%), 1fr)); }
 .loose { align-items: start; }
 .card { background: var(--card); border: 1px solid var(--line); padding: 12px 14px;
-  display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: anywhere; }
+  display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: break-word; }
 .card[inert] > :not(h2) { opacity: .45; }
 .page h2 { font-size: 1.05rem; line-height: 1.3; margin: 0; font-weight: 600; }
 .row1 { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: baseline; }
@@ -62,6 +62,8 @@ a { color: var(--text); }
 .alarm .what { flex: 1 1 240px; min-width: 0; overflow-wrap: anywhere; }
 .banner { background: var(--high); color: #fff; font-weight: 700; padding: 10px 16px; }
 #lost { position: sticky; top: 0; z-index: 9000; }
+.changes { display: grid; gap: 4px 16px;
+  grid-template-columns: minmax(0, 3fr) minmax(0, 2fr) minmax(0, 2fr); }
 .pairs { display: grid; gap: 2px 32px; }
 .columns { grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); }
 .pair { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 12px; }

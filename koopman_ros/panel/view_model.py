@@ -117,7 +117,7 @@ class LoopViewModel:
                 deviation = found.get(('deviation', name))
                 spread = f' ± {deviation[0]:.2g}' if deviation else ''
                 estimates.append(
-                    (readable(name), f'{value:.4g}{spread} {unit.replace("deg", "°")}'))
+                    (readable(name), f'{value:.4g}{spread} {printed(unit)}'))
         self._estimates = tuple(estimates)
 
     def take_plan(self, names: Sequence[str], stamp: float, times: Sequence[float],
@@ -227,9 +227,14 @@ class LoopViewModel:
         :param about: origin and held-out figures, in words.
         """
         self._about = MappingProxyType(dict(about))
+        shown = self.shown_ranges(ranges)
         for name, own in self._all.items():
-            bounds = ranges.get(name)
-            own.training = bounds and (own.shown(bounds[0]), own.shown(bounds[1]))
+            own.training = shown.get(name)
+
+    def shown_ranges(self, ranges: Mapping[str, Range]) -> dict[str, Range]:
+        """Return ranges of the shown signals in the units in which people read them."""
+        return {name: (own.shown(ranges[name][0]), own.shown(ranges[name][1]))
+                for name, own in self._all.items() if name in ranges}
 
     # Snapshots.
 

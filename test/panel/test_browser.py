@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Iterator
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 import re
@@ -22,6 +22,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from koopman_ros.demo import reactor
+from koopman_ros.model import load, save
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.browser import ADDRESS, opened_browser, Pages, PATIENCE
@@ -147,14 +148,17 @@ def confirmed(page: Page, yes: str, where: Locator, answer: str | re.Pattern[str
     expect(where.locator('.answer')).to_have_text(answer)
 
 
-def activated(page: Page, button: str | re.Pattern[str]) -> None:
+def activated(page: Page, button: str | re.Pattern[str], *shown: str, yes: str = 'Activate'
+              ) -> None:
     """Activate a model; again if a busy machine did not read it in time."""
     model = card(page, 'Model')
     for _ in range(TRIES):
         # not to take the answer to the button before for one to this
         page.reload()
         press(model, button)
-        confirmed(page, 'Activate', model, re.compile('^set$|is still being read after'))
+        for text in shown:
+            expect(page.get_by_role('dialog')).to_contain_text(text)
+        confirmed(page, yes, model, re.compile('^set$|is still being read after'))
         if model.locator('.answer').inner_text() == 'set':
             return
     raise AssertionError(f'the model was not read in {TRIES} tries')
@@ -201,7 +205,9 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         assert picture.body() == site.model.with_suffix('.png').read_bytes()
         for other in ('secret', '..%2f..%2fetc%2fpasswd', ''):
             assert page.request.get(f'{site.url}/picture/{other}').status == 404
+        assert '_' not in training.inner_text().replace(str(site.model), '')
         comparison = card(page, 'Comparison')
+        expect(comparison).not_to_contain_text('compared at')
         press(comparison, 'Compare on the last hour')
         press(comparison, 'Cancel')
         expect(comparison).to_contain_text('✖ cancelled')
@@ -210,11 +216,23 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
                                            timeout=5.0 * PATIENCE)
         expect(comparison.locator('img.picture')).to_be_visible()
         model = card(page, 'Model')
-        activated(page, 'Activate the new model …')
+        activated(page, 'Activate the new model …', 'Training range, temperature [°C]',
+                  'identity lift, n_z = 4', 'polynomial', 'accepted', 'Held-out roll-out error')
         expect(model.locator('.value')).to_have_text(str(site.model))
         expect(model).to_contain_text('polynomial')
         activated(page, re.compile('Back to reactor'))
         expect(model.locator('.value')).to_have_text(re.compile('^reactor'))
+        # one that training rejected needs force, which ends with it
+        bad = site.model.with_name('bad.safetensors')
+        accepted = load(site.model)
+        save(replace(accepted, provenance=replace(
+            accepted.provenance, accepted=False, reasons=('too inaccurate',))), bad)
+        ros.set_parameters_atomically('controller', load_refused_model=True, model=str(bad))
+        ros.set_parameters_atomically('controller', load_refused_model=False, model='reactor_nz4')
+        activated(page, re.compile('Back to .*bad'), 'Training rejected this model.',
+                  'refused (too inaccurate)', yes='Activate by force')
+        ros.wait_until(lambda: ros.get_parameters('controller', 'load_refused_model') == [False])
+        activated(page, re.compile('Back to reactor'))
         press(recording, 'Record')
         expect(recording).to_contain_text('recording to')
         # of the pictures that there are not
@@ -239,7 +257,7 @@ def test_the_reason_of_a_refusal_is_next_to_its_control(site: Site) -> None:
         own = asked(page)
         before = float(own.input_value())
         expect(ask_setpoint(page, '80')).to_have_text(
-            re.compile(r'✖ refused: outside 31\.85 to 53\.85 degC'))
+            re.compile(r'✖ refused: outside 31\.85 to 53\.85 °C'))
         expect(own).to_have_value(re.compile(rf'^{before:g}(\.0)?$'))
 
 
@@ -392,12 +410,12 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
         own = page.get_by_label('Parameters of the controller')
         own.get_by_text('coolant temperature', exact=True).click()
         row = own.locator('[data-parameter="coolant_temperature.max"]')
-        expect(row).to_contain_text('max [degC]')
+        expect(row).to_contain_text('max [°C]')
         given = row.get_by_role('textbox')
         expect(given).to_have_value('32')
         for text, said in (('31', 'set'), ('x', "✖ refused: 'x' is not a number"),
-                           ('-300', '✖ refused: must be [-273.15, 1000000000] degC'),
-                           ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 degC must '
+                           ('-300', '✖ refused: must be [-273.15, 1000000000] °C'),
+                           ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 °C must '
                                             'be below')),
                            ('32', 'set')):
             given.fill(text)
