@@ -3,7 +3,7 @@
 
 """Words for the active model: origin and figures in its file, and in the controller's status."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from koopman_ros.core.units import unit_label
 from koopman_ros.model import LiftedModel
@@ -66,19 +66,20 @@ def model_card(model: LiftedModel) -> dict[str, str]:
 
 
 def model_changes(now: Snapshot, new: LiftedModel, trained: Mapping[str, Range]
-                  ) -> list[tuple[str, str, str]]:
+                  ) -> list[Sequence[str]]:
     """
     Return what changes with a new model: a title, and the value of the active and the new model.
 
     :param trained: training ranges of the new model, in the units in which people read them.
     """
-    rows = []
+    rows: list[Sequence[str]] = []
     for face in (*now.states, *now.inputs):
         active, other = (face.span_text(bounds) if bounds else '–'
                          for bounds in (face.training, trained.get(face.name)))
         rows.append((f'Training range, {face.label} [{face.unit}]', active, other))
     card = model_card(new)
-    return rows + [(title, now.model.get(title, '–'), card.get(title, '–'))
+    # the reasons of a verdict fill no column
+    return rows + [(title, *(one.get(title, '–').partition(' (')[0] for one in (now.model, card)))
                    for title in dict.fromkeys((*now.model, *card))
                    if title in _COMPARED or title.startswith('Held-out')]
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 import math
 
@@ -15,6 +15,7 @@ from nicegui import ui
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import printed
 from koopman_ros.model import load
+from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
 from koopman_ros.panel.model_card import (
     model_changes,
@@ -49,7 +50,7 @@ def model_page(page: PageLayout) -> None:
         with box('cards loose'):
             _recording(page)
             _experiment(page)
-            _training(page)
+        _training(page)
         report_card(page)
         comparison_card(page)
 
@@ -112,19 +113,22 @@ def _model(page: PageLayout) -> None:
         async def activate(name: str, rejected: bool = False) -> None:
             now, view = page.source.snapshot, page.source.view
             active = now.status(CONTROL).values.get('model', 'the active model')
-            details = [f'It replaces {active} if it predicts the recent measurements as well.']
-            changes = []
+            details = [
+                name, f'It replaces {active} if it predicts the recent measurements as well.']
+            changes: list[Sequence[str]] = []
+            reasons = now.status(TRAINING).message
             try:
                 new = await asyncio.to_thread(load, model_path(name))
             except (OSError, ValueError) as error:
                 details.append(f'The panel cannot show what changes: {error}')
             else:
                 rejected = new.provenance.accepted is False
+                reasons = '; '.join(new.provenance.reasons)
                 changes = [('', 'active model', 'new model'), *model_changes(
                     now, new, view.shown_ranges(training_ranges(new)))]
             if rejected:
-                details.insert(0, '✖ Training rejected this model.')
-            if not await page.confirm(f'Activate model {name}?', 'Activate by force' if rejected
+                details.append(f'✖ Training rejected this model: {reasons}.')
+            if not await page.confirm('Activate this model?', 'Activate by force' if rejected
                                       else 'Activate', details, changes):
                 return
             # the controller reads the file again even where its name is the same
@@ -232,10 +236,11 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         if last != 'experiment_min':
             continue
         if on == 'setpoint' and f'{signal}.setpoint_min' in parameters:
-            lines.append(f'{signal}: set-points {text(f"{signal}.setpoint_min")} to '
+            lines.append(f'{readable(signal)}: set-points {text(f"{signal}.setpoint_min")} to '
                          f'{text(f"{signal}.setpoint_max")}')
         what = 'steps within' if f'{signal}.safe_value' in parameters else 'aborts outside'
-        lines.append(f'{signal}: {what} {text(name)} to {text(f"{signal}.experiment_max")}')
+        lines.append(f'{readable(signal)}: {what} {text(name)} to '
+                     f'{text(f"{signal}.experiment_max")}')
     return lines
 
 
@@ -244,7 +249,7 @@ def _training(page: PageLayout) -> None:
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')
-        task = _Task()
+        task = _Task(columns=True)
         train, cancel = _buttons(page, {'Train': partial(page.act, 'train', TRAINER),
                                         'Cancel': partial(page.act, 'cancel', TRAINER)})
 

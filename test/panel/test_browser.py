@@ -229,8 +229,8 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
             accepted.provenance, accepted=False, reasons=('too inaccurate',))), bad)
         ros.set_parameters_atomically('controller', load_refused_model=True, model=str(bad))
         ros.set_parameters_atomically('controller', load_refused_model=False, model='reactor_nz4')
-        activated(page, re.compile('Back to .*bad'), 'Training rejected this model.',
-                  'refused (too inaccurate)', yes='Activate by force')
+        activated(page, re.compile('Back to .*bad'), 'rejected this model: too inaccurate',
+                  'refused', yes='Activate by force')
         ros.wait_until(lambda: ros.get_parameters('controller', 'load_refused_model') == [False])
         activated(page, re.compile('Back to reactor'))
         press(recording, 'Record')
