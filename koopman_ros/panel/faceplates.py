@@ -156,7 +156,9 @@ def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:
     finite = [value for value in values if math.isfinite(value)]
     low, high = known or (min(finite, default=0.0), max(finite, default=1.0))
     margin = 0.1 * (high - low) or max(1.0, 0.1 * abs(high))
-    return min([low - margin, *finite]), max([high + margin, *finite])
+    # a range of positive numbers begins at zero at most
+    begin = max(low - margin, 0.0) if low >= 0.0 else low - margin
+    return min([begin, *finite]), max([high + margin, *finite])
 
 
 def _decimals(span: Range) -> int:

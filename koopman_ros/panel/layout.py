@@ -110,7 +110,7 @@ class PageLayout:
                 f'Alarms ({unacknowledged})' if unacknowledged else 'Alarms')
             if now.wall - self._beat_at >= 1.0:
                 self._beat_at = now.wall
-                beat.set_text(clock(now.wall))
+                beat.set_text(f'wall time {clock(now.wall)}')
                 attribute(beat, 'data-beat', f'{now.wall:.1f}')
             silent = [f'no message from the {one.role} since {clock(one.since)}' + (
                 '' if one.ever else ', the start of the panel') for one in now.silences]

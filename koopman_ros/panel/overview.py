@@ -47,7 +47,7 @@ def overview(page: PageLayout) -> None:
             for at, own in enumerate(now.inputs):
                 _input_card(page, at, own)
             _controller_card(page)
-        chart = TrendChart(page, 180, zoom=False)
+        chart = TrendChart(page, 220, zoom=False)
         page.follow(lambda _: chart.update())
 
 

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+import colorsys
 from dataclasses import dataclass
 import math
 import time
@@ -27,15 +29,16 @@ _BUCKETS = 500
 _ALL: Range = (0.0, 1.0)  # shares of the time shown
 _PAUSE = 0.3  # s between two updates of a zoom
 _EPOCH = 1e9  # s; a later stamp is a wall time, an earlier one is a simulated time
-_MARKS = 40  # last events that are shown
+_GROUP = 1.0 / 15.0  # of the time shown; nearer events are one mark
+_SAID = 3  # last events of a mark that are written out
 _LEAST = 0.1  # of the range of a signal, which an axis shows
-_INKS = ('#1d1d1b', '#4b6a88', '#7a6a45', '#6b4b6b', '#3f6b54', '#8a5a44')
+_HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
           'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
 _ABNORMAL = '#8a4b00'
-# in the browser
-_CLOCK = 'p => new Date(p.value).toTimeString().slice(0, 8)'
-_PLANT_CLOCK = 'p => new Date(p.value).toISOString().slice(11, 19)'
+# in the browser; a simulated time has no time zone
+_CLOCK = ('p => { const t = new Date(p.value); return p.value < 1e12 '
+          '? t.toISOString().slice(11, 19) : t.toTimeString().slice(0, 8); }')
 _QUIET = '#6b6b67'
 
 
@@ -81,19 +84,22 @@ class TrendChart:
         self._page = page
         self._charts = _charts(page.source.snapshot)
         self._span, self._whole, self._due, self._zoomed = '10 min', False, 0.0, _ALL
-        self.marks: Sequence[TrendMark] = ()  #: events in the time shown
-        # a time that is not known yet may be either
-        simulated = page.source.snapshot.time < _EPOCH
-        self._chart = ui.echart(_options(self._charts, height, zoom, simulated)).props(
+        self._end: float | None = None
+        self.marks: Sequence[MarkGroup] = ()  #: events in the time shown
+        self._chart = ui.echart(_options(self._charts, height, zoom)).props(
             'aria-label="Trends of all signals" role=img')
-        self._chart.style['height'] = f'{height * len(self._charts) + (105 if zoom else 60)}px'
+        self._chart.style['height'] = f'{height * len(self._charts) + (40 if zoom else 0)}px'
         if zoom:
             self._chart.on('chart:datazoom', self._on_zoom, ['start', 'end', 'batch'],
                            throttle=_PAUSE, leading_events=False)
 
-    def show(self, span: str, whole: bool) -> None:
-        """Show another span of time, and the whole range of each signal or that of its values."""
-        self._span, self._whole, self._due = span, whole, 0.0
+    def show(self, span: str, whole: bool, end: float | None) -> None:
+        """
+        Show another span of time, and the whole range of each signal or that of its values.
+
+        :param end: of the time shown; None to follow the present.
+        """
+        self._span, self._whole, self._end, self._due = span, whole, end, 0.0
         self.update()
 
     def _on_zoom(self, event: GenericEventArguments) -> None:
@@ -110,34 +116,81 @@ class TrendChart:
         self._due = time.monotonic() + period
         now = self._page.source.snapshot
         faces = {face.name: face for face in (*now.states, *now.inputs)}
+        plant_time = latest < _EPOCH
+        end = latest if self._end is None else self._end
         # simulated time begins at 0
-        begin = latest - length if latest >= _EPOCH else max(latest - length, 0.0)
-        end = min(plan_end(now, latest), latest + length)
+        begin = max(end - length, 0.0) if plant_time else end - length
+        if self._end is None:
+            end = min(plan_end(now, latest), latest + length)
+        first, last = (begin + share * (end - begin) for share in self._zoomed)
         pens = [own for _, pens in self._charts for own in pens]
-        values = trends.window([own.key for own in pens], begin, latest, _BUCKETS)
+        values = trends.window([own.key for own in pens], begin, end, _BUCKETS)
         if self._zoomed != _ALL:
             # as fine in the zoomed window as in the whole
-            first, last = (begin + share * (end - begin) for share in self._zoomed)
             fine = trends.window(list(values), first, last, _BUCKETS)
             values = {key: _refined(values[key], fine[key]) for key in values}
         for own in pens:
             if own.kind == 'planned':
                 times, plan = np.reshape(faces[own.signal].plan, (-1, 2)).T
                 values[own.key] = times, plan
-        self.marks = trends.marks(begin, latest)[-_MARKS:]
+        self.marks = grouped(trends.marks(begin, end), _GROUP * (last - first))
         self._chart.run_chart_method('setOption', {
-            'useUTC': latest < _EPOCH,
+            'useUTC': plant_time,
             # without a plan there is no line
-            'legend': {'data': [own.title for own in pens if own.kind != 'planned'
-                                or faces[own.signal].plan]},
-            'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end} for _ in self._charts],
+            'legend': [{'data': [own.title for own in pens if own.kind != 'planned'
+                                 or faces[own.signal].plan]} for _, pens in self._charts],
+            'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end,
+                       'name': 'plant time' if plant_time else 'wall time'}
+                      for _ in self._charts],
             'yAxis': [axis_ends([faces[own.signal].span for own in pens],
                             () if self._whole else [values[own.key][1] for own in pens])
                       for _, pens in self._charts],
             'series': [{'name': own.title, 'data': _points(*values[own.key]),
-                        'markLine': _lines(own, faces[own.signal],
-                                           self.marks if own is pens[0] else ())}
+                        'markLine': {'data': _lines(own, faces[own.signal],
+                                                    self.marks if own is pens[0] else ())}}
                        for _, pens in self._charts for own in pens]})
+
+
+@dataclass(frozen=True)
+class MarkGroup:
+    """Events that are near in time, as one mark."""
+
+    time: float  #: of the first
+    label: str  #: kinds, with their numbers
+    text: str
+    alarm: bool  #: whether an alarm is one of them
+
+
+def grouped(marks: Sequence[TrendMark], width: float) -> list[MarkGroup]:
+    """Return events in order as marks, each of the events within a width of its first one."""
+    groups: list[list[TrendMark]] = []
+    for mark in marks:
+        if not groups or mark.time > groups[-1][0].time + width:
+            groups.append([])
+        groups[-1].append(mark)
+    return [MarkGroup(group[0].time, ', '.join(
+        f'{kind} ×{count}' if count > 1 else kind
+        for kind, count in Counter(mark.kind for mark in group).items()), '; '.join((
+            *((f'{len(group) - _SAID} more',) if len(group) > _SAID else ()),
+            *(f'{mark.kind}: {mark.text}' for mark in group[-_SAID:]))),
+        any(mark.kind == 'alarm' for mark in group)) for group in groups]
+
+
+def time_of_day(text: str, latest: float) -> float | None:
+    """
+    Return a time that is written as h:mm:ss or h:mm; None for another text.
+
+    :param latest: time of the last value; a wall time is the last one before it.
+    """
+    try:
+        hours, minutes, seconds = (*map(int, text.split(':')), 0)[:3]
+    except ValueError:
+        return None
+    after = 3600.0 * hours + 60.0 * minutes + seconds
+    if latest < _EPOCH:
+        return after
+    found = time.mktime((*time.localtime(latest)[:3], 0, 0, 0, 0, 0, -1)) + after
+    return found if found <= latest else found - 86400.0
 
 
 def plan_end(now: Snapshot, latest: float) -> float:
@@ -174,8 +227,13 @@ def trend_page(page: PageLayout) -> None:
                 'aria-label="Time shown" unelevated color=grey-5 text-color=black '
                 'toggle-color=grey-9')
             whole = ui.checkbox('whole range')
-            label('span', 'Scroll or pinch to zoom, drag to pan, hover to read values', 'quiet')
-        chart = TrendChart(page, 260, zoom=True)
+            until = ui.input('Until, h:mm:ss', placeholder='now').props('outlined dense')
+            earlier = ui.button('Earlier').props('outline')
+            later = ui.button('Later').props('outline')
+            ui.button('Now', on_click=lambda: until.set_value('')).props('outline')
+            label('span', 'Click a name to hide its line; scroll or pinch to zoom, drag to pan, '
+                  'hover to read values and events', 'quiet')
+        chart = TrendChart(page, 290, zoom=True)
         label('h2', 'Events')
         events = box('card journal').props('role=list aria-label=Events')
     shown: list[Any] = [None]
@@ -188,19 +246,32 @@ def trend_page(page: PageLayout) -> None:
         events.clear()
         with events:
             for mark in reversed(chart.marks):
-                label('div', f'{_time_of_day(mark.time)}  {mark.kind}: {mark.text}').props(
-                    'role=listitem')
+                label('div', f'{_clock(mark.time)}  {mark.text}').props('role=listitem')
             if not chart.marks:
                 label('div', 'none in this time', 'quiet')
 
-    for control in (span, whole):
+    def end() -> float | None:
+        return time_of_day(str(until.value), page.source.view.trends.latest or 0.0)
+
+    def change() -> None:
         # a browser may send any value
-        control.on_value_change(lambda _: chart.show(str(span.value), bool(whole.value)) if (
-            span.value in SPANS) else None)
+        if span.value in SPANS:
+            chart.show(str(span.value), bool(whole.value), end())
+
+    def shift(sign: float) -> None:
+        latest = page.source.view.trends.latest
+        if span.value in SPANS and latest is not None:
+            found = (latest if (now := end()) is None else now) + sign * SPANS[span.value][0] / 2.0
+            until.set_value('' if found >= latest else _clock(found))
+
+    for control in (span, whole, until):
+        control.on_value_change(change)
+    earlier.on_click(lambda: shift(-1.0))
+    later.on_click(lambda: shift(1.0))
     page.follow(show)
 
 
-def _time_of_day(seconds: float) -> str:
+def _clock(seconds: float) -> str:
     moment = time.gmtime(seconds) if seconds < _EPOCH else time.localtime(seconds)
     return time.strftime('%H:%M:%S', moment)
 
@@ -227,26 +298,41 @@ def axis_ends(spans: Sequence[Range], pens: Sequence[Array]) -> dict[str, float 
             'max': round(math.ceil((middle + 0.5 * least) / step) * step, 6)}
 
 
-def _lines(own: _Pen, face: Faceplate, marks: Sequence[TrendMark]) -> dict[str, Any]:
+def _lines(own: _Pen, face: Faceplate, marks: Sequence[MarkGroup]) -> list[dict[str, Any]]:
     """Return the limits of a signal as horizontal lines, and events as vertical ones."""
     ranges = {'trained': face.training, 'limit': face.limits} if (
         own.kind in ('measured', 'commands')) else {}
     # the chart fails at an end that is not finite
     found: list[dict[str, Any]] = [{'yAxis': end, 'name': name} for name, bounds in ranges.items()
                                    for end in bounds or () if math.isfinite(end)]
-    found += [{'xAxis': 1e3 * mark.time, 'name': mark.kind, 'lineStyle': {
-        'type': 'solid', 'color': _ABNORMAL if mark.kind == 'alarm' else _QUIET}}
+    return found + [{
+        'xAxis': 1e3 * mark.time, 'name': mark.label, 'text': mark.text.replace('; ', '\n'),
+        'symbol': 'circle',
+        'lineStyle': {'type': 'solid', 'color': _ABNORMAL if mark.alarm else _QUIET}}
         for mark in marks]
-    return {'symbol': 'none', 'silent': True, 'animation': False, 'data': found,
-            'lineStyle': {'type': 'dashed', 'color': '#8a8a86'},
-            'label': {'formatter': '{b}', 'position': 'insideEndTop', 'fontSize': 10,
-                      'color': '#4d4d4a'}}
 
 
-def _options(charts: _Charts, height: int, zoom: bool, simulated: bool) -> dict[str, Any]:
+def ink(number: int) -> str:
+    """Return the colour of a pen of a chart: black, then hues of which none comes again."""
+    # by the golden ratio from blue on
+    share = (0.618034 * number - 0.035) % 1.0
+    red, green, blue = colorsys.hls_to_rgb(share, 0.28 + 0.14 * (number % 2), 0.4)
+    return f'#{round(255 * red):02x}{round(255 * green):02x}{round(255 * blue):02x}' if (
+        number) else '#1d1d1b'
+
+
+def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
     """Return the options of charts without data, one above the other."""
     several = range(len(charts))
-    pens = [(at, own) for at, (_, own_pens) in enumerate(charts) for own in own_pens]
+    pens = [(at, number, own) for at, (_, own_pens) in enumerate(charts)
+            for number, own in enumerate(own_pens)]
+    marked = {'symbol': 'none', 'symbolSize': 8, 'animation': False,
+              'lineStyle': {'type': 'dashed', 'color': '#8a8a86'},
+              'label': {'formatter': '{b}', 'position': 'insideEndTop', 'fontSize': 10,
+                        'color': '#4d4d4a'},
+              'emphasis': {'label': {':formatter': 'p => p.data.text || p.name', 'rotate': 0,
+                                     'fontSize': 12, 'color': '#1d1d1b', 'padding': 4,
+                                     'backgroundColor': '#f4f4f2'}}}
     grey = {'borderColor': '#a9a9a5', 'fillerColor': 'rgba(90,90,86,.25)',
             'handleStyle': {'color': '#4d4d4a', 'borderColor': '#4d4d4a'},
             'moveHandleStyle': {'color': '#8a8a86'}, 'brushSelect': False,
@@ -261,15 +347,17 @@ def _options(charts: _Charts, height: int, zoom: bool, simulated: bool) -> dict[
                     'transitionDuration': 0,
                     ':valueFormatter': "v => v == null ? '–' : (+v).toPrecision(6)",
                     'axisPointer': {'type': 'cross', 'label': {'backgroundColor': '#4d4d4a'}}},
-        'legend': {'type': 'scroll', 'top': 4, 'pageIconColor': '#4d4d4a',
-                   'data': [own.title for _, own in pens if own.kind != 'planned'],
-                   'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
-                   # less than that of the text cuts it where there are several pages of pens
-                   'itemHeight': 14, 'itemWidth': 14},
-        'grid': [{'left': 56, 'right': 16, 'top': 60 + height * at, 'height': height - 60}
-                 for at in several],
-        'xAxis': [{'type': 'time', 'gridIndex': at, 'axisPointer': {'label': {
-            ':formatter': _CLOCK if not simulated else _PLANT_CLOCK}}, 'axisLabel': {
+        'legend': [{'type': 'scroll', 'top': 4 + height * at, 'pageIconColor': '#4d4d4a',
+                    'data': [own.title for own in own_pens if own.kind != 'planned'],
+                    'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
+                    # less than that of the text cuts it where there are several pages of pens
+                    'itemHeight': 14, 'itemWidth': 14}
+                   for at, (_, own_pens) in enumerate(charts)],
+        'grid': [{'left': 56, 'right': 16, 'top': _HEAD + height * at,
+                  'height': height - _HEAD - _FOOT} for at in several],
+        'xAxis': [{'type': 'time', 'gridIndex': at, 'nameLocation': 'middle', 'nameGap': 22,
+                   'nameTextStyle': {'color': '#4d4d4a'},
+                   'axisPointer': {'label': {':formatter': _CLOCK}}, 'axisLabel': {
             'formatter': '{HH}:{mm}:{ss}', 'hideOverlap': True, 'color': '#1d1d1b'}}
             for at in several],
         'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
@@ -285,7 +373,7 @@ def _options(charts: _Charts, height: int, zoom: bool, simulated: bool) -> dict[
         'series': [{'type': 'line', 'name': own.title, 'showSymbol': False,
                     'xAxisIndex': at, 'yAxisIndex': at, 'data': [],
                     'step': 'end' if own.steps else False,
-                    'color': _INKS[number % len(_INKS)],
+                    'color': ink(number), 'markLine': marked,
                     'lineStyle': dict(zip(('type', 'width'), _LINES.get(
                         own.kind, ('dashed', 1.2)), strict=True))}
-                   for number, (at, own) in enumerate(pens)]}
+                   for at, number, own in pens]}

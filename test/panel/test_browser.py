@@ -311,6 +311,13 @@ def test_manual_mode_is_confirmed_and_left_again(site: Site) -> None:
         expect(page.locator('header')).to_contain_text('AUTOMATIC')
 
 
+AXIS = """() => {{
+    const chart = document.querySelector('.nicegui-echart');
+    const own = getElement(parseInt(chart.id.slice(1))).chart.getOption().xAxis[0];
+    return own.{0};
+}}"""
+
+
 def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
     points = """() => {
         const chart = document.querySelector('.nicegui-echart');
@@ -326,6 +333,14 @@ def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
         expect(page.get_by_label('Events')).to_contain_text('setpoint: temperature 46 °C')
         page.get_by_role('button', name='1 h').click()
         page.wait_for_function(f'() => ({points})().every(count => count > 20)')
+        expect(page.locator('header')).to_contain_text('wall time')
+        page.wait_for_function(AXIS.format("name === 'plant time' && own.max > 0"))
+        page.get_by_label('Until, h:mm:ss').fill('0:05')
+        page.wait_for_function(AXIS.format('max === 300e3'))
+        page.get_by_role('button', name='Now').click()
+        page.wait_for_function(AXIS.format('max > 300e3'))
+        page.get_by_role('button', name='Earlier').click()
+        expect(page.get_by_label('Until, h:mm:ss')).to_have_value(re.compile(r'\d+:\d\d:\d\d'))
 
 
 def test_a_plan_is_drawn_ahead_of_now_while_there_is_one(site: Site) -> None:
@@ -336,7 +351,8 @@ def test_a_plan_is_drawn_ahead_of_now_while_there_is_one(site: Site) -> None:
         const last = name => series.find(one => one.name.startsWith(name)).data.at(-1)?.[0];
         return [last('temperature planned') > last('temperature [') + 10_000
                     && xAxis[0].max >= last('coolant temperature planned'),
-                legend[0].data.filter(name => name.includes('planned')).length];
+                legend.flatMap(own => own.data).filter(
+                    name => name.includes('planned')).length];
     }"""
     node = site.ros.node
     # as a controller with MPC publishes them

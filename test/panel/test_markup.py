@@ -75,7 +75,7 @@ def test_hostile_texts_of_all_sources_stay_texts(
         for slot in element.slots.values():
             assert not slot.template
         shown += CODE in str(getattr(element, 'text', ''))
-    assert shown > 5, 'the texts are there'
+    assert shown > 3, 'the texts are there'
     assert CODE not in client.head_html + client.body_html
 
 

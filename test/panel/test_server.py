@@ -29,7 +29,8 @@ from websockets.typing import Origin
 from koopman_ros.panel import trend_page
 from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
-from koopman_ros.panel.trend_page import axis_ends, zoomed
+from koopman_ros.panel.trend_page import axis_ends, grouped, ink, time_of_day, zoomed
+from koopman_ros.panel.trends import TrendMark
 from support.browser import opened_browser, Pages
 from support.hostile import HostileSource, NOW, TEXTS
 from support.users import PASSWORDS, write_users
@@ -436,3 +437,28 @@ def test_an_axis_shows_a_share_of_the_range_of_its_signals(
     assert ends[0] <= low <= 46.03 < 46.1 <= high <= ends[1]
     assert high - low >= 2.0
     assert axis_ends([(30.0, 40.0), (35.0, 50.0)], ()) == {'min': 30.0, 'max': 50.0}
+
+
+def test_pens_of_a_chart_have_colours_of_their_own() -> None:
+    assert len({ink(number) for number in range(40)}) == 40
+
+
+def test_events_that_are_near_are_one_mark() -> None:
+    marks = [TrendMark(float(second), kind, f'text {second}') for second, kind in (
+        *((second, 'setpoint') for second in range(9)), (9, 'alarm'), (30, 'mode'))]
+    assert [(mark.time, mark.label, mark.text, mark.alarm) for mark in grouped(marks, 10.0)] == [
+        (0.0, 'setpoint ×9, alarm',
+         '7 more; setpoint: text 7; setpoint: text 8; alarm: text 9', True),
+        (30.0, 'mode', 'mode: text 30', False)]
+
+
+@pytest.mark.parametrize(('text', 'latest', 'found'), [
+    ('0:03:20', 500.0, 200.0), ('1:00', 500.0, 3600.0), ('30:00:01', 500.0, 108_001.0),
+    ('', 500.0, None), ('now', 500.0, None), ('1', 500.0, None)])
+def test_times_are_those_of_the_plant(text: str, latest: float, found: float | None) -> None:
+    assert time_of_day(text, latest) == found
+
+
+def test_a_wall_time_is_the_last_before_now() -> None:
+    for seconds in (NOW - 60.0, NOW - 80_000.0):
+        assert time_of_day(time.strftime('%H:%M:%S', time.localtime(seconds)), NOW) == seconds
