@@ -25,7 +25,7 @@ from koopman_ros.panel.view_model import LoopViewModel
 
 PERIOD = 0.25  # s between two updates of a page
 _TIMEOUT = 40.0  # s for an answer
-_TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
+TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
          '/tuning': 'Tuning'}
 _TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
 _ADDRESSES = ('href', 'src')
@@ -75,14 +75,14 @@ class PageLayout:
     """
 
     def __init__(self, source: Source, visitor: Visitor, path: str) -> None:
-        self.source, self.visitor = source, visitor
+        self.source, self.visitor, self._path = source, visitor, path
         self.enabled = visitor.may_act()  #: whether the controls can be used
         self._shown: Snapshot | None = None
         self._updates: list[Callable[[Snapshot], None]] = []
         self._beat_at = 0.0
         ui.add_css(CSS)
         ui.add_head_html(WATCH)
-        ui.page_title(f'{_TABS[path]} – {source.title}')
+        ui.page_title(f'{TABS[path]} – {source.title}')
         ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
         self._head(path)
         self.body = box('page')
@@ -96,7 +96,7 @@ class PageLayout:
             if self.visitor.named:
                 link('Log out', '/logout')
         with box('tabs', tag='nav').props('aria-label=Pages'):
-            tabs = {target: link(name, target) for target, name in _TABS.items()}
+            tabs = {target: link(name, target) for target, name in TABS.items()}
         tabs[path].classes('here').props('aria-current=page')
         banner = label('div', '', 'banner hidden').props('role=alert')
 
@@ -137,7 +137,7 @@ class PageLayout:
         if not self.visitor.may_look():
             # logged out on another page, or idle for too long
             self._timer.cancel()
-            ui.navigate.to('/login')
+            ui.navigate.to(f'/login?page={self._path}')
             return
         for update in self._updates:
             update(now)
@@ -164,9 +164,16 @@ class PageLayout:
             return NOT_ALLOWED
         future = self.source.ask(Action(self.visitor.name, what, name, value, old))
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
+            answer: Answer = await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
         except TimeoutError:
-            return Answer(False, f'no answer within {_TIMEOUT:g} s')
+            answer = Answer(False, f'no answer within {_TIMEOUT:g} s')
+        self._end_if_closed()
+        return answer
+
+    def _end_if_closed(self) -> None:
+        """End the present task if its page was closed meanwhile."""
+        if self.body.is_deleted:
+            raise asyncio.CancelledError
 
     def control(self, element: Any) -> Any:
         """Return a control, disabled for a viewer."""
@@ -203,6 +210,7 @@ class PageLayout:
                     'outline autofocus')
                 ui.button(yes, on_click=lambda: dialog.submit(True)).props('unelevated')
         found = await dialog
+        self._end_if_closed()
         dialog.delete()
         return bool(found)
 

@@ -30,7 +30,7 @@ from koopman_ros.panel.layout import (
     show_if,
 )
 from koopman_ros.panel.requests import Answer
-from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, Snapshot
+from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot
 from koopman_ros.panel.trend_page import TrendChart
 
 _STRIP = 3  # alarms that are shown here
@@ -47,6 +47,7 @@ def overview(page: PageLayout) -> None:
             for at, own in enumerate(now.inputs):
                 _input_card(page, at, own)
             _controller_card(page)
+        _simulation(page)
         chart = TrendChart(page, 220, zoom=False)
         page.follow(lambda _: chart.update())
 
@@ -238,9 +239,22 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
     page.follow(show)
 
 
+def _simulation(page: PageLayout) -> None:
+    async def reset() -> None:
+        if await page.confirm('Reset the simulated plant?', 'Reset the simulated plant',
+                              ['It jumps to the state in which it was started.']):
+            answer.show(await page.act('reset', PLANT))
+
+    with box('row1 hidden') as row:
+        page.button('Reset the simulated plant …', reset)
+        answer = AnswerLine()
+    # the driver of a real plant is no node of ours
+    page.follow(lambda now: show_if(row, bool(now.parameters.get(PLANT))))
+
+
 def _controller_card(page: PageLayout) -> None:
     with page.card('controller', 'Controller', CONTROLLER):
-        mode, level = label('div', '', 'big'), label('div', '', 'value')
+        mode, level = label('div', '', 'mode'), label('div', '', 'value')
         fallback = label('div', '▲ FALLBACK CONTROL ACTIVE', 'abnormal hidden')
         reason, message = label('div', ''), label('div', '', 'quiet')
         estimates = label('div', '')

@@ -23,8 +23,9 @@ a { color: var(--text); }
 .tabs a.here { background: var(--ground); font-weight: 600; border: 1px solid var(--line);
   border-bottom: none; }
 .page { padding: 12px 16px; display: flex; flex-direction: column; gap: 12px; }
-.cards { display: grid; gap: 12px;
-  grid-template-columns: repeat(auto-fit, minmax(min(320px, 100%), 1fr)); }
+.cards { display: flex; flex-wrap: wrap; gap: 12px; }
+.cards > * { flex: 1 1 max(min(320px, 100%), 33.3% - 12px); }
+.cards:has(> :nth-child(4):last-child) > * { flex-basis: max(min(320px, 100%), 50% - 12px); }
 .loose { align-items: start; }
 .card { background: var(--card); border: 1px solid var(--line); padding: 12px 14px;
   display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: break-word; }
@@ -34,6 +35,7 @@ a { color: var(--text); }
 .between { justify-content: space-between; }
 .big { font-size: 3.4rem; line-height: 1.05; font-weight: 600;
   font-variant-numeric: tabular-nums; }
+.mode { font-size: 2.4rem; line-height: 1.2; font-weight: 600; }
 .unit { font-size: 1.4rem; }
 .value { font-size: 1.5rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .abnormal { align-self: flex-start; color: #fff; background: var(--medium); padding: 2px 8px;
@@ -81,7 +83,6 @@ a { color: var(--text); }
 .journal { font-variant-numeric: tabular-nums; }
 @media (max-width: 600px) {
   .page { padding: 8px; }
-  .cards { grid-template-columns: minmax(0, 1fr); }
   .tabs { padding: 0; }
   .tabs a { padding: 10px 7px; font-size: .95rem; }
   .head { padding: 6px 8px; }

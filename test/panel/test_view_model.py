@@ -13,7 +13,7 @@ import pytest
 
 from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
-from koopman_ros.panel.faceplates import pen
+from koopman_ros.panel.faceplates import pen, span_text
 from koopman_ros.panel.requests import (
     Action,
     action_text,
@@ -205,6 +205,13 @@ def test_bars_hold_ranges_and_values() -> None:
     (state,) = own.snapshot(NOW + 2.0).states
     assert state.span[1] == pytest.approx(80.0)
     assert state.abnormal == 'above the trained range'
+
+
+@pytest.mark.parametrize(('bounds', 'text'), [
+    ((31.85, 53.85), '31.9 to 53.8'), ((5.0 + 1e-9, 32.0 - 1e-9), '5.0 to 32.0'),
+    ((-1.23, math.inf), '-1.2 to –')])
+def test_limits_are_written_within_the_limits(bounds: tuple[float, float], text: str) -> None:
+    assert span_text(bounds, 1) == text
 
 
 def test_the_target_of_a_ramp_is_shown() -> None:
