@@ -5,6 +5,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+import re
 
 from koopman_ros.panel.alarms import Alarms, Priority
 from koopman_ros.panel.files import sanitize_text
@@ -31,6 +32,7 @@ _MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
 _MAX_NAME = 200  # characters
 # So many errors within so many seconds are an alarm, however short each of them is.
 _REPEATED, _WITHIN = 5, 60.0
+_NUMBER = re.compile(r'(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]\d+)?')
 
 
 class Conditions:
@@ -48,6 +50,7 @@ class Conditions:
         self._nodes, self._start = dict(nodes), now
         # wall time and message of the last changes to ERROR, by task
         self._errors: dict[str, deque[tuple[float, str]]] = {}
+        self._keys: dict[str, tuple[str, ...]] = {}  # of the alarms of each task
         self._since: dict[str, float] = {}  # wall time of the present message, by task
         self._begun: dict[str, float] = {}  # wall time of the first message, by role
         self._last: dict[str, float] = {}  # wall time of the last message, by role
@@ -101,8 +104,15 @@ class Conditions:
             self._errors.setdefault(name, deque(maxlen=_REPEATED)).append((now, status.message))
         priority = Priority.HIGH if level >= ERROR else (
             Priority.MEDIUM if role == CONTROLLER else Priority.LOW)
-        self.alarms.report(name, level > OK and self._is_alarm(status, now), priority,
-                           f'{name}: {status.message}', now)
+        active, texts = level > OK and self._is_alarm(status, now), {name: status.message}
+        if warnings := [text for key, text in values.items() if key.startswith('warning ')]:
+            # a condition is its sentence without the numbers
+            texts = {sanitize_text(f'{name}: {_NUMBER.sub("#", text)}', _MAX_NAME): text
+                     for text in warnings}
+        for key in {*self._keys.get(name, ()), *texts}:
+            self.alarms.report(key, active and key in texts, priority,
+                               f'{name}: {texts.get(key, "")}', now)
+        self._keys[name] = tuple(texts)
 
     def _is_alarm(self, status: TaskStatus, now: float) -> bool:
         """Return whether a warning or an error is an alarm, and no other alarm shows it."""

@@ -199,7 +199,7 @@ def _recording(page: PageLayout) -> None:
 def _experiment(page: PageLayout) -> None:
     with page.card('experiment', 'Experiment', TRAINER):
         task = _Task()
-        limits = label('div', '', 'lines quiet')
+        limits, obstacle = label('div', '', 'lines quiet'), label('div', '', 'hidden')
 
         async def start() -> Answer | None:
             lines = experiment_limits(page.source.snapshot.parameters.get(TRAINER, {}))
@@ -207,17 +207,34 @@ def _experiment(page: PageLayout) -> None:
                 'Start the experiment?', 'Start the experiment',
                 ['The experiment applies random steps within these limits:', *lines]) else None
 
-        _, end = _buttons(page, {'Start …': start,
+        begin, end = _buttons(page, {'Start …': start,
                                  'End': partial(page.act, 'experiment', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
+        reason = experiment_obstacle(now)
+        obstacle.set_text(f'Not possible now: {reason}')
+        show_if(obstacle, bool(reason))
+        page.allow(begin, not reason)
         page.allow(end, 'left [s]' in found.values)
         task.show(found, {'time left [s]' if key == 'left [s]' else key: value
                           for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
 
     page.follow(show)
+
+
+def experiment_obstacle(now: Snapshot) -> str:
+    """Return why no experiment can start, and what to do, or nothing."""
+    signal = now.parameter(TRAINER, 'experiment_signal')
+    if now.status(EXPERIMENT).values.get('left [s]', '0') != '0':
+        return 'an experiment is running'
+    if signal == 'command' and now.mode:
+        return ('the controller commands the inputs; stop it, or set experiment_signal to '
+                'setpoint or manual on the tuning page')
+    wanted = {'setpoint': 'automatic', 'manual': 'manual'}.get(str(signal), now.mode)
+    return '' if now.mode == wanted else (
+        f'with experiment_signal = {signal}, the controller must be in {wanted} mode')
 
 
 def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[str]:

@@ -177,7 +177,7 @@ class LoopViewModel:
                 for name, value in zip(names, fields['value'], strict=True):
                     own = self._states[name]
                     own.values['target'] = own.shown(value)
-                    self._mark('setpoint', f'{readable(name)} {own.values["target"]:.6g} '
+                    self._mark('set-point', f'{readable(name)} {own.values["target"]:.6g} '
                                            f'{printed(own.read)}')
             case 'manual_command' if fields['accepted']:
                 for own, value in zip(self._inputs.values(), fields['value'], strict=True):

@@ -329,7 +329,7 @@ def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
         expect(ask_setpoint(page, '46')).to_have_text('accepted')
     with site.page('/trends') as page:
         page.wait_for_function(f'() => ({points})()[0] > 20')
-        expect(page.get_by_label('Events')).to_contain_text('setpoint: temperature 46 °C')
+        expect(page.get_by_label('Events')).to_contain_text('set-point: temperature 46 °C')
         page.get_by_role('button', name='1 h').click()
         page.wait_for_function(f'() => ({points})().every(count => count > 20)')
         expect(page.locator('header')).to_contain_text('wall time')

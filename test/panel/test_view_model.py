@@ -14,6 +14,7 @@ import pytest
 from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.faceplates import pen, span_text
+from koopman_ros.panel.model_page import experiment_obstacle
 from koopman_ros.panel.requests import (
     Action,
     action_text,
@@ -432,6 +433,47 @@ def test_a_manual_command_is_limited_as_the_controller_does() -> None:
         'coolant_temperature.max': parameter('coolant_temperature.max', 32.0)})
     assert own.limited('coolant_temperature', 60.0) == 32.0
     assert own.limited('coolant_temperature', 20.0) == 20.0
+
+
+@pytest.mark.parametrize(('signal', 'mode', 'left', 'words'), [
+    ('command', '', '0', ''), ('command', 'automatic', '0', 'stop it, or set experiment_signal'),
+    ('setpoint', 'automatic', '0', ''), ('setpoint', 'manual', '0', 'in automatic mode'),
+    ('manual', 'automatic', '0', 'in manual mode'), (None, 'automatic', '0', ''),
+    ('setpoint', 'automatic', '12.5', 'is running')])
+def test_an_experiment_that_cannot_start_has_a_reason(
+        signal: str | None, mode: str, left: str, words: str) -> None:
+    own = view()
+    if mode:
+        answered(own, mode=mode)
+    if signal:
+        own.take_parameters(TRAINER, {'experiment_signal': parameter('experiment_signal', signal)})
+    status(own, EXPERIMENT, OK, 'finished', {'left [s]': left}, NOW)
+    found = experiment_obstacle(own.snapshot(NOW))
+    assert words in found
+    assert bool(found) is bool(words)
+
+
+def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
+    own = view()
+
+    def standing(second: float, *warnings: str) -> list[tuple[str, AlarmState]]:
+        values = {f'warning {number}': text for number, text in enumerate(warnings, 1)}
+        status(own, 'controller: model', WARN if warnings else OK, '; '.join(warnings), values,
+               NOW + second)
+        measure(own, 50.0, second + 1.0)
+        own.advance(NOW + second)
+        return [(alarm.text.partition(': model: ')[2], alarm.state)
+                for alarm in own.snapshot(NOW + second).standing]
+
+    up, back = AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED
+    standing(0.0, 'level_1 at 4.5 m')
+    assert standing(2.0, 'level_1 at 4.6 m', 'retrain') == [('level_1 at 4.6 m', up)]
+    assert standing(4.0, 'retrain', 'level_1 at 4.7 m') == [
+        ('retrain', up), ('level_1 at 4.7 m', up)]
+    standing(6.0, 'retrain')
+    assert standing(12.0, 'retrain') == [('retrain', up), ('level_1 at 4.7 m', back)]
+    standing(13.0)
+    assert [state for _, state in standing(19.0)] == [back, back]
 
 
 # Trends.
