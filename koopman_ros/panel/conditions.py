@@ -30,7 +30,7 @@ _ENDED = 10.0  # s for which an experiment or training that failed is an active 
 _PERIODS = 5.0  # usual times between two measurements without one
 _MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
 _MAX_NAME = 200  # characters
-# So many errors within so many seconds are an alarm, however short each of them is.
+# errors within seconds that are an alarm, however short each of them is
 _REPEATED, _WITHIN = 5, 60.0
 _NUMBER = re.compile(r'(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]\d+)?')
 
@@ -147,9 +147,9 @@ class Conditions:
         for role in self._watched:
             text = f'no message from the {role}'
             if role == PLANT:
-                # the controller knows what it does meanwhile
-                told = self._unmeasured() and not self._is_silent(CONTROLLER, now)
-                text = self.statuses[CONTROL].message if told else 'no measurement'
+                # the message of the controller says how it reacts
+                reported = self._unmeasured() and not self._is_silent(CONTROLLER, now)
+                text = self.statuses[CONTROL].message if reported else 'no measurement'
             silent = self._is_silent(role, now) and (
                 role in self._last or now - self._start > _START)
             self.alarms.report(f'silence of {role}', silent,

@@ -171,7 +171,7 @@ class PageLayout:
         return answer
 
     def _end_if_closed(self) -> None:
-        """End the present task if its page was closed meanwhile."""
+        """End the present task if its page was closed."""
         if self.body.is_deleted:
             raise asyncio.CancelledError
 

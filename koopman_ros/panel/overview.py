@@ -118,7 +118,7 @@ class _Entry:
 
     def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any]) -> None:
         self._send = send
-        self._shown: float | None = None  # present value in the field until somebody types
+        self._shown: float | None = None  # present value in the field until a user types
         self._ends: Range = (0.0, 1.0)
         with box('ask'):
             self._field = page.control(ui.number(title, on_change=self._typed).props(
@@ -132,7 +132,7 @@ class _Entry:
         self._field.on('keydown.escape', self._reset)
 
     def show(self, face: Faceplate, present: float) -> None:
-        """Follow the present value until somebody types another one."""
+        """Follow the present value until a user types another one."""
         low, high = (round(end, face.decimals) for end in face.span)
         if (low, high) != self._ends:
             self._ends, step = (low, high), 10.0 ** -face.decimals

@@ -55,7 +55,7 @@ _PAGES: dict[str, Callable[[PageLayout], None]] = {
 
 
 class _AuthMiddleware:
-    """Middleware that refuses requests of other origins, and those of nobody who is logged in."""
+    """Middleware that refuses requests of other origins, and those without a log-in."""
 
     def __init__(self, app: Any, keeper: AccessControl, listener: Listener) -> None:
         self._app, self._keeper, self._listener = app, keeper, listener

@@ -108,7 +108,7 @@ class _Row:
         if parameter.read_only:
             self._field.set_text(parameter.text)
         elif self._field.value in ('', self._text, None):
-            # what is being typed stays
+            # a text that a user is typing stays
             self._field.set_value(parameter.text)
         self._text = parameter.text
 
