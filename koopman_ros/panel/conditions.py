@@ -14,6 +14,7 @@ from koopman_ros.panel.snapshot import (
     CONTROLLER,
     ERROR,
     EXPERIMENT,
+    MEASUREMENTS,
     OK,
     PLANT,
     REQUESTS,
@@ -122,6 +123,8 @@ class Conditions:
             return False
         if status.name in (EXPERIMENT, TRAINING):
             return now - self._since[status.name] < _ENDED
+        if status.name == MEASUREMENTS:
+            return not self._is_silent(PLANT, now)
         if status.name != CONTROL:
             return True
         if self._unmeasured():

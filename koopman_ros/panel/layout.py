@@ -114,7 +114,8 @@ class PageLayout:
                 attribute(beat, 'data-beat', f'{now.wall:.1f}')
             silent = [f'no message from the {one.role} since {clock(one.since)}' + (
                 '' if one.ever else ', the start of the panel') for one in now.silences]
-            banner.set_text(f'⚠ Connection lost: {"; ".join(silent)}')
+            known = any(one.ever for one in now.silences)
+            banner.set_text(f'⚠ {"Connection lost" if known else "Waiting"}: {"; ".join(silent)}')
             show_if(banner, bool(silent))
 
         self.follow(show)

@@ -105,6 +105,6 @@ def status_card(values: Mapping[str, str]) -> dict[str, str]:
     for key, value in values.items():
         if key.endswith(_OUTSIDE):
             name = key.removesuffix(_OUTSIDE)
-            subject = 'State' if name == 'distance' else name.capitalize()
+            subject = 'State' if name == 'distance' else readable(name).capitalize()
             found[f'{subject} outside the training range [half-ranges]'] = value
     return {title: value for title, value in found.items() if value not in _UNKNOWN}

@@ -243,7 +243,8 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         return ['Trainer not running: no limits available']
 
     def text(name: str) -> str:
-        return f'{parameters[name].text} {printed(parameters[name].unit)}'.rstrip()
+        value, unit = parameters[name].value, printed(parameters[name].unit)
+        return f'{value:.6g} {unit}' if isinstance(value, float) else f'{value} {unit}'.rstrip()
 
     on = parameters['experiment_signal'].text
     lines = [f'steps: {on}, for {text("experiment_length")}, each '

@@ -163,7 +163,7 @@ def test_a_model_is_described_in_words() -> None:
     assert status_card({
         'model': 'x', 'model file time': '2026-11-25T15:10:08.000+00:00', 'law': 'none',
         'distance outside training box [half-ranges]': '0.5', 'gain norm': 'nan',
-        'coolant outside training box [half-ranges]': '0'}) == {
+        'pump_1 and pump_2 outside training box [half-ranges]': '0'}) == {
         'File written': '2026-11-25 15:10:08',
         'State outside the training range [half-ranges]': '0.5',
-        'Coolant outside the training range [half-ranges]': '0'}
+        'Pump 1 and pump 2 outside the training range [half-ranges]': '0'}

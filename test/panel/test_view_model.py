@@ -30,6 +30,7 @@ from koopman_ros.panel.snapshot import (
     ERROR,
     EXPERIMENT,
     LOST,
+    MEASUREMENTS,
     OK,
     PLANT,
     REQUESTS,
@@ -380,6 +381,9 @@ LATE = {'measurements': '9', 'since last measurement [s]': '40'}
                                            '; silence of plant: no measurement'}),
     # the silence of a plant is one alarm, in the words of the controller
     (CONTROL, ERROR, 'held', LATE, 2.0, {20.0: 'silence of plant: held'}),
+    (MEASUREMENTS, WARN, 'late', {}, 2.0, {
+        20.0: 'silence of plant: no measurement; '
+              f'{MEASUREMENTS}: {MEASUREMENTS}: late (returned)'}),
     (CONTROL, OK, 'automatic', LATE, 2.0, {20.0: 'silence of plant: no measurement'}),
     # the operator who made a request reads the answer
     (REQUESTS, WARN, 'request refused: outside', {}, 99.0, {5.0: '', 40.0: ''}),
