@@ -123,6 +123,11 @@ class Conditions:
             return False
         if status.name in (EXPERIMENT, TRAINING):
             return now - self._since[status.name] < _ENDED
+        if status.name.startswith(f'{PLANT}: ') and any(
+                status.message in other.message for other in self.statuses.values()
+                if other.level > OK and other.name.startswith(f'{CONTROLLER}: ')):
+            # the controller has noticed it as well
+            return False
         if status.name == MEASUREMENTS:
             return not self._is_silent(PLANT, now)
         if status.name != CONTROL:

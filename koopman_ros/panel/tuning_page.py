@@ -90,10 +90,11 @@ class _Row:
                 return
             with box(''):
                 with box('ask'):
+                    choices = {bool: ('false', 'true'), str: parameter.choices}.get(
+                        type(parameter.value))
                     self._field = page.control(attribute(
-                        (ui.select(list(parameter.choices)) if parameter.choices and
-                         isinstance(parameter.value, str) else ui.input()).props(
-                             'outlined dense'), 'aria-label', title))
+                        (ui.select(list(choices)) if choices else ui.input()).props(
+                            'outlined dense'), 'aria-label', title))
                     attribute(page.button('Set', self._submit), 'aria-label',
                               f'Set {parameter.name}')
                 self._answer = AnswerLine()

@@ -439,14 +439,17 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
             given.press('Enter')
             expect(row.locator('.answer')).to_have_text(said)
         # parameters with a few possible values are lists
-        page.get_by_label('Parameters of the trainer').get_by_text('general', exact=True).click()
-        row = page.locator('[data-parameter="experiment_signal"]')
-        for choice in ('manual', 'setpoint'):
-            row.get_by_role('combobox').click()
-            page.get_by_role('option', name=choice, exact=True).click()
-            press(row, 'Set experiment_signal')
-            expect(row.locator('.answer')).to_have_text('set')
-            expect(row.get_by_role('combobox')).to_have_value(choice)
+        for node, name, choices in (('trainer', 'experiment_signal', ('manual', 'setpoint')),
+                                    ('controller', 'load_refused_model', ('true', 'false'))):
+            page.get_by_label(f'Parameters of the {node}').get_by_text(
+                'general', exact=True).click()
+            row = page.locator(f'[data-parameter="{name}"]')
+            for choice in choices:
+                row.get_by_role('combobox').click()
+                page.get_by_role('option', name=choice, exact=True).click()
+                press(row, f'Set {name}')
+                expect(row.locator('.answer')).to_have_text('set')
+                expect(row.get_by_role('combobox')).to_have_value(choice)
 
         def exported() -> str:
             with page.expect_download() as download:

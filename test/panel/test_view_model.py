@@ -367,6 +367,10 @@ def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
         ('controller: actuators', Priority.MEDIUM)]
+    # also seen by the plant
+    status(own, 'plant: simulation', WARN, 'stuck', {}, NOW + 2.0)
+    own.advance(NOW + 3.4)
+    assert [alarm.key for alarm in own.snapshot(NOW + 3.4).standing] == ['controller: actuators']
 
 
 WAITING = {'measurements': '0'}
