@@ -29,6 +29,7 @@ _BUCKETS = 500
 _ALL: Range = (0.0, 1.0)  # shares of the time shown
 _PAUSE = 0.3  # s between two updates of a zoom
 _EPOCH = 1e9  # s; a later stamp is a wall time, an earlier one is a simulated time
+_DAY = 86400.0  # s
 _GROUP = 1.0 / 15.0  # of the time shown; nearer events are one mark
 _SAID = 3  # last events of a mark that are written out
 _LEAST = 0.1  # of the range of a signal, which an axis shows
@@ -190,7 +191,7 @@ def time_of_day(text: str, latest: float) -> float | None:
     if latest < _EPOCH:
         return after
     found = time.mktime((*time.localtime(latest)[:3], 0, 0, 0, 0, 0, -1)) + after
-    return found if found <= latest else found - 86400.0
+    return found if found <= latest else found - _DAY
 
 
 def plan_end(now: Snapshot, latest: float) -> float:
@@ -262,7 +263,9 @@ def trend_page(page: PageLayout) -> None:
         latest = page.source.view.trends.latest
         if span.value in SPANS and latest is not None:
             found = (latest if (now := end()) is None else now) + sign * SPANS[span.value][0] / 2.0
-            until.set_value('' if found >= latest else _clock(found))
+            # a time of day is one of the last 24 hours
+            first = 0.0 if latest < _EPOCH else latest - _DAY + 1.0
+            until.set_value('' if found >= latest else _clock(max(found, first)))
 
     for control in (span, whole, until):
         control.on_value_change(change)

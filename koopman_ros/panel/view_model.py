@@ -185,8 +185,7 @@ class LoopViewModel:
                 self._mark('manual', 'manual command')
             case 'mode':
                 self._mode = str(fields['mode'])
-                for own in self._inputs.values():
-                    own.values.pop('manual', None)
+                self._forget('manual')
                 self._mark('mode', f'{self._mode} mode')
             case 'model':
                 self._mark('model', f'model {fields["model"]["name"]}')
@@ -197,8 +196,15 @@ class LoopViewModel:
                 if 'model' in fields:
                     self._replace_model(fields['model'])
             case 'start' | 'snapshot':
+                if event == 'start':
+                    self._forget('manual', 'target')
                 self._mode = str(fields['state']['mode']['name']).lower()
                 self._model = dict(fields['model'])
+
+    def _forget(self, *kinds: str) -> None:
+        for own in self._all.values():
+            for kind in kinds:
+                own.values.pop(kind, None)
 
     def _replace_model(self, model: Mapping[str, Any]) -> None:
         before, self._model = self._model, dict(model)

@@ -226,6 +226,20 @@ def test_the_target_of_a_ramp_is_shown() -> None:
                                  'reason': ['setpoint_outside']}, NOW)
     first, second = own.snapshot(NOW).states
     assert (first.setpoint, first.target, second.setpoint, second.target) == (0.1, 0.1, 0.15, 0.2)
+    # a controller that starts again has no target
+    own.take_record('start', {'state': {'mode': {'name': 'AUTOMATIC'}}, 'model': {}}, NOW)
+    assert own.snapshot(NOW).states[1].target == 0.15
+
+
+def test_a_manual_command_is_shown_within_the_limits_until_the_mode_changes() -> None:
+    own = view()
+    own.take_parameters(CONTROLLER, {f'coolant_temperature.{end}': parameter(
+        f'coolant_temperature.{end}', value) for end, value in (('min', 5.0), ('max', 32.0))})
+    own.take_signals('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
+    own.take_record('manual_command', {'accepted': True, 'value': [to_kelvin(45.0)]}, NOW)
+    assert own.snapshot(NOW).inputs[0].manual == 32.0
+    own.take_record('mode', {'mode': 'automatic'}, NOW)
+    assert own.snapshot(NOW).inputs[0].manual == pytest.approx(20.0)
 
 
 def test_a_snapshot_stays_what_it_was() -> None:
