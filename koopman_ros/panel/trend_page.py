@@ -37,9 +37,10 @@ _HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
           'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
 _ABNORMAL = '#8a4b00'
-# in the browser; a simulated time has no time zone
-_CLOCK = ('p => { const t = new Date(p.value); return p.value < 1e12 '
-          '? t.toISOString().slice(11, 19) : t.toTimeString().slice(0, 8); }')
+# _clock in the browser
+_CLOCK = ('t => t >= 1e12 ? new Date(t).toTimeString().slice(0, 8) : '
+          "String(Math.floor(t / 36e5)).padStart(2, '0') + "
+          "new Date(t).toISOString().slice(13, 19)")
 _QUIET = '#6b6b67'
 
 
@@ -275,8 +276,10 @@ def trend_page(page: PageLayout) -> None:
 
 
 def _clock(seconds: float) -> str:
-    moment = time.gmtime(seconds) if seconds < _EPOCH else time.localtime(seconds)
-    return time.strftime('%H:%M:%S', moment)
+    """Write a time of day, or the hours, minutes and seconds of a simulation."""
+    if seconds >= _EPOCH:
+        return time.strftime('%H:%M:%S', time.localtime(seconds))
+    return f'{int(seconds // 3600.0):02}' + time.strftime(':%M:%S', time.gmtime(seconds))
 
 
 def _points(times: Array, values: Array) -> list[list[float | None]]:
@@ -360,8 +363,8 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                   'height': height - _HEAD - _FOOT} for at in several],
         'xAxis': [{'type': 'time', 'gridIndex': at, 'nameLocation': 'middle', 'nameGap': 22,
                    'nameTextStyle': {'color': '#4d4d4a'},
-                   'axisPointer': {'label': {':formatter': _CLOCK}}, 'axisLabel': {
-            'formatter': '{HH}:{mm}:{ss}', 'hideOverlap': True, 'color': '#1d1d1b'}}
+                   'axisPointer': {'label': {':formatter': f'p => ({_CLOCK})(p.value)'}},
+                   'axisLabel': {':formatter': _CLOCK, 'hideOverlap': True, 'color': '#1d1d1b'}}
             for at in several],
         'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
                    'name': f'{", ".join(dict.fromkeys(own.label for own in own_pens))} [{unit}]',
