@@ -106,7 +106,8 @@ class Conditions:
         priority = Priority.HIGH if level >= ERROR else (
             Priority.MEDIUM if role == CONTROLLER else Priority.LOW)
         active, texts = level > OK and self._is_alarm(status, now), {name: status.message}
-        if warnings := [text for key, text in values.items() if key.startswith('warning ')]:
+        warnings = [text for key, text in values.items() if key.startswith('warning ')]
+        if warnings := warnings or [status.message] * (name == CONTROL):
             # a condition is its sentence without the numbers
             texts = {sanitize_text(f'{name}: {_NUMBER.sub("#", text)}', _MAX_NAME): text
                      for text in warnings}

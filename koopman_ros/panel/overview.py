@@ -31,7 +31,7 @@ from koopman_ros.panel.layout import (
 )
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot
-from koopman_ros.panel.trend_page import TrendChart
+from koopman_ros.panel.trend_chart import TrendChart
 
 _STRIP = 3  # alarms that are shown here
 

@@ -26,11 +26,11 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from koopman_ros.panel import trend_page
+from koopman_ros.panel import trend_chart
 from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
-from koopman_ros.panel.trend_page import axis_ends, grouped, ink, time_of_day, zoomed
-from koopman_ros.panel.trends import TrendMark
+from koopman_ros.panel.trend_chart import axis_ends, ink, zoomed
+from koopman_ros.panel.trend_page import time_of_day
 from support.browser import opened_browser, Pages
 from support.hostile import HostileSource, NOW, TEXTS
 from support.users import PASSWORDS, write_users
@@ -387,7 +387,7 @@ ZOOM = """() => {
 
 def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
         site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trend_page, '_BUCKETS', 20)
+    monkeypatch.setattr(trend_chart, '_BUCKETS', 20)
     for k in range(36_000):
         site.source.view.trends.add('level', NOW + 0.1 * k, {
             12_345: 70.0, 23_456: -30.0}.get(k, math.sin(0.01 * k)))
@@ -441,15 +441,6 @@ def test_an_axis_shows_a_share_of_the_range_of_its_signals(
 
 def test_pens_of_a_chart_have_colours_of_their_own() -> None:
     assert len({ink(number) for number in range(40)}) == 40
-
-
-def test_events_that_are_near_are_one_mark() -> None:
-    marks = [TrendMark(float(second), kind, f'text {second}') for second, kind in (
-        *((second, 'setpoint') for second in range(9)), (9, 'alarm'), (30, 'mode'))]
-    assert [(mark.time, mark.label, mark.text, mark.alarm) for mark in grouped(marks, 10.0)] == [
-        (0.0, 'setpoint ×9, alarm',
-         '7 more; setpoint: text 7; setpoint: text 8; alarm: text 9', True),
-        (30.0, 'mode', 'mode: text 30', False)]
 
 
 @pytest.mark.parametrize(('text', 'latest', 'found'), [

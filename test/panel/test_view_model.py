@@ -318,7 +318,8 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
         status(own, 'other', ERROR, 'is down', {}, NOW + second)
         own.advance(NOW + second)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 3.0).standing] == [
-        ('other', Priority.HIGH), (CONTROL, Priority.MEDIUM), ('trainer: recording', Priority.LOW)]
+        ('other', Priority.HIGH), (f'{CONTROL}: extrapolates', Priority.MEDIUM),
+        ('trainer: recording', Priority.LOW)]
     # raised at once, in any order
     assert sorted(mark.text for mark in own.trends.marks(0.0, 10.0) if mark.kind == 'alarm') == [
         f'{CONTROL}: extrapolates', 'other: is down', 'trainer: recording: disk is filling']
@@ -369,7 +370,7 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     now = own.snapshot(NOW + 2.0)
-    assert {alarm.key for alarm in now.standing} == {CONTROL, 'controller: actuators'}
+    assert {alarm.key for alarm in now.standing} == {f'{CONTROL}: held', 'controller: actuators'}
     assert len(now.statuses) < 100
 
 
@@ -394,7 +395,8 @@ LATE = {'measurements': '9', 'since last measurement [s]': '40'}
 @pytest.mark.parametrize(('task', 'level', 'message', 'values', 'plant', 'expected'), [
     # the nodes of a loop start one after the other; later it is a fault
     (CONTROL, WARN, 'waiting', WAITING, None, {5.0: '', 40.0: 'silence of plant: waiting'}),
-    (CONTROL, WARN, 'waiting', WAITING, 99.0, {5.0: '', 40.0: f'{CONTROL}: {CONTROL}: waiting'}),
+    (CONTROL, WARN, 'waiting', WAITING, 99.0, {
+        5.0: '', 40.0: f'{CONTROL}: waiting: {CONTROL}: waiting'}),
     ('', OK, '', {}, None, {5.0: '', 40.0: 'silence of controller: no message from the controller'
                                            '; silence of plant: no measurement'}),
     # the silence of a plant is one alarm, in the words of the controller
@@ -496,6 +498,14 @@ def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
     assert standing(12.0, 'retrain') == [('retrain', up), ('level_1 at 4.7 m', back)]
     standing(13.0)
     assert [state for _, state in standing(19.0)] == [back, back]
+    # so has each reason for a control level, whose numbers may change
+    for second, message in enumerate(('held: stuck for 5 s', 'held: stuck for 6 s', 'held: late')):
+        for part in (0.0, 1.5):
+            measure(own, 50.0, 20.0 + 2 * second + part)
+            status(own, CONTROL, ERROR, message, {}, NOW + 20.0 + 2 * second + part)
+    assert sorted(alarm.text for alarm in own.snapshot(NOW + 26.0).standing
+                  if alarm.text.startswith(CONTROL)) == [
+        f'{CONTROL}: held: late', f'{CONTROL}: held: stuck for 6 s']
 
 
 # Trends.
