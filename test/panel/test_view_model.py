@@ -216,6 +216,13 @@ def test_limits_are_written_within_the_limits(bounds: tuple[float, float], text:
     assert span_text(bounds, 1) == text
 
 
+def test_the_scale_of_an_input_without_negative_values_begins_at_zero() -> None:
+    own = view(TANKS)
+    own.take_parameters(CONTROLLER, {f'pump_1.{end}': parameter(f'pump_1.{end}', value)
+                                     for end, value in (('min', 0.0), ('max', 12.0))})
+    assert own.snapshot(NOW).inputs[0].span == pytest.approx((0.0, 13.2))
+
+
 def test_the_target_of_a_ramp_is_shown() -> None:
     own = view(TANKS)
     for name, value in (('level_1', 0.10), ('level_2', 0.15)):
