@@ -213,7 +213,7 @@ def _experiment(page: PageLayout) -> None:
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
         reason = experiment_obstacle(now)
-        obstacle.set_text(f'Not possible now: {reason}')
+        obstacle.set_text(f'Start is not possible: {reason}')
         show_if(obstacle, bool(reason))
         page.allow(begin, not reason)
         page.allow(end, 'left [s]' in found.values)

@@ -55,7 +55,7 @@ def grouped(marks: Sequence[TrendMark], width: float) -> list[MarkGroup]:
     return [MarkGroup(group[0].time, ', '.join(
         f'{kind} ×{count}' if count > 1 else kind
         for kind, count in Counter(mark.kind for mark in group).items()), '; '.join((
-            *((f'{len(group) - _SAID} more',) if len(group) > _SAID else ()),
+            *((f'{len(group) - _SAID} earlier',) if len(group) > _SAID else ()),
             *(f'{mark.kind}: {mark.text}' for mark in group[-_SAID:]))),
         any(mark.kind == 'alarm' for mark in group)) for group in groups]
 

@@ -208,5 +208,5 @@ def test_events_that_are_near_are_one_mark() -> None:
         *((second, 'setpoint') for second in range(9)), (9, 'alarm'), (30, 'mode'))]
     assert [(mark.time, mark.label, mark.text, mark.alarm) for mark in grouped(marks, 10.0)] == [
         (0.0, 'setpoint ×9, alarm',
-         '7 more; setpoint: text 7; setpoint: text 8; alarm: text 9', True),
+         '7 earlier; setpoint: text 7; setpoint: text 8; alarm: text 9', True),
         (30.0, 'mode', 'mode: text 30', False)]
