@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -133,6 +133,9 @@ faults: $(VENV)/mpc.stamp  ## inject 167 faults into running loops of five plant
 docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env \
 	  --doctree-dir out/docs/.doctrees docs out/docs
+
+panel-pictures: $(VENV)/test.stamp  ## take the pictures of the panel, a minute -> docs
+	$(BIN)/python docs/panel_pictures.py
 
 config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from their tables
 	$(BIN)/python -m koopman_ros.ros.node_descriptions

@@ -66,7 +66,7 @@ _REMOTE_PERIOD = 0.5  # s between two looks at other nodes
 _LOGGED = 300  # characters of an action in the log
 #: node, service and type of the service, by action
 _SERVICES = {
-    'reload': (CONTROLLER, 'reload_model', Trigger),
+    'reset': (PLANT, 'reset', Trigger), 'reload': (CONTROLLER, 'reload_model', Trigger),
     'automatic': (CONTROLLER, 'set_automatic', SetBool),
     'train': (TRAINER, 'train', Trigger), 'cancel': (TRAINER, 'cancel_training', Trigger),
     'record': (TRAINER, 'record', SetBool), 'experiment': (TRAINER, 'experiment', SetBool)}
@@ -110,9 +110,8 @@ class PanelNode(LoopNode):
         self._subscribe()
         self._operator_actions = self._matching.publish(topics.AUDIT_LOG)
         self._nodes = {role: RemoteNode(
-            self, getattr(settings, role),
-            {service: kind for of, service, kind in _SERVICES.values() if of == role},
-            partial(self.view.take_parameters, role)) for role in (CONTROLLER, TRAINER)}
+            self, name, {service: kind for of, service, kind in _SERVICES.values() if of == role},
+            partial(self.view.take_parameters, role)) for role, name in nodes.items()}
         self._wake = self.create_guard_condition(self._on_actions)
         wall_timer(self, _PERIOD, self._on_timer)
         wall_timer(self, _REMOTE_PERIOD, self._on_remote_timer)
@@ -347,7 +346,9 @@ class PanelNode(LoopNode):
             reply(_not_running(CONTROLLER))
             return
         accepted = 'accepted'
-        if not setpoint and (limited := self.view.limited(name, value)) != value:
+        if setpoint and self.snapshot.mode == 'manual':
+            accepted = 'accepted: the controller follows it only in automatic mode'
+        elif not setpoint and (limited := self.view.limited(name, value)) != value:
             accepted = f'limited to {limited:.6g} {printed(read)}'
         own = float(conversion(read, unit)(value))
         answered = self._repeated.send(name, place, unit, own)

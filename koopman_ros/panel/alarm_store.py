@@ -108,7 +108,7 @@ def _identity(of: Path | int) -> _Identity:
 
 
 def _unused(path: Path) -> Path:
-    """Return a name beside a file that no other file has."""
+    """Return the name of a new file next to a file."""
     number, found = 1, path.with_name(f'{path.name}.damaged')
     while os.path.lexists(found):
         number, found = number + 1, path.with_name(f'{path.name}.damaged{number + 1}')

@@ -55,7 +55,7 @@ _PAGES: dict[str, Callable[[PageLayout], None]] = {
 
 
 class _AuthMiddleware:
-    """Middleware that refuses requests of other origins, and those of nobody who is logged in."""
+    """Middleware that refuses requests of other origins, and those without a log-in."""
 
     def __init__(self, app: Any, keeper: AccessControl, listener: Listener) -> None:
         self._app, self._keeper, self._listener = app, keeper, listener
@@ -86,7 +86,9 @@ class _AuthMiddleware:
                              users=self._keeper.users is not None):
             return Response(f'refused: {reason}\n', 403)
         if not logged_in and scope['path'] != '/login':
-            return RedirectResponse('/login', 303) if page else Response('log in first\n', 401)
+            asked = '' if scope['path'] == '/' else f'?page={scope["path"]}'
+            return RedirectResponse(f'/login{asked}', 303) if page else Response(
+                'log in first\n', 401)
         if scope['type'] == 'http' and scope['path'].startswith(_SOCKETS):
             # the id of a socket that polls would be a credential
             return Response('refused: only WebSockets are served here\n', 403)
@@ -134,12 +136,17 @@ class PanelServer:
     :param users: file of users, empty for none.
     :param proxies: addresses and networks of trusted proxies, empty for none.
     :raises ValueError: for an address that needs users, or a wrong file.
-    :raises OSError: for an address in use, or a file that cannot be read.
+    :raises OSError: for an address in use.
     """
 
     def __init__(self, source: Source, host: str, port: int, users: str, certificate: str,
                  key: str, proxies: Sequence[str] = ()) -> None:
-        found = Users.read(users) if users else None
+        try:
+            found = Users.read(users) if users else None
+        except OSError as error:
+            raise ValueError(
+                f'users = {users!r} cannot be read ({error.strerror}): write the file with '
+                f'python -m koopman_ros.panel.access {users} NAME operator') from error
         _check(host, users, found, certificate, key, proxies)
         self._socket = _bound(host, port)
         shown = f'[{host}]' if ':' in host else host

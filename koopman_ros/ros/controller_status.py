@@ -109,9 +109,9 @@ def statuses(now: StatusContext) -> dict[str, TaskReport]:
     found = {CONTROL: _control_status(now, warnings)}
     for condition in CONDITIONS:
         sentences = [sentence for of, sentence in warnings if of == condition]
-        found[condition] = TaskReport(Severity.WARN,
-                                      '; '.join(sentences)) if sentences else TaskReport(
-            Severity.OK, 'in order')
+        found[condition] = TaskReport(Severity.WARN, '; '.join(sentences), {
+            f'warning {number}': sentence for number, sentence in enumerate(sentences, 1)
+        }) if sentences else TaskReport(Severity.OK, 'in order')
     return found
 
 
