@@ -86,6 +86,7 @@ def conversion(unit: str, wanted: str) -> Conversion:
     return Conversion(factor, offset)
 
 
+@cache
 def check_unit(unit: str) -> None:
     """Raise ValueError for a unit that there is not."""
     if unit in _USUAL:

@@ -13,7 +13,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import group, parameter, per_signal, signal_value, UNBOUNDED
-from koopman_ros.core.units import check_unit, LAST_STAMP_SECONDS
+from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.parameters.signal_topics import (
     CommandedPlaces,
     DEFAULT_SYSTEM,
@@ -127,8 +127,6 @@ class PlantTable(ParameterTable[PlantParameters]):
         try:
             self.plant = plant_class(system)
             reference = build(self.plant, {})
-            for unit in (*reference.state_units, *reference.input_units):
-                check_unit(unit)
         except ValueError as error:
             raise ConfigurationError(f'system = {system!r}: {error}') from error
         self.described = signals = Signals(

@@ -38,8 +38,8 @@ def random_pair() -> tuple[ControlAffineSystem, LiftedModel]:
     A, B = rng.normal(size=(2, 2)) + 0.3 * np.eye(2), rng.normal(size=(2, 2)) + 2.0 * np.eye(2)
     system = ControlAffineSystem(
         'random pair', ('x1', 'x2'), ('1', '1'), ('u1', 'u2'), ('1/min', '1/min'), 'min',
-        lambda x: x @ A.T, lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)), B, np.zeros(2),
-        np.zeros(2))
+        lambda x: x @ A.T, B, np.zeros(2), np.zeros(2),
+        drift_jacobian=lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)))
     scale = np.array([1.0, 2.0])
     states, inputs = (
         Coordinates(names, units, np.zeros(2), scale, -10.0 * scale, 10.0 * scale)

@@ -20,8 +20,8 @@ def linear(A, B):
     return ControlAffineSystem(
         'linear', names, ('1',) * len(A), tuple(f'u{i}' for i in range(B.shape[1])),
         ('1',) * B.shape[1], 's', lambda x: x @ A.T,
-        lambda x: np.broadcast_to(A, (*x.shape, len(A))), B, np.zeros(len(A)),
-        np.zeros(B.shape[1]))
+        B, np.zeros(len(A)), np.zeros(B.shape[1]),
+        drift_jacobian=lambda x: np.broadcast_to(A, (*x.shape, len(A))))
 
 
 UNSTABLE = linear([[1.0]], [[1.0]])

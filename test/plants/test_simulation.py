@@ -269,7 +269,8 @@ def test_no_level_saves_it(changes, x0, message):
 
 def test_failure_that_is_not_the_box_is_passed_on():
     design = RandomStepDesign(-1.0, 1.0, -np.inf, np.inf, hold_time=1.0, sample_period=1.0)
-    broken = replace(two_state_example(), drift=lambda x: np.where(x > 0.5, np.inf, x))
+    broken = replace(two_state_example(), drift=lambda x: np.where(x > 0.5, np.inf, x),
+                     drift_jacobian=None)
     with pytest.raises(IntegrationError, match='its rate is not finite there'):
         random_steps(broken, design, 5.0, 0, x0=[1.0, 1.0])
 

@@ -38,8 +38,8 @@ class Vessel(Constants):
     def system(self):
         return ControlAffineSystem(
             'vessel', ('level',), ('m',), ('pump',), ('V',), 's', lambda x: -self.leak * x,
-            lambda x: np.full((*x.shape, 1), -self.leak),
-            np.array([[self.gain * self.strength]]), np.zeros(1), np.zeros(1))
+            np.array([[self.gain * self.strength]]), np.zeros(1), np.zeros(1),
+            drift_jacobian=lambda x: np.full((*x.shape, 1), -self.leak))
 
 
 TRUE = Vessel(gain=1.2, leak=0.4)
