@@ -133,7 +133,7 @@ class Signals:
     def __str__(self) -> str:
         """Write states and inputs with units."""
         return ' and '.join(
-            f'{kind} ' + ', '.join(f'{name} [{unit}]' for name, unit in of.items())
+            f'{kind} ' + ', '.join(described(of))
             for kind, of in (('states', self.states), ('inputs', self.inputs)))
 
     def defaults(self) -> dict[str, str]:
@@ -266,10 +266,15 @@ def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Messag
     return found
 
 
-def named_units(described: Collection[str]) -> dict[str, str]:
+def described(units: Mapping[str, str]) -> tuple[str, ...]:
+    """Return signals as :func:`named_units` reads them, e.g. ``level [m]``."""
+    return tuple(f'{name} [{unit}]' for name, unit in units.items())
+
+
+def named_units(texts: Collection[str]) -> dict[str, str]:
     """Return units by name of signals described as ``name [unit]``; ConfigurationError if not."""
     found = {}
-    for text in described:
+    for text in texts:
         match = _NAMED.fullmatch(text.strip())
         if match is None or match[1] in found:
             raise ConfigurationError(f'{text!r} must be a name and a unit, each name once, e.g. '

@@ -84,8 +84,14 @@ class Specification:
         bracket = '(' if self.open_minimum else '['
         return f'{bracket}{self.minimum:.10g}, {self.maximum:.10g}]{unit}'
 
+    @property
+    def notes(self) -> list[str]:
+        """The allowed values, and whether a node takes another one while it runs."""
+        return [*filter(None, [self.range_text]), *['fixed at start'] * self.read_only,
+                *['a module:name is fixed at start'] * self.code]
+
     def check(self, value: Any) -> str:
-        """Return what is wrong with a value of the right type, or an empty string."""
+        """Return the reason why a value of the right type is rejected, or an empty string."""
         unit = f' {self.unit}' if self.unit else ''
         if self.choices and value not in self.choices:
             return f'{self.name} = {value!r} must be {self.range_text}'
@@ -276,11 +282,8 @@ class ParameterTable(Generic[T]):
         """Write the table as a commented ROS parameter file, for nodes of any name."""
         lines = ['/**:', '  ros__parameters:']
         for name, row in self.rows.items():
-            notes = [row.range_text] if row.range_text else []
-            notes += ['fixed at start'] if row.read_only else []
-            notes += ['a module:name is fixed at start'] if row.code else []
             lines += ['', f'    # {row.description}' + (f' [{row.unit}]' if row.unit else '')]
-            lines += [f'    #   {"; ".join(notes)}'] if notes else []
+            lines += [f'    #   {"; ".join(row.notes)}'] if row.notes else []
             lines.append(f'    {name}: {as_yaml(row.default)}')
         return '\n'.join(lines) + '\n'
 

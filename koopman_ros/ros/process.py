@@ -6,6 +6,7 @@
 from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
+import re
 import signal
 import sys
 
@@ -150,25 +151,35 @@ def _loops_file(args: list[str] | None) -> str | None:
     return rest[1] if rest[:1] == [_LOOPS] and len(rest) == 2 else None
 
 
+def _given(args: list[str] | None) -> dict[str, str]:
+    """Return the system and the model among the arguments."""
+    found = (re.fullmatch(r'(?:.*:)?(system|model):=(.*)', arg) for arg in (
+        sys.argv if args is None else args))
+    return {match[1]: match[2].strip('\'"') for match in found if match}
+
+
 def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None:
-    """Print the help, or refuse what is not ROS's; return an exit code, or None to go on."""
-    try:
-        rest = remove_ros_args(args)[1:]
-    except RuntimeError:
-        # the start says what is wrong with them
-        return None
-    if not rest or (hosts and _loops_file(args) is not None):
-        return None
-    if '--help' in rest or '-h' in rest:
+    """Print the help, or refuse an unknown argument; return an exit code, or None to start."""
+    if {'--help', '-h'} & {*(sys.argv if args is None else args)}:
         # the tables of all nodes
         from koopman_ros.ros.node_descriptions import help_text
 
         try:
-            print(help_text(name), flush=True)
+            print(help_text(name, _given(args)), flush=True)
+        except ValueError as error:
+            print(f'{name}: {one_line(error)}', file=sys.stderr)
+            return 1
         except BrokenPipeError:
             # `--help | head` stops half-way; the interpreter flushes once more when it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    try:
+        rest = remove_ros_args(args)[1:]
+    except RuntimeError:
+        # rclpy.init gives the reason
+        return None
+    if not rest or (hosts and _loops_file(args) is not None):
+        return None
     print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
           'name:=value; --help says more', file=sys.stderr)
     return 2
