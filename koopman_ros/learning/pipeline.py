@@ -18,6 +18,7 @@ from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.plots import finite
+from koopman_ros.core.progress import progress_line
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import (
@@ -160,7 +161,7 @@ class Retrained:
         return finite_figures
 
 
-def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
+def retrain(task: TrainingTask, on_progress: OnProgress | None = None) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -169,6 +170,8 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     training makes of a sibling's would be refused, training starts again without the sibling.
     The result does not depend on the executor of the task.
 
+    :param on_progress: called with the share done and a text; True stops the training. By default
+        a terminal shows both on one line.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
@@ -177,8 +180,8 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
     """
     checked_device(task.device)
-    with backend_of(task.executor) as backend:
-        return _retrain(backend, task, on_progress)
+    with backend_of(task.executor) as backend, progress_line() as report:
+        return _retrain(backend, task, on_progress or (lambda *now: bool(report(*now))))
 
 
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> Retrained:
@@ -273,9 +276,7 @@ class _Progress:
 
     def learning(self, now: MultistartProgress) -> bool:
         self.learned = now.finished / now.total
-        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
-        self('learn', self.learned, f'learning: {now.name}, n_z {now.n_z}, start '
-             f'{min(now.finished + 1, now.total)} of {now.total}{rw}')
+        self('learn', self.learned, f'learning: {now.name}, {now.text}')
         return False
 
     def judging(self, name: str, share: float) -> bool:

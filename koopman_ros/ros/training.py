@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.paths import model_path
+from koopman_ros.core.progress import show_bar
 from koopman_ros.execution.training import (
     class_lines,
     constant_lines,
@@ -32,7 +33,6 @@ from koopman_ros.ros.node import LoopNode
 
 POLL_PERIOD = 0.1  # s between two looks at a training
 _LINE_PERIOD = 5.0  # s between plain lines of progress
-_BAR_WIDTH = 30
 
 
 def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
@@ -87,11 +87,7 @@ class TrainingProgress:
     def show(self, state: JobState) -> None:
         """Show a state of the training."""
         if sys.stderr.isatty():
-            full = round(_BAR_WIDTH * state.share)
-            bar = '#' * full + '-' * (_BAR_WIDTH - full)
-            text, end = ('', '\n') if state.ended else (state.text, '')
-            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
-                  file=sys.stderr, flush=True)
+            show_bar(state.share, *(('', '\n') if state.ended else (state.text,)))
         elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
             self._last_line = time.monotonic()
             self._say(f'{100.0 * state.share:.0f} %: {state.text}')

@@ -15,6 +15,7 @@ import numpy as np
 from koopman_ros import __version__
 from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
+from koopman_ros.core.progress import progress_line
 from koopman_ros.evaluation.closed_loop_test import (
     ClosedLoopTest,
     evaluate_closed_loops,
@@ -143,6 +144,8 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
     :param starts: number of starts in each round; their seeds are drawn from `seed`.
+    :param watch: called with the progress; True ends the training with the best lift so far. By
+        default a terminal shows the progress on one line.
     :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
         refused.
     :param loops: closed loops in which the law is tried before, see
@@ -169,7 +172,6 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
         rounds = _further(recipe, rounds, begin)
     prepared = PreparedSamples.of(plant, samples)
     parts, box = prepared.parts, prepared.box
-    tracker = Tracker(watch, starts * len(rounds) - (starts - 1) * (begin is not None))
     backend = backend or Serial()
     scaling = Scaling.of(plant, box, parts[0],
                          recipe.pre_feedback if isinstance(recipe, IncrementalTraining) else None)
@@ -186,9 +188,13 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     def judge(grown: TrainedLift | str) -> _Candidate | str:
         return _judged(grown, lambda found: scaling.model(found, **about), parts)
 
-    path, interrupted = _run_rounds(rounds, tracker, run, judge)
-    return _conclude(prepared, path, interrupted, tracker, loops if refuse else 0, refuse,
-                     backend)
+    with progress_line() as report:
+        tracker = Tracker(
+            watch or (lambda now: bool(report(now.finished / now.total, now.text))),
+            starts * len(rounds) - (starts - 1) * (begin is not None))
+        path, interrupted = _run_rounds(rounds, tracker, run, judge)
+        return _conclude(prepared, path, interrupted, tracker, loops if refuse else 0, refuse,
+                         backend)
 
 
 def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple[int, ...]:
