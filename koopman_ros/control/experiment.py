@@ -70,8 +70,8 @@ class Experiment:
             if not rate > 0.0:
                 raise ValueError(f'{name}: rate = {rate} must be above 0')
         if not 0.0 < self.hold_shortest <= self.hold_longest:
-            raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and not '
-                             f'above hold_longest = {self.hold_longest} s')
+            raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and at most '
+                             f'hold_longest = {self.hold_longest} s')
         if not 0.0 < self.duration < np.inf:
             raise ValueError(f'duration = {self.duration} s must be finite and above 0')
 

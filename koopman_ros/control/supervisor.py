@@ -39,8 +39,8 @@ class FallbackOrder:
     def __post_init__(self) -> None:
         if list(self.margins) != sorted(self.margins):
             raise ValueError(f'fallback_order = {list(self.laws)}, learned_model_margin and '
-                             'linear_model_margin: the margin of a level must not be below '
-                             f'that of a better one, got {list(self.margins)}')
+                             'linear_model_margin: the margin of a level must be at least that of '
+                             f'the better ones, got {list(self.margins)}')
 
     @cached_property
     def levels(self) -> tuple[str, ...]:

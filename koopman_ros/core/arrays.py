@@ -73,8 +73,8 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     refused = ~np.isfinite(array) if finite else np.isnan(array)
     if refused.any():
         position = tuple(map(int, np.argwhere(refused)[0]))
-        raise ValueError(f'{name} must be finite: entry {list(position)} is {array[position]}; '
-                         'check where that number was computed or measured')
+        raise ValueError(f'{name} must be finite, but entry {list(position)} is '
+                         f'{array[position]}: check its source')
     array.setflags(write=False)
     return array
 

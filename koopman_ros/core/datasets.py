@@ -50,7 +50,7 @@ class PlantDescription:
         for kind in ('state', 'input'):
             for what in ('names', 'units'):
                 if isinstance(given := getattr(self, f'{kind}_{what}'), str):
-                    raise ValueError(f'{kind}_{what} is the text {given!r}: pass a sequence, '
+                    raise ValueError(f'{kind}_{what} is the string {given!r}: pass a sequence, '
                                      f'({given!r},) for one {kind}')
             names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
             for unit in units:
@@ -80,7 +80,7 @@ class PlantDescription:
         """
         shape = (*np.shape(x), len(self.input_names))
         if self.B is None:
-            raise ValueError('B is not known: give it to the plant')
+            raise ValueError('B is unknown: pass it to PlantDescription')
         if not callable(self.B):
             return np.broadcast_to(self.B, shape)
         found = np.asarray(self.B(x), dtype=np.float64)
@@ -118,22 +118,24 @@ class Episode:
             t = np.ascontiguousarray(real(getattr(self, times), times))
             v = np.ascontiguousarray(real(getattr(self, values), values))
             if (t.ndim, v.ndim) == (2, 1):
-                raise ValueError(f'{times} has shape {t.shape} and {values} {v.shape}: they are '
-                                 'exchanged; pass the times first')
+                raise ValueError(f'{times} has shape {t.shape} and {values} {v.shape}: the '
+                                 'arguments are swapped; pass the times first')
             if (t.ndim, v.ndim) == (1, 1):
-                raise ValueError(f'{values} has shape {v.shape}: pass one column for each signal, '
-                                 f'{values}[:, None] for one')
+                raise ValueError(f'{values} has shape {v.shape}: pass one column per signal, '
+                                 f'{values}[:, None] for a single one')
             if t.ndim != 1 or v.ndim != 2 or len(t) != len(v) or len(t) == 0:
                 raise ValueError(f'incompatible {times} and {values}: expected (n,) and (n, m) '
                                  f'with n > 0, got {t.shape} and {v.shape}')
             if not (np.all(np.isfinite(t)) and np.all(np.isfinite(v))):
-                raise ValueError(f'{times} or {values} hold values that are not finite: drop them')
+                raise ValueError(f'{times} or {values} contain values that are not finite: remove '
+                                 'those samples')
             if not np.all(np.diff(t) > 0.0):
-                raise ValueError(f'{times} must rise: sort the samples and drop repeated ones')
+                raise ValueError(f'{times} must increase: sort the samples and remove repeated '
+                                 'ones')
             object.__setattr__(self, times, t)
             object.__setattr__(self, values, v)
         if self.input_time[0] > self.time[0]:
-            raise ValueError('the input at the first measurement is not known: begin the episode '
+            raise ValueError('the input at the first measurement is unknown: begin the episode '
                              'with the first measurement after an input')
         if self.linear and len(self.linear) != self.u.shape[1]:
             raise ValueError(f'linear = {self.linear} must have one entry for each of '
@@ -227,8 +229,8 @@ def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samp
         edges = np.flatnonzero(np.diff(inside, prepend=False, append=False)).reshape(-1, 2)
         parts += [episode.part(a, b) for a, b in edges.tolist() if b - a >= samples]
     if not parts:
-        raise ValueError(f'no {samples} samples in a row lie between {low} and {high}: choose '
-                         'a wider range, or record within this one')
+        raise ValueError(f'no {samples} consecutive samples lie between {low} and {high}: choose '
+                         'a wider range, or record more data in this one')
     return parts
 
 
@@ -254,8 +256,8 @@ class DriftSamples:
     def __post_init__(self) -> None:
         episode = np.ascontiguousarray(self.episode)
         if episode.ndim != 1 or not np.array_equal(episode, episode.astype(np.int64)):
-            raise ValueError('episode must hold one whole number a sample, that of its episode, '
-                             f'got an array {episode.shape} of {episode.dtype}')
+            raise ValueError('episode must hold one integer per sample, the number of its '
+                             f'episode, got an array {episode.shape} of {episode.dtype}')
         object.__setattr__(self, 'episode', episode)
         for name in ('x', 'dxdt', 'u'):
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
@@ -264,7 +266,7 @@ class DriftSamples:
                     f'incompatible {name}: expected ({len(self)}, n), got {array.shape}')
             if count := np.count_nonzero(~np.isfinite(array)):
                 raise ValueError(
-                    f'{name} holds {count} values that are not finite: drop those samples')
+                    f'{name} contains {count} values that are not finite: remove those samples')
             object.__setattr__(self, name, array)
         if self.x.shape != self.dxdt.shape:
             raise ValueError(f'incompatible dxdt: expected {self.x.shape}, got {self.dxdt.shape}')
@@ -276,8 +278,8 @@ class DriftSamples:
             order = np.argsort(self.episode, kind='stable')
             within = np.diff(np.asarray(self.episode)[order]) == 0
             if not (np.all(np.isfinite(time)) and np.all(np.diff(time[order])[within] > 0.0)):
-                raise ValueError('time must rise from sample to sample within an episode: '
-                                 'sort the samples and drop repeated ones')
+                raise ValueError('time must increase from sample to sample within an episode: '
+                                 'sort the samples and remove repeated ones')
             object.__setattr__(self, 'time', time)
 
     def __len__(self) -> int:
@@ -309,8 +311,8 @@ def split_by_episode(samples: DriftSamples, seed: int) -> tuple[DriftSamples, Dr
     """
     episodes = np.unique(samples.episode)
     if len(episodes) < 3:
-        raise ValueError(f'training needs at least 3 episodes to hold some out, got '
-                         f'{len(episodes)}: record more, or cut the record into episodes')
+        raise ValueError('training needs at least 3 episodes, because some are held out, got '
+                         f'{len(episodes)}: record more, or split the record into episodes')
     order = np.random.default_rng(seed).permutation(episodes)
     held = max(1, len(episodes) // 5)
     return (samples.take(order[2 * held:]), samples.take(order[:held]),

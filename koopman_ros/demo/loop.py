@@ -122,7 +122,7 @@ class Operator:
         end = FIRST_STAMP_NS + seconds * NANOSECONDS
         while self.last_stamp_ns < end:
             self.harness.wait_until(partial(self._answered_after, self.last_stamp_ns),
-                                    'the loop stands still: no command')
+                                    'the loop has stopped: no command was received')
 
     def _answered_after(self, stamp_ns: int) -> bool:
         return self.last_stamp_ns > stamp_ns
@@ -132,7 +132,8 @@ class Operator:
         if self._setpoints is None:
             self._setpoints = SignalPublisher(
                 self._wiring.setpoints, self._wiring.signals.states, self._publisher)
-            self.harness.wait_until(lambda: self.found_loop, 'nobody hears the set-points')
+            self.harness.wait_until(lambda: self.found_loop,
+                                    'no node subscribes to the set-points')
         stamp = FIRST_STAMP_NS + round(seconds * NANOSECONDS)
         wanted = [setpoints[name] for name in self._wiring.setpoints]
         self._setpoints.send(np.array(wanted), stamp_message(stamp), 'operator')
@@ -177,7 +178,7 @@ class Operator:
                 raise HarnessError(f'{task}: {status.message}')
             return status if status is not None and status.message.startswith(words) else None
 
-        status = self.harness.wait_until(found, f'the {task} did not end', timeout)
+        status = self.harness.wait_until(found, f'the {task} did not finish', timeout)
         assert status is not None
         return status
 
@@ -258,13 +259,13 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
         if found := foreign(harness, scenario.wiring):
             raise HarnessError(
                 f'ROS domain {domain} has other nodes with the names or topics of the demo: '
-                f'{found}; end them, or start in another domain: '
+                f'{found}; stop them, or use another domain: '
                 f'ROS_DOMAIN_ID={(int(domain) + 1) % 102} make demo')
         operator = Operator(scenario, harness, on_row)
         harness.start('controller', {'system': scenario.system, **scenario.controller})
         harness.start('trainer', {'system': scenario.system, **trainer})
         harness.wait_until(lambda: operator.found_loop,
-                           'controller and trainer did not find each other')
+                           'controller and trainer did not discover each other')
         if panel is not None:
             shown = harness.start('panel', {'system': scenario.system, **panel})
             address = harness.wait_until(lambda: re.search(r'the panel is at (\S+)',

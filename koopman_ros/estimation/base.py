@@ -82,8 +82,8 @@ class Estimate:
         P = self.covariance
         shapes = (np.shape(self.x), np.shape(self.w), None if P is None else np.shape(P))
         if shapes not in (((n_x,), (n_x,), None), ((n_x,), (n_x,), (2 * n_x, 2 * n_x))):
-            raise ValueError(f'the estimator returned x, w and covariance of shapes {shapes} for '
-                             f'{n_x} states')
+            raise ValueError(f'the estimator returned x, w and covariance with shapes {shapes} '
+                             f'for {n_x} states')
         if not isinstance(self.innovation, Innovation | None):
             raise TypeError(f'the estimator returned {type(self.innovation).__name__} as the '
                             'innovation')

@@ -51,9 +51,9 @@ class DisturbanceObserver(Estimator):
                  ) -> None:
         super().__init__(model, outputs, tuning, parameters)
         if not outputs.determine_state:
-            raise ValueError(f'{", ".join(outputs.names)}, measured, do not determine all '
-                             f'{model.n_x} states: measure as many, or take a Kalman filter as '
-                             'the estimator')
+            raise ValueError(f'{", ".join(outputs.names)} are measured, which does not determine '
+                             f'all {model.n_x} states: measure as many, or set estimator to a '
+                             'Kalman filter')
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model under input and disturbance."""

@@ -108,7 +108,7 @@ class ExtendedKalmanFilter(Estimator):
             if self._determined(found):
                 return found
         names = ', '.join(self.outputs.names)
-        raise ValueError(f'{names}, measured, do not determine the states '
+        raise ValueError(f'the measurements of {names} do not determine the states '
                          f'{", ".join(model.states.names)} and a disturbance for each: measure '
                          'another signal')
 

@@ -47,11 +47,12 @@ def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
     low, high = shown(states.lower[i], unit), shown(states.upper[i], unit)
     axes.axvspan(low, high, **DRAWN_RANGE)
     kinds: tuple[tuple[NDArray[np.bool_], str, dict[str, Any]], ...] = (
-        (~check.poor & ~failed, f'arrives at up to {MOST_COST:g} times the cost of a linear law',
+        (~check.poor & ~failed, f'reaches the set-point at up to {MOST_COST:g} times the cost of '
+                                'a linear law',
          {'color': '0.45', 'marker': '.'}),
-        (check.poor & ~failed, 'does not, nor would it with a perfect model',
+        (check.poor & ~failed, 'does not; a perfect model would not either',
          {'facecolors': 'none', 'edgecolors': 'tab:blue', 'marker': 'o'}),
-        (failed, 'would cost clearly less, or arrive, with a perfect model',
+        (failed, 'would cost clearly less, or reach the set-point, with a perfect model',
          {'color': 'tab:red', 'marker': 'x'}))
     for chosen, label, style in kinds:
         if chosen.any():

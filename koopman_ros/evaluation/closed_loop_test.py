@@ -152,9 +152,10 @@ class ClosedLoopTest:
     def __str__(self) -> str:
         """Say in one clause how many loops failed, how, and where."""
         if not self.loops:
-            return (f'no law arrives in any of {self.hopeless} closed loops over the box, linear '
-                    'ones included')
-        text = f'the law fails in {np.sum(self.failed)} of {self.loops} closed loops over the box'
+            return ('no law, not even a linear one, reaches the set-point in any of '
+                    f'{self.hopeless} closed loops over the trained range')
+        text = (f'the law fails in {np.sum(self.failed)} of {self.loops} closed loops over the '
+                'trained range')
         if not self.failed.any():
             sound = self.ratios[~self.poor]
             worst = float(np.max(sound)) if len(sound) else math.nan
@@ -206,7 +207,7 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     :raises ValueError: for a model without inputs.
     """
     if model.n_u == 0:
-        raise ValueError('a plant without inputs has no closed loop')
+        raise ValueError('a plant without inputs cannot be controlled')
     tuning = tuning or Tuning.for_model(model, max_gain=_LARGEST_GAIN)
     limits = limits or tuning.limits
     plant = DriftPlant(model, rate)

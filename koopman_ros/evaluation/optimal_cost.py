@@ -87,7 +87,7 @@ def optimum(task: Task) -> OptimalTrajectory:
     K = riccati.K if riccati.status is RiccatiStatus.SOLVED else np.zeros_like(riccati.K)
     course = _constant_law(task, task.u_ref, K, task.x_ref)
     if not math.isfinite(course.cost):
-        raise ValueError(f'{system.name}: the linear law does not hold the plant from '
+        raise ValueError(f'{system.name}: the linear law does not stabilise the plant from '
                          f'{system.describe_state(task.x0)}: start nearer to the set-point')
     for _ in range(_MAX_ITERATIONS):
         change, gains, gain = _improvement(task, course)
@@ -100,8 +100,8 @@ def optimum(task: Task) -> OptimalTrajectory:
         if better.cost >= course.cost:
             break
         course = better
-    raise ValueError(f'{system.name}: no optimum found, the cost is still {course.cost:.6g} and '
-                     f'would fall by {gain:.3g}: shorten the horizon or the period')
+    raise ValueError(f'{system.name}: no optimum found: the cost is {course.cost:.6g} and could '
+                     f'still fall by {gain:.3g}; shorten the horizon or the period')
 
 
 def _constant_law(task: Task, u: Array, K: Array, x: Array) -> OptimalTrajectory:

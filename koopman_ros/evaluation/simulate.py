@@ -253,7 +253,7 @@ def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) ->
         if not lower <= value <= upper:
             raise ValueError(f'{name} = {value:.6g} {unit} is outside the trained range '
                              f'{lower:.6g} {unit} to {upper:.6g} {unit}: choose a set-point '
-                             'inside, or a model trained over a wider range')
+                             'inside it, or a model trained over a wider range')
     if not controlled:
         target = steady_state_target(model, states.to_deviation(setpoint))
         nearest = target.x if model.n_u >= model.n_x else (
@@ -263,7 +263,7 @@ def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) ->
             where = '' if nearest is None else (
                 f'; the nearest steady state is {states.to_physical(nearest).tolist()}')
             raise ValueError(f'no input of the model holds {", ".join(states.names)} at '
-                             f'{setpoint.tolist()}{where}: choose another set-point, or name in '
+                             f'{setpoint.tolist()}{where}: choose another set-point, or list in '
                              'controlled the states that have one')
         return target
     endless = np.full(model.n_u, np.inf)
@@ -343,7 +343,7 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
                 inputs.append(model.inputs.to_physical(act(x)[1]))
                 states.append(x)
             if np.max(np.abs(model.states.to_deviation(solver.y[:-1]))) > escape:
-                raise _Failed('the state escaped')
+                raise _Failed('the state diverged')
             if solver.nfev > max_evaluations:
                 raise _Failed(f'the law was evaluated {max_evaluations} times before the end')
         cost = float(solver.y[-1])

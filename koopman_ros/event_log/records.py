@@ -74,7 +74,7 @@ def parse(text: str) -> EventRecord:
         version = fields.pop('version')
         if version != VERSION:
             raise RecordError(
-                f'its records are of version {version!r}, this package reads {VERSION}: take the '
+                f'its records have version {version!r}, this package reads {VERSION}: use the '
                 'package that recorded it')
         record = EventRecord(str(fields.pop('run')), int(fields.pop('number')),
                              str(fields.pop('event')), fields)
@@ -82,7 +82,7 @@ def parse(text: str) -> EventRecord:
     except RecordError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise RecordError(f'{text[:60]!r} is no record of a controller') from error
+        raise RecordError(f'{text[:60]!r} is not a record of a controller') from error
     return record
 
 
@@ -105,7 +105,7 @@ def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, d
 def event_of(record: EventRecord) -> events.Event:
     """Return the event of a record; raise KeyError, TypeError or ValueError where it has none."""
     if record.event not in EVENTS:
-        raise ValueError(f'the event {record.event!r} is not known')
+        raise ValueError(f'unknown event {record.event!r}')
     kind = EVENTS[record.event]
     return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]})
 
@@ -121,7 +121,7 @@ def state_of(record: EventRecord) -> State:
     """Return the state in a snapshot; raise KeyError, TypeError or ValueError for another."""
     state = decoded(record.fields['state'])
     if not isinstance(state, State):
-        raise TypeError(f'a {type(state).__name__} is no state of a controller')
+        raise TypeError(f'a {type(state).__name__} is not a state of a controller')
     return state
 
 
@@ -216,7 +216,7 @@ def numbers(values: NDArray[Any]) -> list[Any]:
 def float_array(values: Any) -> NDArray[np.float64]:
     """Return what :func:`numbers` was given; raise TypeError or ValueError for no numbers."""
     if not isinstance(values, list):
-        raise TypeError(f'{values!r} is no list of numbers')
+        raise TypeError(f'{values!r} is not a list of numbers')
     array = np.array([float(item) for item in values], dtype=np.float64)
     array.setflags(write=False)
     return array

@@ -56,7 +56,7 @@ def replay_bags(parameters: ReplayParameters, topic: str = RECORDS,
         from koopman_ros.event_log.figure import draw
     except ImportError as error:
         raise ConfigurationError(
-            'the picture needs matplotlib, which is missing: pip install matplotlib, or '
+            'the plot needs matplotlib, which is not installed: pip install matplotlib, or '
             'apt-get install python3-matplotlib') from error
 
     bags = [replayed_bag(path, parameters, topic, given) for path in parameters.bags]
@@ -134,10 +134,10 @@ def _controller(values: Mapping[str, Any], model: LiftedModel) -> Controller:
     if unknown := ', '.join(sorted(
             name for name in set(values) - set(table.rows)
             if '.' not in name or name.partition('.')[0] in signals.units)):
-        raise RecordError(f'its controller had the parameters {unknown}, which this version has '
-                          'not: take the package that recorded it')
+        raise RecordError(f'its controller had the parameters {unknown}, which this version does '
+                          'not have: use the package that recorded it')
     snapshot = table.snapshot(values)
     if reason := table.check(snapshot):
-        raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
-                          'take the package that recorded it')
+        raise RecordError(f'its controller had parameters that this version rejects ({reason}): '
+                          'use the package that recorded it')
     return built(snapshot, model)

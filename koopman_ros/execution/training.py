@@ -14,7 +14,7 @@ from typing import Any
 
 from koopman_ros.execution.job import Job
 
-_CANCELLED = 'cancelled, nothing was written'
+_CANCELLED = 'cancelled; nothing was written'
 
 
 @dataclass(frozen=True)
@@ -104,12 +104,12 @@ class TrainingJob(Job):
             text = _CANCELLED
         elif code < 0:
             name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
-            remedy = ('a day of processor time is its limit: train on fewer bags'
+            remedy = ('the limit is one day of processor time; train on fewer bags'
                       if name == 'SIGXCPU' else
-                      'see whether the memory suffices, and train again')
+                      'check the free memory, and train again')
             text = f'the training process was killed by {name}: {remedy}'
         else:
-            last = self.errors[-1] if self.errors else 'it said nothing'
+            last = self.errors[-1] if self.errors else 'no error message'
             text = f'the training process ended with code {code}: {last}'
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): '
@@ -120,15 +120,15 @@ class TrainingJob(Job):
 def _in_words(summary: Mapping[str, Any]) -> str:
     if not summary['accepted']:
         reasons = '; '.join(summary['reasons'])
-        kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
-        return f'the new model ({summary["model_class"]}) is refused: {reasons}{kept}'
+        kept = f'; saved as {summary["model_file"]}' if summary['model_file'] else ''
+        return f'the new model ({summary["model_class"]}) is rejected: {reasons}{kept}'
     present = summary['heldout_error_of_present_lift']
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
         'heldout_error_of_present_lift', 'present one'))
     units = summary['units']
-    return (f'the new model ({summary["model_class"]}) is accepted: error on held-out records '
+    return (f'the new model ({summary["model_class"]}) is accepted: its error on held-out data is '
             f'{_errors(summary["heldout_error"], units)}, that of the {name} '
-            + ('infinite, as it diverges' if None in summary[other].values()
+            + ('infinite (diverges)' if None in summary[other].values()
                else _errors(summary[other], units))
             + f'; written to {summary["model_file"]}')
 

@@ -63,7 +63,7 @@ class Provenance:
     def __post_init__(self) -> None:
         if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
                 self.accepted is not None):
-            raise ValueError(f'accepted = {self.accepted} does not fit the reasons '
+            raise ValueError(f'accepted = {self.accepted} contradicts the reasons '
                              f'{list(self.reasons)}')
 
     @property
@@ -240,7 +240,7 @@ class LiftedModel:
             xi = solver.y.reshape(shape)
             if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
                 raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
-                                   'inputs within the training box')
+                                   'inputs within the trained range')
             path.append(xi)
         return self.states.to_physical(np.stack(path, axis=-2))
 

@@ -67,7 +67,7 @@ class Weights:
             shape = np.shape(getattr(self, name))
             if len(shape) != 2 or shape[0] != shape[1]:
                 raise ValueError(f'incompatible {name}: expected a square matrix, got {shape}; '
-                                 'Weights.physical takes one weight a signal')
+                                 'Weights.physical takes one weight per signal')
             M = frozen(getattr(self, name), name, shape)
             values = np.linalg.eigvalsh(M)
             size = float(np.max(np.abs(values), initial=0.0))

@@ -41,7 +41,8 @@ class MPCParameters:
     upper: Array = value_column(
         'states', UNBOUNDED, 'Soft upper limit of this state.', name='max', none=NO_UPPER)
     time_limit: float = parameter(
-        0.0, 'Computing time of a plan after which the next law acts; 0: any.', 's', 0.0, 3600.0)
+        0.0, 'Computing time of a plan above which the next law takes over; 0: no '
+             'limit.', 's', 0.0, 3600.0)
 
 
 class RecedingHorizon(Law):
