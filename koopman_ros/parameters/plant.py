@@ -51,9 +51,9 @@ class StateParameters(MeasuredPlace):
     bias: float = parameter(
         0.0, 'Offset of the measurement.', '{unit}', -UNBOUNDED, UNBOUNDED)
     resolution: float = parameter(
-        0.0, 'Resolution of the measurement; 0: unlimited.', '{unit}', 0.0, 1e9)
+        0.0, 'Resolution of the measurement; 0: exact.', '{unit}', 0.0, 1e9)
     initial_offset: float = parameter(
-        0.0, 'Distance from the steady state at the start.', '{unit}', -UNBOUNDED, UNBOUNDED,
+        0.0, 'Initial offset from the steady state.', '{unit}', -UNBOUNDED, UNBOUNDED,
         read_only=True)
 
 
@@ -62,13 +62,13 @@ class InputParameters(CommandedPlaces):
     """The actuator of an input."""
 
     min: float = signal_value(
-        -UNBOUNDED, 'Lowest value that the actuator reaches.')
+        -UNBOUNDED, 'Lower limit of the actuator.')
     max: float = signal_value(
-        UNBOUNDED, 'Highest value that the actuator reaches.')
+        UNBOUNDED, 'Upper limit of the actuator.')
     delay: float = parameter(
         0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
     lag: float = parameter(
-        0.0, 'Time constant with which the input follows its command; 0: at once.', 's', 0.0,
+        0.0, 'Time constant of the actuator; 0: no lag.', 's', 0.0,
         3600.0)
 
 
@@ -77,13 +77,13 @@ class PlantParameters:
     """Snapshot of the plant's parameters, in the units that people read."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'Plant to simulate: one of the library, an entry point of the group '
-        'koopman_ros.plants, or package.module:Class.', read_only=True)
+        DEFAULT_SYSTEM, 'Plant to simulate: the name of a library plant, an entry point of the '
+                        'group koopman_ros.plants, or package.module:Class.', read_only=True)
     measured: tuple[str, ...] = parameter(
         ('',), 'States whose measurements must have subscribers before lock-step starts; an empty '
         'name: all.', read_only=True)
     autostart: bool = parameter(
-        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        True, 'Configure and activate at start-up; false: left to a lifecycle manager.',
         read_only=True)
     sample_period: float = parameter(
         1.0, 'Time between measurements.', 's', 1e-3, 3600.0, read_only=True)
@@ -92,19 +92,22 @@ class PlantParameters:
         1.0, 'Simulated seconds per second; 0: as fast as possible.', '', 0.0, 1e6, smallest=1e-6,
         read_only=True)
     lockstep: bool = parameter(
-        False, 'Wait for the command of each measurement before the next one.',
+        False, 'Lock-step: wait for the command of each measurement before the next one.',
         read_only=True)
     lockstep_timeout: float = parameter(
-        5.0, 'Wall time after which lock-step continues with the last command.', 's', 0.01, 3600.0,
+        5.0, 'Wall time without a command after which lock-step continues with the last '
+             'one.', 's', 0.01, 3600.0,
         read_only=True)
     lockstep_subscribers: int = parameter(
-        1, 'Number of subscribers of the measurements before lock-step starts.', '', 1, 1000,
+        1, 'Number of subscribers to the measurements that lock-step waits for at the '
+           'start.', '', 1, 1000,
         read_only=True)
     duration: float = parameter(
-        0.0, 'Simulated time after which the simulation stops; 0: never.', 's', 0.0, 1e9,
+        0.0, 'Simulated duration; 0: unlimited.', 's', 0.0, 1e9,
         read_only=True)
     start_time: float = parameter(
-        1.0, 'Time of the first measurement when not in real time.', 's', 1e-3, LAST_STAMP_SECONDS,
+        1.0, 'Stamp of the first measurement when not in real '
+             'time.', 's', 1e-3, LAST_STAMP_SECONDS,
         read_only=True)
     publish_clock: bool = parameter(True, 'Publish /clock when not in real time.', read_only=True)
     frame_id: str = parameter('plant', 'frame_id of the messages.', read_only=True)
@@ -169,12 +172,12 @@ class PlantTable(ParameterTable[PlantParameters]):
 def _cross_check(signals: Signals, values: PlantParameters) -> str:
     if values.start_time + values.duration > LAST_STAMP_SECONDS:
         return (f'start_time + duration = {values.start_time + values.duration:.10g} s must be at '
-                f'most {LAST_STAMP_SECONDS} s, where the stamps of messages end: choose a smaller '
+                f'most {LAST_STAMP_SECONDS} s, the largest message stamp: choose a smaller '
                 'start_time')
     if len(values.frame_id) > LONGEST_FRAME_ID:
-        return (f'frame_id has {len(values.frame_id)} characters, must have at most '
+        return (f'frame_id has {len(values.frame_id)} characters, the maximum is '
                 f'{LONGEST_FRAME_ID}: shorten it')
     if unknown := set(filter(None, values.measured)) - set(signals.states):
-        return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}, the '
-                f'states are {", ".join(signals.states)}: choose among them')
+        return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}: choose '
+                f'from the states {", ".join(signals.states)}')
     return SignalTopics(signals, values.states, values.inputs, PLANT_KINDS).check()

@@ -264,7 +264,7 @@ class ParameterTable(Generic[T]):
             self.amended(snapshot, **{row.name: old[row.name]}))] or changed
         given = ' and '.join(self._given(row.name, values) for row in guilty)
         ranges = dict.fromkeys(f' in {row.range_text}' for row in guilty if row.range_text)
-        return f'{given} cannot be used: {error}; choose another value{" or".join(ranges)}'
+        return f'{given} is not usable: {error}; choose another value{" or".join(ranges)}'
 
     def _given(self, name: str, values: Mapping[str, Any]) -> str:
         return f'{name} = {values[name]} {self.rows[name].unit}'.rstrip()

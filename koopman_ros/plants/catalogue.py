@@ -44,8 +44,8 @@ def plant_class(name: str) -> Any:
     known = PLANTS | {entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)
                       if entry.name not in PLANTS}
     if name not in known:
-        raise ValueError(f'there is no plant {name!r}: choose one of {", ".join(known)}, or write '
-                         'module:Class; a package that offers one by name must be built, and its '
+        raise ValueError(f'unknown plant {name!r}: choose one of {", ".join(known)}, or use '
+                         'module:Class; a package that provides a plant must be installed and its '
                          'workspace sourced')
     return load_plugin(name, 'plant', known)
 
@@ -72,9 +72,9 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
     except ValueError:
         raise
     except BaseException as error:  # code of one's own may raise anything, SystemExit included
-        raise ValueError(f'the plant {name} cannot be built ({contained(error)}): correct its '
-                         'class') from error
+        raise ValueError(f'the plant {name} cannot be constructed ({contained(error)}): correct '
+                         'the class') from error
     if not isinstance(made, ControlAffineSystem):
         raise ValueError(f'the plant {name} returned a {type(made).__name__}, must be a '
-                         'ControlAffineSystem: return one from its method system')
+                         'ControlAffineSystem: return one from the method system')
     return made

@@ -121,19 +121,19 @@ def estimated_parameters_of(plant: Any, ranges: Mapping[str, tuple[float, float]
     known = {constant.name: constant for constant in constants_of(plant)}
     own = {name: constant.estimated for name, constant in known.items() if constant.estimated}
     if not (ranges or own):
-        raise ValueError(f'{plant.__name__} does not say which of its constants are to be '
-                         f'estimated: name some of {", ".join(known) or "none"}, with ranges')
+        raise ValueError(f'{plant.__name__} marks no constants as estimated: name some of '
+                         f'{", ".join(known) or "none"}, with ranges')
     found = []
     for name, given in (ranges or dict.fromkeys(own)).items():
         if name not in known:
-            raise ValueError(f'{name} is no constant of {plant.__name__}: it has '
+            raise ValueError(f'{name} is not a constant of {plant.__name__}: choose from '
                              f'{", ".join(known) or "none"}')
         one = known[name]
         low, high = given or own.get(name) or (one.lower, one.upper)
         if not one.lower <= low < high <= one.upper:
             raise ValueError(
-                f'the range of {name} is [{low:.10g}, {high:.10g}] {one.unit}, must rise and lie '
-                f'in [{one.lower:.10g}, {one.upper:.10g}] {one.unit}')
+                f'the range of {name} is [{low:.10g}, {high:.10g}] {one.unit}, must increase and '
+                f'lie in [{one.lower:.10g}, {one.upper:.10g}] {one.unit}')
         found.append(replace(one, lower=low, upper=high))
     return tuple(found)
 
@@ -148,7 +148,7 @@ def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:
     """
     rows = {row.name: row for row in _rows(plant)}
     if unknown := values.keys() - rows.keys():
-        raise ValueError(f'{min(unknown)} is no constant of {plant.__name__}: it has '
+        raise ValueError(f'{min(unknown)} is not a constant of {plant.__name__}: choose from '
                          f'{", ".join(rows) or "none"}')
     return {name: _from_si(rows[name], value) for name, value in values.items()}
 

@@ -97,7 +97,7 @@ class ControlAffineSystem:
                 raise ValueError(f'incompatible {kind}_units: expected ({len(names)},), '
                                  f'got ({len(units)},)')
         if not self.state_names:
-            raise ValueError('state_names is empty, a system has at least one state')
+            raise ValueError('state_names is empty: a system needs at least one state')
         if not callable(self.B):
             object.__setattr__(self, 'B', frozen(self.B, 'B', (self.n_x, self.n_u)))
         for name, checked in (
@@ -252,8 +252,7 @@ def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
         raise EquilibriumError(
             f'{system.name}: no input holds {system.describe_state(held)}: '
             f'{system.state_names[worst]} still changes by {rate[worst]:.3g} '
-            f'{system.state_units[worst]}/{system.time_unit}; '
-            'choose a steady state')
+            f'{system.state_units[worst]}/{system.time_unit}; choose a steady state')
     return u
 
 
@@ -268,7 +267,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
     :raises EquilibriumError: when no input holds them.
     """
     if unknown := wanted.keys() - set(system.state_names):
-        raise ValueError(f'{min(unknown)} is no state of {system.name}: choose of '
+        raise ValueError(f'{min(unknown)} is not a state of {system.name}: choose from '
                          f'{", ".join(system.state_names)}')
     held = np.array([name in wanted for name in system.state_names])
     x, u = system.nominal_state.copy(), system.nominal_input

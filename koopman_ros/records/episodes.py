@@ -105,7 +105,7 @@ def distinct(bags: Sequence[str | os.PathLike[str]], account: ImportReport
     read: set[str] = set()
     for bag in bags:
         if (path := os.path.realpath(bag)) in read:
-            account.note(f'{os.fspath(bag)} is named twice: read once')
+            account.note(f'{os.fspath(bag)} is listed twice: read once')
             continue
         read.add(path)
         yield bag
@@ -146,14 +146,14 @@ class _BagImport:
         """Return an input without the measured one if the bag lacks that."""
         if signal.measured is None or signal.measured.topic in self.content.types:
             return signal
-        self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: {signal.name} is '
-                          'taken from its command')
+        self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: the command is '
+                          f'used as the applied {signal.name}')
         return replace(signal, measured=None)
 
     def segments(self) -> Iterator[Segment]:
         """Yield the numbers between resets of time, long ones in portions."""
         if not self.content.complete:
-            self.account.note(f'{self.bag} was not closed or is damaged: read up to its last '
+            self.account.note(f'{self.bag} was not closed or is damaged: read up to the last '
                               'complete record')
         counts, n_x = self.content.counts, len({signal.place for signal in self.states})
         places = list(self.scales)
@@ -179,8 +179,7 @@ class _BagImport:
                 yield segment
                 segment = segment.following()
         if left := sum(counts[topic] for topic in topics) - read:
-            self.account.note(f'{self.bag} is damaged: {left} messages that it counts could not '
-                              'be read')
+            self.account.note(f'{self.bag} is damaged: {left} of its messages could not be read')
         yield segment
 
     def _accepted(self, message: BagMessage, place: MessageField, lowest: float, highest: float
@@ -195,7 +194,7 @@ class _BagImport:
             return None
         if stamp_ns is None:
             self.account.note(f'{self.bag}: messages of {place.topic} ({place.type}) have no '
-                              'stamp: their receipt counts')
+                              'stamp: the time of receipt is used')
             return NO_STAMP, value
         return stamp_ns, value
 
@@ -212,10 +211,10 @@ class _BagImport:
         plant, receipt = np.sum(steps[np.all(steps >= 0.0, axis=1)], axis=0).tolist()
         if abs(plant - receipt) > max(_SAME_PACE * receipt, _SAME_PACE_SECONDS):
             raise BagReadError(
-                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and '
-                f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
-                "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
-                "--use-sim-time'), or use a type with a header")
+                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and its times of receipt '
+                f'are not plant time ({plant:.6g} s on /clock in {receipt:.6g} s): record with '
+                "use_sim_time (of the trainer, or 'ros2 bag record --use-sim-time'), or use a "
+                'message type with a header')
 
     def episodes(self, segment: Segment) -> Iterator[Episode]:
         """Align one segment and cut it at its gaps and jumps."""
@@ -329,11 +328,11 @@ class _BagImport:
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
                 or np.max(np.diff(times)) > reach):
             if len(measured[0]):
-                self.account.note(f'{self.bag}: {name} was not measured throughout, and is taken '
-                                  'from its command there')
+                self.account.note(f'{self.bag}: {name} was not always measured: the command is '
+                                  'used in between')
             return *applied_inputs.around(*commands, stamps), False
         for held in (commands[1], np.clip(commands[1], values.min(), values.max())):
             if applied_inputs.follows_command(commands[0], held, times, values):
                 return *applied_inputs.around(commands[0], held, stamps), False
-        self.account.note(f'{self.bag}: {name} is taken as it was measured')
+        self.account.note(f'{self.bag}: {name} is the measured applied input')
         return times, values, True

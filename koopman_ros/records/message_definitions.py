@@ -78,8 +78,8 @@ def _split(type_name: str) -> tuple[str, str]:
     match = _TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise MessageDefinitionError(
-            f'message type {type_name!r} is not of the form package/msg/Name, '
-            'such as sensor_msgs/msg/Temperature')
+            f'message type {type_name!r} is not of the form package/msg/Name, e.g. '
+            'sensor_msgs/msg/Temperature')
     return match[1], match[2]
 
 

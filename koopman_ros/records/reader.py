@@ -63,7 +63,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     type is not decoded here. Raises TypeError for a single string as `topics`.
     """
     if isinstance(topics, str):
-        raise TypeError(f'topics must be a collection of names: pass [{topics!r}]')
+        raise TypeError(f'topics must be a list of names: pass [{topics!r}]')
     files, _ = locate(path, recover=recover)
     return decoded_messages(files, None if topics is None else frozenset(topics), recover)
 

@@ -128,7 +128,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
             return change(request, response)
         except RuntimeError as error:
             # in rclpy an invalid transition would end the process
-            self.get_logger().error(f'no such transition now: {one_line(error)}')
+            self.get_logger().error(f'this transition is not possible now: {one_line(error)}')
             response.success = False
             return response
 
@@ -191,5 +191,5 @@ def one_line(error: BaseException) -> str:
     text = str(error).split(', at ./')[0].split(', at /')[0]
     text = ' '.join(text.split()) or type(error).__name__
     if empty := _EMPTY_TEXT.search(text):
-        text += f'; an empty text needs quotes within quotes: -p "{empty[1]}\'\'"'
+        text += f'; an empty string needs nested quotes: -p "{empty[1]}\'\'"'
     return text

@@ -113,7 +113,7 @@ class ModelReload:
             # nobody is there who would hear the answer
             return response
         if name != self.in_force.name:
-            outcome = f'the model was changed to {self.in_force.name} while {name} was read'
+            outcome = f'{self.in_force.name} became the current model while {name} was read'
         if isinstance(outcome, LoadedModel):
             try:
                 # the operator may have asked for another one meanwhile
@@ -186,6 +186,6 @@ class ModelReload:
         self._node.get_logger().info(f'{loaded.about}; {loaded.comparison}')
 
     def _refuse(self, reason: str) -> str:
-        self.refused = f'the old model is kept: {reason}'
+        self.refused = f'the current model is kept: {reason}'
         self._on_refused()
         return self.refused

@@ -61,7 +61,7 @@ class OperatorRequests:
             self.setpoint_received = True
             scheduled = any(entry[0] == received.stamp_ns
                             for entry in self._loop.state.setpoint.scheduled)
-            when = f', holds from {received.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
+            when = f', effective from {received.stamp_ns / NANOSECONDS:.3f} s' if scheduled else ''
             unit = self._signals.states[name]
             self._log.info(
                 f'set-point {quantity_text(value, unit)} of {name} accepted{when}',
@@ -95,7 +95,7 @@ class OperatorRequests:
         refused = self._loop.change(event).refused
         self._note = ''
         if refused is not None:
-            self._warn(f'request refused: {self._words(refused)}')
+            self._warn(f'request rejected: {self._words(refused)}')
         return refused is None
 
     def _warn(self, note: str) -> None:

@@ -121,7 +121,7 @@ def take_down(name: str, node: LoopNode | None, executor: Executor | None,
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see
     # docs/explanation/fast_dds_deadlock.md
     disarm = force_exit_after(patience, 0, (
-        f'{name}: the middleware does not shut down: left to the operating system'))
+        f'{name}: the middleware did not shut down: the process is ended'))
     if executor is not None:
         # its threads would call into the interpreter while that ends
         executor.shutdown()
@@ -180,8 +180,8 @@ def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None
         return None
     if not rest or (hosts and _loops_file(args) is not None):
         return None
-    print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
-          'name:=value; --help says more', file=sys.stderr)
+    print(f'{name}: unknown argument {rest[0][:100]!r}: pass parameters as --ros-args -p '
+          'name:=value; see --help', file=sys.stderr)
     return 2
 
 
@@ -195,6 +195,6 @@ def open_to_the_network(environment: Mapping[str, str]) -> str:
         or (environment.get('ROS_SECURITY_ENABLE', '').lower() == 'true'
             and environment.get('ROS_SECURITY_STRATEGY', '') == 'Enforce'))
     return '' if closed else (
-        'open to the network: whoever is on a network of this machine, in ROS domain '
-        f'{environment.get("ROS_DOMAIN_ID") or 0}, can command this node; '
-        'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it to this machine')
+        'open to the network: any machine on the same network can command this node in ROS domain '
+        f'{environment.get("ROS_DOMAIN_ID") or 0}; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
+        'restricts access to this machine')

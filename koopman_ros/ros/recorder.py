@@ -127,11 +127,11 @@ class Recorder:
         if self.simulated:
             waited = time.monotonic() - self._begun
             said = '' if self._now_ns or waited < _CLOCK_PATIENCE else (
-                'nothing is recorded before the first /clock, as use_sim_time is set: publish '
-                '/clock, or set use_sim_time to false')
+                'nothing is recorded before the first /clock message, because use_sim_time is '
+                'set: publish /clock, or set use_sim_time to false')
         elif unstamped and self._node.count_publishers(topics.CLOCK):
-            said = (f'{unstamped[0]} has no stamps and is logged by the wall clock, while /clock '
-                    'is published: start the trainer with use_sim_time set to true')
+            said = (f'{unstamped[0]} has no stamps and is logged in wall time, although /clock is '
+                    'published: start the trainer with use_sim_time set to true')
             # by which a reader sees how fast the plant ran
             self._types.setdefault(topics.CLOCK, Clock)
             self._names.setdefault(topics.CLOCK, topics.CLOCK)

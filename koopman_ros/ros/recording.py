@@ -65,7 +65,7 @@ class Recording:
         if output == wanted:
             self._node.get_logger().info(said)
         else:
-            said += f', because {wanted} exists already'
+            said += f', because {wanted} already exists'
             self._node.get_logger().warning(said)
         return said
 
@@ -148,7 +148,7 @@ class Recording:
         folder = next(parent for parent in output.absolute().parents if parent.is_dir())
         free = shutil.disk_usage(folder).free / _MEGABYTE
         return '' if free >= limit else (
-            f'{free:.0f} MB are free on the disk of {folder}, below min_free_disk = '
+            f'{free:.0f} MB are free on the disk of {folder}, less than min_free_disk = '
             f'{limit:.10g} MB')
 
     def _status(self) -> TaskReport:

@@ -57,8 +57,8 @@ def by_topic(places: Mapping[str, MessageField]) -> Iterator[tuple[str, Any, lis
         names = [name for name, place in places.items() if place.topic == topic]
         if len(kinds := dict.fromkeys(places[name].type for name in names)) > 1:
             raise ConfigurationError(
-                f'{" and ".join(names)} share the topic {topic} and differ in the type of its '
-                f'messages, {" and ".join(kinds)}: give them one type, or topics of their own')
+                f'{" and ".join(names)} share the topic {topic} but have different message types, '
+                f'{" and ".join(kinds)}: use one type, or separate topics')
         for name in names:
             try:
                 kind = topics.message_class(places[name].type)
@@ -72,7 +72,7 @@ def _converted(name: str, unit: str, wanted: str) -> Conversion:
     try:
         return conversion(unit, wanted)
     except ValueError as error:
-        raise ConfigurationError(f'{name}: {error}: name another unit') from error
+        raise ConfigurationError(f'{name}: {error}: set another unit') from error
 
 
 def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., None]:

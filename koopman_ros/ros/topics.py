@@ -112,7 +112,7 @@ def message_class(type_name: str) -> Any:
         return load_plugin(f'{package}.{kind}:{name}', 'message type', {})
     except ValueError as error:
         raise LookupError(
-            f'message type {type_name!r} is not installed here: source its workspace') from error
+            f'message type {type_name!r} is not installed: source its workspace') from error
 
 
 class EndpointMonitor:
@@ -195,15 +195,15 @@ class EndpointMonitor:
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
                        if info.topic_type in kinds)
         return '' if len(names) < 2 else (
-            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; end all but one')
+            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; stop all but one')
 
     def _complaints(self, own: Publisher | Subscription) -> list[str]:
         topic, kind = own.topic_name, type_name(own.msg_type)
         subscribes = isinstance(own, Subscription)
         publishers = self._node.get_publishers_info_by_topic(topic)
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)
-        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, here it is '
-                f'{kind}: end that node, or remap its topic'
+        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, this node for '
+                f'{kind}: stop that node, or remap its topic'
                 for other in (*publishers, *subscriptions) if other.topic_type != kind]
         for other in publishers if subscribes else subscriptions:
             offered, requested = _explicit(own.qos_profile), _explicit(other.qos_profile)
@@ -218,7 +218,7 @@ class EndpointMonitor:
                            'reliability:=best_effort')
             said.append(
                 f'{topic}: {node_name(other)} {"publishes" if subscribes else "subscribes"} with '
-                'an incompatible quality of service, so that no message passes: '
+                'an incompatible quality of service, so no messages are received: '
                 f'{reason.replace("ERROR: ", "").strip(";")}; {remedy}')
         return said
 

@@ -80,7 +80,7 @@ def end_in_time(name: str) -> Callable[[], None]:
             # the pipe stays open, for the byte of a second signal
             if number:
                 disarm = force_exit_after(_PATIENCE, 1, (
-                    f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force'))
+                    f'{name}: still busy {_PATIENCE:g} s after a signal: the process is ended'))
                 over.wait()
                 disarm()
 
