@@ -41,7 +41,7 @@ class InputLimits:
 
 @dataclass(frozen=True)
 class SensorLimits:
-    """What the sensors can measure and their plant can do, one number per measured signal."""
+    """Limits of the sensors and of the rates of their signals, one number per measured signal."""
 
     lower: Array = value_column(
         'measured', -UNBOUNDED, 'Lower end of the sensor range.', name='sensor_min')
@@ -62,9 +62,9 @@ class SensorLimits:
 @dataclass(frozen=True)
 class Tuning:
     """
-    What an engineer tunes, in the units of the model's signals.
+    The tuning of a controller, in the units of the model's signals.
 
-    Field and parameter have one name, but for columns whose row says another one: a row
+    Field and parameter have one name, except for columns with a row of another name: a row
     ``weight`` of a state is the parameter ``<state>.weight``.
     """
 
@@ -153,7 +153,7 @@ class Tuning:
         Return the tuning with one number for each signal.
 
         :param measured: names of the signals that are measured.
-        :raises ValueError: naming what does not fit.
+        :raises ValueError: naming the mismatch.
         """
         states, inputs = model.states.names, model.inputs.names
         controlled = tuple(filter(None, self.controlled)) or states
@@ -185,7 +185,7 @@ class Tuning:
     @classmethod
     def for_model(cls, model: LiftedModel, **given: Any) -> Self:
         """
-        Return a tuning whose weights, ranges and safe inputs are a model's, but for what is given.
+        Return a tuning with weights, ranges and safe inputs of a model, except the given ones.
 
         The weights are 1 on deviations scaled by the model, the inputs' limits their trained
         range, and the safe inputs the nominal ones.

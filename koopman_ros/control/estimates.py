@@ -84,8 +84,8 @@ class StateEstimation:
         Check a measurement (n_y,) and take it into account.
 
         :param elapsed: seconds since the last command.
-        :param u: (n_u,) what has acted since then, in scaled deviations.
-        :return: the state with measurement, time and estimate, and what became of the measurement.
+        :param u: (n_u,) applied input since then, in scaled deviations.
+        :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
         before, last = state.estimate, state.accepted
         predicted = self.predict(state, elapsed, u)
@@ -130,7 +130,7 @@ class StateEstimation:
         """
         Return the state (n_x,), in state units, that goes with a measurement (n_y,).
 
-        What the measurement leaves open is as it is known, or where it may rest.
+        States that it does not determine are those of the estimate, or of a steady state.
         """
         outputs, states = self.outputs, self.model.states
         if outputs.determine_state:
@@ -165,7 +165,7 @@ class StateEstimation:
         return estimator.correct(predicted, xi, elapsed)
 
     def _lost(self, state: State, time_ns: int) -> bool:
-        """Tell whether no measurement was accepted for so long that the state is not known."""
+        """Whether the state is unknown, because no measurement was accepted for too long."""
         if state.accepted is None:
             return False
         seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS

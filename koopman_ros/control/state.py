@@ -62,7 +62,7 @@ class State:
     __repr__ = short_repr
 
     def restarted(self, time_ns: int | None) -> State:
-        """Return the state without what may have made a calculation fail, after a measurement."""
+        """Return the state after a measurement, without the parts that may have made it fail."""
         return replace(self, **WITHOUT_LAW, estimate=None, recovery=None, target=None,
                        time_ns=time_ns)
 
@@ -80,7 +80,7 @@ WITHOUT_LAW: Mapping[str, Any] = {
 
 
 class Arrival(Enum):
-    """What came of a measurement; after one late or repeated the last command is given again."""
+    """The outcome of a measurement; after one late or repeated the last command is given again."""
 
     ACCEPTED = 'accepted'
     REJECTED = 'rejected'
@@ -120,7 +120,7 @@ class EstimateReport:
 
     @staticmethod
     def of(estimate: Estimate, estimator: Estimator) -> EstimateReport:
-        """Return what is reported of an estimate, whatever fails in an estimator."""
+        """Return the report of an estimate, even if the estimator fails."""
         states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
         try:
             disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
@@ -170,7 +170,7 @@ NO_COMMAND = CommandReport()
 
 @dataclass(frozen=True, slots=True)
 class StepReport:
-    """What a step did."""
+    """The report of a step."""
 
     mode: Mode  #: who commanded
     level: str  #: the control level that acted; 'manual' in manual mode

@@ -95,7 +95,7 @@ class Supervisor:
     def allowed(self, order: FallbackOrder, outside: float,
                 ranges: tuple[tuple[str, float, float], ...]) -> LevelRequest:
         """
-        Return what the distance from the training data, in half-ranges, allows.
+        Return the level that the distance from the training data, in half-ranges, allows.
 
         :param ranges: (name, lower, upper) of the trained range, for the reason.
         """

@@ -25,7 +25,7 @@ class PlantDescription:
     """
     Names, units, nominal point and input matrix of a plant.
 
-    :raises ValueError: naming what does not fit the names, or a time unit that there is not.
+    :raises ValueError: naming the mismatch, or for an unknown unit.
     """
 
     name: str  #: name of the plant
@@ -196,8 +196,9 @@ def averaged(episode: Episode, count: int) -> Episode:
     """
     Return the means of `count` measurements in a row each, at the means of their times.
 
-    What the input came to from one to the next is kept: its changes, or where there are more of
-    them than means, as in a loop that answers each measurement, its own mean between two times.
+    The integral of the input from one to the next is kept: its changes, or where there are more of
+    them than means, as in a loop that commands at each measurement, its own mean between two
+    times.
 
     :raises ValueError: for an episode without two such groups.
     """
@@ -218,7 +219,8 @@ def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samp
     """
     Cut episodes where a state leaves a range, for a training box that ends there.
 
-    :param lower: lower corner of the range, a scalar or (n_x,), in state units; upper likewise.
+    :param lower: lower corner of the range, a scalar or (n_x,), in state units; upper: the upper
+        corner.
     :param samples: the least of a part; shorter ones are left out.
     :raises ValueError: when nothing is left.
     """

@@ -19,7 +19,7 @@ from koopman_ros.core.units import conversion, display_unit
 
 @dataclass(frozen=True)
 class FieldDefaults:
-    """How messages of a type carry a number where nothing else is said."""
+    """The default field and unit of a message type."""
 
     field: str  #: where in the message; '{name}' stands for the name of the signal
     unit: str = ''  #: of the number there; empty for that of the signal
@@ -185,7 +185,7 @@ def _index_of(message: Any, key: str) -> int:
 def place(topic: str, name: str, unit: str,
           given: Mapping[str, str] | None = None) -> MessageField:
     """
-    Return where a signal is, with what is given of ``topic``, ``type``, ``field`` and ``unit``.
+    Return where a signal is, from the given ones of ``topic``, ``type``, ``field`` and ``unit``.
 
     The rest follows: the type from the unit of the signal, field and unit from the type.
 

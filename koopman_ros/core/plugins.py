@@ -19,8 +19,7 @@ def load_plugin(name: str, kind: str, known: Mapping[str, Callable[..., Any] | s
     Return a class or function by its name: a known one, or ``module:name`` of any module.
 
     :param kind: of plug-in, for the error, e.g. ``'law'``.
-    :param known: by name, itself or as ``module:name``, which is imported only when it is asked
-        for.
+    :param known: by name, itself or as ``module:name``, which is imported on first use.
     :raises ValueError: for a name without something that can be called.
     """
     found = known.get(name, name)
@@ -102,7 +101,7 @@ def loaded_class(name: str) -> type[Any]:
 
 def contained(error: BaseException) -> str:
     """
-    Return in one line what a plug-in raised, whatever it is, also SystemExit.
+    Return the exception of a plug-in in one line, whatever it is, also SystemExit.
 
     :raises KeyboardInterrupt: where that is the error: it is meant for the process.
     """

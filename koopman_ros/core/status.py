@@ -20,12 +20,12 @@ Value: TypeAlias = (
 
 class StatusCode(Enum):
     """
-    What is the matter: its identifier in records, and the sentence that people read.
+    The reason of a condition: its identifier in records, and its sentence for people.
 
     Of numbers in a sentence, 'value' is one of the signal, 'change' a difference of two, with its
     unit; 'rate' is a change per second. 'ranges' are (name, lower, upper) of several signals,
-    'values' (name, value); 'level' is the name of a control level. What has no such format is
-    written as it is.
+    'values' (name, value); 'level' is the name of a control level. Values without a format are
+    written unchanged.
     """
 
     template: str
@@ -172,7 +172,7 @@ LEVELS = {'mpc': 'predictive law', 'sdre': 'learned law', 'linear': 'linear law'
 
 
 def level_words(name: str) -> str:
-    """Return what an operator calls a control level."""
+    """Return the name of a control level for operators."""
     return LEVELS.get(name, name)
 
 

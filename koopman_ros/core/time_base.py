@@ -14,7 +14,7 @@ _ROUNDS, _PAUSE = 3.0, 0.2  # times the last round, and s
 
 
 class Advance(Enum):
-    """What a number is in relation to the numbers before it."""
+    """The relation of a number to those before it."""
 
     NEW = 'new'  #: larger than all before it
     OLD = 'old'  #: repeated, or late by less than is tolerated

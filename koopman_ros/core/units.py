@@ -88,7 +88,7 @@ def conversion(unit: str, wanted: str) -> Conversion:
 
 @cache
 def check_unit(unit: str) -> None:
-    """Raise ValueError for a unit that there is not."""
+    """Raise ValueError for an unknown unit."""
     if unit in _USUAL:
         return
     if unit == 'pH':
@@ -110,7 +110,7 @@ def _check_form(unit: str) -> None:
 
 
 def check_time_unit(unit: str) -> None:
-    """Raise ValueError for a time unit that rates are not given in."""
+    """Raise ValueError for an unknown time unit."""
     if unit not in SECONDS_PER_TIME_UNIT:
         raise ValueError(f"time_unit must be 's' or 'min', got {unit!r}: convert times and rates "
                          'to one of them')

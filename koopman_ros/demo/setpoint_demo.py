@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The demo: a learned controller moves a plant to a set-point, beside the linear law and the optimum.
+The demo: a learned controller moves a plant to a set-point; linear law and optimum compared.
 
-The section `demo` of the plant's parameter file says what happens. The controller runs as a
+The section `demo` of the plant's parameter file defines the scenario. The controller runs as a
 process in the loop; the linear law and the optimum are computed on the plant's equations.
 """
 

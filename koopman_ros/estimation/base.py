@@ -78,7 +78,7 @@ class Estimate:
             self.covariance is None or np.isfinite(self.covariance).all()))
 
     def check(self, n_x: int) -> None:
-        """Raise a TypeError or ValueError unless it is one of so many states, and finite."""
+        """Raise a TypeError or ValueError unless it has n_x states and is finite."""
         P = self.covariance
         shapes = (np.shape(self.x), np.shape(self.w), None if P is None else np.shape(P))
         if shapes not in (((n_x,), (n_x,), None), ((n_x,), (n_x,), (2 * n_x, 2 * n_x))):
@@ -111,7 +111,7 @@ class Estimator(ABC):
         Prepare the estimator; a ValueError refuses the configuration.
 
         :param model: whose drift predicts.
-        :param outputs: what is measured of the state.
+        :param outputs: the measured outputs.
         :param tuning: with one number for each signal of the model.
         :param parameters: its own, of the class :attr:`Parameters`.
         """

@@ -41,7 +41,7 @@ def plot_law_check(check: ClosedLoopTest, path: Path) -> Path:
 
 
 def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
-    """Draw where each loop began and was to end in state i, and what became of it there."""
+    """Draw start and set-point of each loop in state i, with its outcome."""
     states, failed = check.states, check.failed
     name, unit = states.names[i].replace('_', ' '), states.units[i]
     low, high = shown(states.lower[i], unit), shown(states.upper[i], unit)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Closed loops all over a model's training box, by which its law is judged beside others."""
+"""Closed loops all over a model's training box, in which its law is compared with others."""
 
 from __future__ import annotations
 
@@ -79,17 +79,17 @@ class ClosedLoopTest:
 
     @property
     def poor(self) -> NDArray[np.bool_]:
-        """Tell which (N,) had no gain, did not arrive, or cost over 1.1 times a linear law."""
+        """Whether each loop (N,) had no gain, no arrival, or over 1.1 times a linear cost."""
         return np.asarray(~(self.ratios <= MOST_COST))
 
     @property
     def failed(self) -> NDArray[np.bool_]:
-        """Tell in which (N,) a perfect model would do clearly better, by 1.05 in the cost."""
+        """Whether in each loop (N,) a perfect model would cost clearly less, by 1.05."""
         return np.asarray(~(self.excess <= MOST_EXCESS))
 
     @property
     def lost(self) -> NDArray[np.bool_]:
-        """Tell which (N,) had no gain or did not arrive, where a linear law does."""
+        """Whether each loop (N,) had no gain or failed to reach it, where a linear law does."""
         return np.isinf(self.ratios)
 
     @property
@@ -134,7 +134,7 @@ class ClosedLoopTest:
 
     @property
     def region(self) -> str:
-        """Say in which ranges the failed loops began and were to end; empty where none failed."""
+        """Return the ranges of starts and set-points of failed loops; empty where none failed."""
         failed = self.failed
         return '' if not failed.any() else (
             f'begun at {self._ranges(self.starts[failed])} and bound for '
@@ -150,7 +150,7 @@ class ClosedLoopTest:
                                         strict=True))
 
     def __str__(self) -> str:
-        """Say in one clause how many loops failed, how, and where."""
+        """Return in one clause how many loops failed, how, and where."""
         if not self.loops:
             return ('no law, not even a linear one, reaches the set-point in any of '
                     f'{self.hopeless} closed loops over the trained range')
@@ -190,9 +190,9 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
 
     Starts fill the box evenly, and set-points that part of it where the data are (a scrambled
     Sobol sequence of fixed seed); the latter are steady states of that drift, which an input
-    within its limits holds. All laws get the input that does: what a disturbance observer finds at
-    rest. Inputs are held from sample to sample. Where no law arrives
-    within the limits, they run again without: what is far from the data the limits must not hide.
+    within its limits holds. All laws get that input, as from a disturbance observer at rest.
+    Inputs are held from sample to sample. Where no law reaches the set-point within the limits,
+    they run again without: the limits must not hide a model that is wrong far from the data.
 
     :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
         and per time unit of the model; affine in the input.

@@ -35,7 +35,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class OptimalTrajectory:
-    """What a plant did in a task."""
+    """The trajectory of a plant in a task."""
 
     states: Array  #: (samples + 1, n_x)
     inputs: Array  #: (samples, n_u), each held for a period
@@ -44,7 +44,7 @@ class OptimalTrajectory:
 
 def cost_along(task: Task, states: Array, inputs: Array) -> float:
     """
-    Return the cost of what a controller did: states (N + 1 or N, n_x) and inputs (N, n_u) held.
+    Return the cost of a trajectory: states (N + 1 or N, n_x) and inputs (N, n_u) held.
 
     Each sample is integrated from its own state, so that nothing adds up on an unstable plant.
     """

@@ -27,7 +27,7 @@ Sensor: TypeAlias = Callable[[Array, float], Array | None]
 
 
 class Plant(Protocol):
-    """What runs under the controller, such as ``plants.Process``."""
+    """The plant in the loop, e.g. ``plants.Process``."""
 
     @property
     def time_ns(self) -> int:
@@ -64,14 +64,14 @@ Change: TypeAlias = Callable[[Loop], Loop]
 
 @dataclass(frozen=True)
 class ScheduledChange:
-    """What happens at a time."""
+    """An event at a time."""
 
     seconds: float  #: from the start of the simulation
     what: Event | Change  #: an event of the controller, or a function of the loop
 
 
 def at(seconds: float, what: Event | Change) -> ScheduledChange:
-    """Say what happens at a time in s, before the measurement of that time."""
+    """Declare an event at a time in s, before the measurement of that time."""
     return ScheduledChange(seconds, what)
 
 
@@ -82,7 +82,7 @@ def exchange(controller: Controller) -> Change:
 
 
 def restart(loop: Loop) -> Loop:
-    """Start the controller anew; it finds the input that acts."""
+    """Restart the controller, which begins from the applied input."""
     return replace(loop, state=loop.controller.initialise(State(), loop.plant.u))
 
 
@@ -98,7 +98,7 @@ def after_a_second(time_ns: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """What a loop did, one row a sample."""
+    """The trajectories of a loop, one row per sample."""
 
     times: Array  #: (N,) in s from the start
     states: Array  #: (N, n) of the plant
@@ -131,13 +131,13 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     arguments give the same numbers.
 
     :param plant: at the start; its present time is that of the first sample.
-    :param events: what happens when; of the same time, in the order given.
+    :param events: events with their times; those of the same time in the given order.
     :param duration: in s, as the period between samples.
-    :param C: (n_y, n) what is measured of the plant's state, y = C x; by default that of the
+    :param C: (n_y, n) measurement matrix of the plant's state, y = C x; by default that of the
         controller, whose model then has the plant's states.
-    :param noise: (n_y,) standard deviations of what is added to y; none by default.
+    :param noise: (n_y,) standard deviations of the measurement noise; none by default.
     :param seed: of the noise.
-    :param sensor: what it makes of that, by value and time: a bias, a fault, silence.
+    :param sensor: sensor model, a function of value and time: a bias, a fault, silence.
     :param input_sensor: the same of the input that acts; None where it is not measured.
     :param state: of the controller at the start; knowing nothing by default.
     :param stamp: the stamp of a measurement at a time of the plant, both in ns.
@@ -236,7 +236,7 @@ class ClosedLoop:
 
 
 class _Failed(Exception):  # noqa: N818
-    """The loop cannot go on; the message says why."""
+    """The loop cannot continue; the message says why."""
 
 
 # A set-point for all states is held where a steady state is so near, in half-ranges of the box.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The replay's picture: what was measured, what was commanded, and where commands differ."""
+"""The plot of a replay: measurements, commands, and where commands differ."""
 
 from pathlib import Path
 import textwrap
@@ -77,7 +77,7 @@ def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
 
 
 def _typical(finite: np.ndarray) -> np.ndarray:
-    """Return what a picture should show: a broken sensor's values would flatten all others."""
+    """Return the values to plot: those of a broken sensor would flatten all others."""
     if not finite.size:
         return finite
     low, high = np.percentile(finite, (2.0, 98.0))

@@ -97,7 +97,7 @@ def replay(recorded: Iterable[records.EventRecord], find_model: FindModel, build
 
 
 class _ReplayRun:
-    """A run of a controller, and the alternative beside it."""
+    """A run of a controller, and the alternative."""
 
     def __init__(self, result: Replay, find_model: FindModel, build: Build,
                  alternative: Alternative | None) -> None:

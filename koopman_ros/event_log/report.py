@@ -126,12 +126,12 @@ def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new
 
 
 def reproduced(bag: ReplayedBag) -> bool:
-    """Tell whether the recorded commands are those of the replay, within the tolerance."""
+    """Whether the recorded commands are those of the replay, within the tolerance."""
     return bag.check.compared > 0 and not bag.check.beyond.any()
 
 
 def verdict(bag: ReplayedBag) -> str:
-    """Say in one sentence how the replay did."""
+    """Return the result of the replay in one sentence."""
     check = bag.check
     if not check.compared:
         return ('nothing to compare: the records contain no command' if not bag.found.samples else

@@ -102,7 +102,7 @@ def replay_records(records: Iterable[EventRecord], models: Sequence[Path] = (),
     """
     Replay records of this package's controller node, in the order of receipt.
 
-    :param models: files or folders in which models are looked for beside the shipped ones.
+    :param models: files or folders to search for models, in addition to the bundled ones.
     :raises RecordError: for records that cannot be replayed.
     """
     places = [*models, config_directory() / 'models']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a replay reads: a controller's records and commands in a bag, and the models they name."""
+"""The input of a replay: records and commands of a controller in a bag, and their models."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -69,7 +69,7 @@ def find_model(places: Sequence[Path], name: str, digest: str) -> LiftedModel:
 
     :param places: files and folders that are searched.
     :param name: of the model, as recorded; first the file of that name, if it is one.
-    :raises RecordError: where no file has it.
+    :raises RecordError: if there is no such file.
     """
     files = [Path(name).expanduser()] if name.endswith('.safetensors') else []
     for place in places:

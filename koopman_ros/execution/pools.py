@@ -286,7 +286,7 @@ def _unpacked(source: Path | bytes) -> Any:
 
 
 def _call(send: _Send, source: Path | bytes, number: int, item: bytes) -> Any:
-    """Run a task on a worker, which tells its progress at most once a period."""
+    """Run a task on a worker, which reports its progress at most once a period."""
     if send(number, None):
         return _NotBegun()
     function, shared = _unpacked(source)

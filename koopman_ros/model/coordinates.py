@@ -79,7 +79,7 @@ class Coordinates:
         return array
 
     def only(self, names: Sequence[str]) -> Coordinates:
-        """Return these coordinates alone; raise ValueError for one that there is not."""
+        """Return these coordinates alone; raise ValueError for an unknown one."""
         if tuple(names) == self.names:
             return self
         if unknown := [name for name in names if name not in self.names]:

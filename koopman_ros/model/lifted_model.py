@@ -335,7 +335,7 @@ class LiftedModel:
 
     def failed_near(self, x: Array, x_ref: Array) -> bool:
         """
-        Tell whether the law failed in the tested loop nearest to a state and a set-point.
+        Whether the law failed in the tested loop nearest to a state and a set-point.
 
         Both (n_x,) in scaled deviations; see :attr:`verified_loops`.
         """

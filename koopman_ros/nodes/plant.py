@@ -293,7 +293,7 @@ class PlantNode(ManagedNode):
         return response
 
     def _resynchronise(self) -> None:
-        """Resume after a stop, during which the plant's time stood still."""
+        """Resume after a stop, during which the plant's time did not advance."""
         if self._settings.lockstep:
             self._answered = True
             self._continue_lockstep()

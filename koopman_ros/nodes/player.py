@@ -225,7 +225,7 @@ def _stamp_ns(message: records.BagMessage) -> int | None:
 
 
 def recorded_offer(offered: tuple[Qos, ...]) -> QoSProfile:
-    """Offer what all publishers of the recording offered."""
+    """Return the quality of service that all recorded publishers offered."""
     best_effort = {o.reliability for o in offered} == {QosReliability.BEST_EFFORT}
     latched = {o.durability for o in offered} == {QosDurability.TRANSIENT_LOCAL}
     return topics.profile(

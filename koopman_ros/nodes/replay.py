@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The replay: the records in bags through the control step again, and beside a new model."""
+"""The replay: re-runs the control step on recorded bags, also with a new model."""
 
 from collections.abc import Callable, Mapping
 import sys

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the controller node, and of the replay: its own beside a controller's."""
+"""Parameters of the controller node, and of the replay, which has those as well."""
 
 from collections.abc import Mapping
 import contextlib
@@ -87,9 +87,9 @@ class ControllerParameters:
 
 def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
     """
-    Return the controller with a model, whatever states that has beside the measured ones.
+    Return the controller with a model, which may have states that are not measured.
 
-    :raises ValueError: where the estimator cannot do with what is measured.
+    :raises ValueError: if the measured signals do not suffice for the estimator.
     """
     own = signals_of(model, parameters.tuning.controlled, parameters.states)
     tuning = of_other_states(parameters.tuning, tuple(parameters.every_state), model.states.names)
@@ -130,7 +130,7 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
 
 
 def _dynamics(model: LiftedModel) -> dict[str, Any]:
-    """Return what suits a model's modes: an unstable plant cannot wait, and is planned for."""
+    """Return defaults for a model's modes: an unstable plant cannot wait, and needs a plan."""
     modes = np.linalg.eigvals(
         model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
@@ -151,7 +151,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     Return the parameters of a controller with a model.
 
     Its trained range, scaling and time constants are the defaults, unless the preset of a plant
-    says otherwise.
+    overrides them.
 
     :param given: values that are known already, of which system, signals and plug-ins count.
     :raises ConfigurationError: for signals, given or of a preset, that the model has not.

@@ -31,7 +31,7 @@ def named_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float] | None]:
 
 def refused(equations: str, texts: Sequence[str]) -> str:
     """
-    Say why equations cannot be fitted, or nothing.
+    Return why equations cannot be fitted, or an empty string.
 
     :param equations: name of a plant, empty for none.
     :param texts: their constants, see :func:`named_ranges`.

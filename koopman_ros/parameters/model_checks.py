@@ -31,7 +31,7 @@ _TRIALS = 3
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model with what tells its versions apart."""
+    """A model with the identity of its file."""
 
     name: str  #: of a shipped model, or the path of a file
     model: LiftedModel
@@ -41,7 +41,7 @@ class LoadedModel:
 
     @property
     def identity(self) -> dict[str, str]:
-        """What records name it by."""
+        """The identity of the model in records."""
         return {'name': self.name, 'digest': self.digest}
 
     @property
@@ -53,7 +53,7 @@ class LoadedModel:
 
 @dataclass(frozen=True)
 class ModelCheckContext:
-    """What a new model has to cope with."""
+    """The situation in which a new model must work."""
 
     parameters: ControllerParameters
     state: State
@@ -61,7 +61,7 @@ class ModelCheckContext:
     recent: PredictionWindows | None  #: what was measured lately; None while that is too little
 
     def controller(self, model: LiftedModel) -> Controller:
-        """Return what would act with a model; ModelFileError where that cannot be."""
+        """Return the controller of a model; ModelFileError where it cannot be."""
         try:
             return built(self.parameters, model)
         except ValueError as error:
@@ -137,7 +137,7 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
 
 
 def refuse_setpoints(model: LiftedModel, situation: ModelCheckContext) -> None:
-    """Raise ModelFileError for a model that cannot track what the operator asked for."""
+    """Raise ModelFileError for a model that cannot track the requested set-point."""
     controller = situation.controller(model)
     if (refusal := controller.untrained(situation.state.setpoint)) is not None:
         raise ModelFileError(words_of(signals_of(model))(refusal))
@@ -165,9 +165,9 @@ def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None
 
 def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheckContext) -> str:
     """
-    Raise ModelFileError for a model that predicts what was measured lately much worse.
+    Raise ModelFileError for a model that predicts recent measurements much worse.
 
-    :return: how well it does beside the present one, in words.
+    :return: the comparison with the current one, in words.
     """
     found = None if situation.recent is None else compare(
         situation.controller(present), situation.controller(model), situation.recent)
@@ -196,7 +196,7 @@ def listed(signals: Coordinates, values: Array) -> str:
 
 
 def rests_outside(controller: Controller) -> str:
-    """Say that the safe input keeps the plant where no law may act, or return ''."""
+    """Return the warning that the safe input keeps the plant where no law may act, or ''."""
     model, rest = controller.model, controller.rest
     # a model without training data is a linearisation, which does not know where that is
     if rest.holding is None or not model.provenance.data_digest:

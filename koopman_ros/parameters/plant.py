@@ -121,8 +121,8 @@ class PlantTable(ParameterTable[PlantParameters]):
     """
     The table of a plant.
 
-    :param given: what is known of the values already, of which `system` counts.
-    :raises ConfigurationError: for a system that there is not, or that cannot be built.
+    :param given: known values, of which `system` is used.
+    :raises ConfigurationError: for an unknown system, or one that cannot be constructed.
     """
 
     def __init__(self, given: Mapping[str, Any] = MappingProxyType({})) -> None:
@@ -151,7 +151,7 @@ class PlantTable(ParameterTable[PlantParameters]):
         return build(self.plant, values.constants, nominal_state)
 
     def actuator(self, values: PlantParameters) -> Actuator:
-        """Return what stands before the inputs, in the plant's units."""
+        """Return the actuators of the inputs, in the plant's units."""
         units = self.described.inputs
         tuned = values.inputs
         return Actuator(in_own_units(tuned, 'min', units), in_own_units(tuned, 'max', units),
@@ -159,7 +159,7 @@ class PlantTable(ParameterTable[PlantParameters]):
                         np.array([tuned[name].lag for name in units]))
 
     def _build(self, values: PlantParameters) -> None:
-        """Build what a plant starts with, down to the tolerances of its integration."""
+        """Build the plant's process, including the tolerances of its integration."""
         self.actuator(values)
         try:
             system = self.system(values)

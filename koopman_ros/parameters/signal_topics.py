@@ -222,7 +222,7 @@ class SignalTopics:
     applied = _role('inputs', 'topic')
 
     def check(self) -> str:
-        """Say what is wrong with them, or return an empty string."""
+        """Return their defect in words, or an empty string."""
         try:
             for kind in self.kinds:
                 places = getattr(self, kind)
@@ -330,6 +330,6 @@ def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None
 
 
 def refusal(names: Collection[str]) -> str:
-    """Say why a list of names cannot be that of topics, or return an empty string."""
+    """Return why a list of names cannot be that of topics, or an empty string."""
     return '' if names and all(names) else (
         f'topics = {list(names)} must contain at least one name and no empty one')

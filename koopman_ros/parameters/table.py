@@ -122,14 +122,14 @@ class ParameterTable(Generic[T]):
     The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
 
     :param signals: names and units of the signals, by field made with :func:`per_signal`, or by
-        what a column is declared for.
+        the signals of a column.
     :param groups: rows by field made with :func:`group`.
     :param plugins: parameter dataclasses by the name of the plug-in.
     :param defaults: values, by name, in place of those of the dataclass; foreign ones are ignored.
     :param ordered: names of which the first must be below the second, the same for each signal.
-    :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
-    :param build: builds from a snapshot what the node will use, of which a ValueError or an
-        ArithmeticError is the reason to refuse the snapshot.
+    :param cross_check: returns the defect of a whole snapshot, or an empty string.
+    :param build: builds the node's objects from a snapshot; a ValueError or an ArithmeticError of
+        it rejects the snapshot.
     """
 
     def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '',
@@ -289,7 +289,7 @@ class ParameterTable(Generic[T]):
 
 
 def in_own_units(tuned: Mapping[str, Any], attribute: str, units: Mapping[str, str]) -> Array:
-    """Return what :func:`signal_value` declared for signals (n,), in their own units."""
+    """Return values declared by :func:`signal_value` for signals (n,), in their own units."""
     return np.array([conversion(display_unit(unit), unit)(getattr(tuned[name], attribute))
                      for name, unit in units.items()])
 
@@ -341,7 +341,7 @@ def _shown_none(none: float, is_value: bool, unit: str) -> float:
 
 
 def lowest(unit: str) -> float:
-    """Return what a value in a unit cannot be below; as a limit it stands for none."""
+    """Return the lowest possible value in a unit; as a limit it means none."""
     # there is nothing below absolute zero
     return -ZERO_CELSIUS if unit == 'degC' else -UNBOUNDED
 

@@ -200,7 +200,7 @@ class TrainerParameters:
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
-        Return the plan of an experiment; a ValueError says what is missing.
+        Return the plan of an experiment; a ValueError names the missing parameters.
 
         :param setpoints: (n_c,) to come back to, for one that steps these; None steps the inputs.
         """
@@ -264,8 +264,8 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     Return the parameters of a trainer.
 
     :param present: the lift in use, whose signals and box are the defaults, or None without one.
-    :param given: what is known of the values already, of which system and signals count.
-    :raises ConfigurationError: where nothing says what the signals are.
+    :param given: known values, of which system and signals are used.
+    :raises ConfigurationError: if the signals are unknown.
     """
     system = system_of(given)
     own = plant_defaults(system, 'trainer')

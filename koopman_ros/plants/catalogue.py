@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plants by name: those of the library, those that installed packages offer, and one's own."""
+"""Plants by name: those of the library, those of installed packages, and your own."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -58,9 +58,9 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
     :param values: constants in SI, by name, as :func:`constants_of` has them; the default of each
         that is missing.
     :param nominal_state: (n_x,) for a plant that raised EquilibriumError without, only then.
-    :raises ValueError: for a constant that there is not or that is outside its range, or for a
-        factory that returns no ControlAffineSystem.
-    :raises EquilibriumError: where the plant says so.
+    :raises ValueError: for an unknown constant or one outside its range, or for a factory that
+        returns no ControlAffineSystem.
+    :raises EquilibriumError: if the plant raises it.
     """
     constants = in_plant_units(plant, values)
     # a callable need not have a name

@@ -24,7 +24,7 @@ def constant(default: float, unit: str, lower: float, upper: float, description:
 
     :param default: in the plant's unit, as `lower` and `upper`, the ends of its range.
     :param si: the unit in which a parameter shows it; the plant's by default. A temperature in K
-        with ``'degC'`` is shown as REP 103 has it.
+        with ``'degC'`` is shown in degrees Celsius, as in REP 103.
     :param factor: the value in the plant's unit is that in `si` times this factor.
     :param estimated: the range, in the plant's unit, in which it is looked for where the plant's
         equations are fitted to a record; None for one that is taken as known then.
@@ -115,8 +115,8 @@ def estimated_parameters_of(plant: Any, ranges: Mapping[str, tuple[float, float]
     Return the constants of a plant's class to be estimated, each with the range of its search.
 
     :param ranges: lowest and highest value by name, in SI, None for the range that the class
-        gives; nothing at all for the constants of which the class says that they are estimated.
-    :raises ValueError: for a constant that there is not, and a range outside that of the class.
+        gives; empty for the constants that the class marks as estimated.
+    :raises ValueError: for an unknown constant, or a range outside that of the class.
     """
     known = {constant.name: constant for constant in constants_of(plant)}
     own = {name: constant.estimated for name, constant in known.items() if constant.estimated}
@@ -142,7 +142,7 @@ def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:
     """
     Return constants given in SI in the units of the plant's class.
 
-    A default or an end of a range that was not changed comes back to the bit.
+    An unchanged default or end of a range is returned exactly.
 
     :raises ValueError: for a name that is no constant of the plant.
     """

@@ -45,7 +45,7 @@ class Process:
 
     @property
     def followed(self) -> Array:
-        """What the input follows (n_u,)."""
+        """The delayed command (n_u,) that the input follows."""
         return self.u if self.command is None else self.command
 
     def commanded(self, command: Array, time_ns: int) -> Process:
@@ -91,7 +91,7 @@ class Process:
 
 
 def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Array:
-    """Return a state (n_x,) so many nanoseconds later."""
+    """Return a state (n_x,) after a duration in nanoseconds."""
     if time_ns == 0:
         return x
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
@@ -102,7 +102,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> Contr
     Put a first-order lag before each input: d[x; v]/dt = [f(x) + B(x) v; -v / tau] + [0; u / tau].
 
     The inputs v that act become states; the time constants tau (n_u,) are in time units. An input
-    without one, of which tau is 0, stands still where it is.
+    without lag, of which tau is 0, stays where it is.
     """
     n_x, n_u = system.n_x, system.n_u
     rate = np.zeros(n_u)

@@ -24,7 +24,7 @@ def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike
                 input_upper: ArrayLike, state_lower: ArrayLike, state_upper: ArrayLike
                 ) -> NDArray[np.bool_]:
     """
-    Say from which states a limited input can bring the plant back to its nominal one.
+    Return from which states a limited input can return the plant to its nominal one.
 
     Tried is the linear-quadratic law of the plant linearised there, with states and inputs weighed
     in halves of their ranges, and limited. The state may not leave its box on the way.

@@ -222,7 +222,7 @@ class ControlAffineSystem:
 
 
 def describe(system: ControlAffineSystem) -> PlantDescription:
-    """Return what training may know of a plant beside its data: all but the drift."""
+    """Return the known description of a plant, for training: all but the drift."""
     return PlantDescription(system.name, system.state_names, system.state_units,
                             system.input_names,
                             system.input_units, system.time_unit, system.nominal_state,
@@ -230,7 +230,7 @@ def describe(system: ControlAffineSystem) -> PlantDescription:
 
 
 class EquilibriumError(ValueError):
-    """There is no steady state or no holding input where one was asked for."""
+    """A requested steady state or holding input does not exist."""
 
 
 def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:

@@ -81,7 +81,7 @@ def decoded_messages(files: Iterable[Path], topics: frozenset[str] | None, recov
 
 
 def _channel_decoder(stored: StoredMessage) -> _Decode:
-    """Return what decodes a channel; BagReadError for a type or an encoding not decoded here."""
+    """Return the decoder of a channel; BagReadError for a type or an encoding not decoded here."""
     schema, channel = stored.schema, stored.channel
     encodings = channel.message_encoding, schema.encoding if schema else 'no schema'
     if schema is None or encodings != (MessageEncoding.CDR, SchemaEncoding.ROS2):

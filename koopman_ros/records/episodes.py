@@ -47,7 +47,7 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Recor
                   least_jumps: Sequence[float] | None = None) -> tuple[list[Episode],
                                                                        ImportReport]:
     """
-    Return all episodes of some bags, see :func:`stream_episodes`, and what was made of the bags.
+    Return all episodes of some bags, see :func:`stream_episodes`, and the account of the import.
 
     :raises BagReadError: as it does.
     """
@@ -73,10 +73,10 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     stamp; where the stamps are those of the wall clock, it acts later by the time between the two
     receipts. A command without a stamp acts when it is received.
 
-    Episodes end at gaps, where time is set back, and where a state jumps to another level as
-    after a reset. Spikes of a single sample are dropped, and so are measurements before the first
-    input, since nobody knows what acted on them. A bag that was not closed or is damaged is read
-    as far as it goes. The account tells all that.
+    Episodes end at gaps, where time is set back, and where a state jumps to another level as after
+    a reset. Spikes of a single sample are dropped, and so are measurements before the first input,
+    because the applied input is unknown before. A bag that was not closed or is damaged is read as
+    far as it goes. The account lists all of that.
 
     Memory does not grow with the bags: of a long record some ten thousand measurements are
     put together at a time, at whose ends an episode ends, too.
@@ -84,7 +84,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     :param account: is added to as the episodes come.
     :param tolerance_ns: how far stamps of one sample of several states may lie apart.
     :param least_jumps: smallest change of each state, in its unit, that may be a spike or a jump;
-        by default the record alone tells.
+        by default the one in the record.
     :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there,
         and for states without stamps whose receipts run at another pace than /clock in the bag.
     """

@@ -117,7 +117,7 @@ def summary_section(stream: BinaryIO) -> Summary | None:
 
 
 def is_closed(file: Path) -> bool:
-    """Tell a closed file from a cut one; raise BagReadError for one that is not MCAP at all."""
+    """Whether a file was closed, not truncated; raise BagReadError for one that is not MCAP."""
     if file.stat().st_size == 0:
         raise BagReadError(f'{str(file)!r} is empty: its recorder wrote nothing; record again')
     with opened(file) as stream:
@@ -168,7 +168,7 @@ class _WholeReads:
         stream.seek(0)
 
     def read(self, length: int) -> bytes:
-        """Return so many bytes; raise EndOfFile where there are fewer."""
+        """Return a number of bytes; raise EndOfFile where there are fewer."""
         self._left -= length
         if self._left < 0:
             raise EndOfFile

@@ -37,7 +37,7 @@ class BagWriter:
     `path` ending in '.mcap' makes one self-describing file; any other path makes a bag directory
     with `<name>_0.mcap` and, at `close`, `metadata.yaml`. An existing path is never overwritten.
 
-    A bag directory is split where asked for: a message that finds `max_file_bytes` written, or
+    A bag directory can be split: a message that finds `max_file_bytes` written, or
     `max_file_duration_s` [s] passed since the first log time of the file, begins the next file
     (`<name>_1.mcap`, ...; 0: never). The file before it is completed in the background, written
     through to the disk and only then listed in `metadata.yaml`: files listed there can be read

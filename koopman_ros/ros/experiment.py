@@ -25,9 +25,9 @@ class PlantExperiment:
     """
     Drive the plant with random steps on the service ``~/experiment``; reports by diagnostics.
 
-    The steps begin at the present inputs. When they are over, the inputs return to their safe
-    values along the rate limit, or the set-points to what they were, and are held there until the
-    service is called with false once more, or another publisher comes.
+    The steps begin at the present inputs. Afterwards the inputs return to their safe values along
+    the rate limit, or the set-points to their former values, and are held there until the service
+    is called with false again, or another publisher appears.
 
     :param commanded: last command of each input by name, of any node; kept up to date.
     """

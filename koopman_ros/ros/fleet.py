@@ -25,7 +25,7 @@ def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
     """
     Retrain the plants of a file of loops, each by its trainer's parameters, until a signal.
 
-    A line on the standard output says how each ended. Nothing is written of those that have not
+    A line on standard output gives the result of each. Nothing is written of those that have not
     ended at a signal.
 
     :param arrived: signals, as they come.

@@ -48,7 +48,7 @@ def read_loops(path: Path) -> tuple[str, ...]:
     """
     Read the namespaces of loops, one a line; blank lines and comments after # do not count.
 
-    :raises ConfigurationError: naming the line and what is wrong with it.
+    :raises ConfigurationError: naming the line and its defect.
     :raises OSError: when the file cannot be read.
     """
     lines: dict[str, int] = {}

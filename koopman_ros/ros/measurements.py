@@ -77,7 +77,7 @@ class Measurements:
 
     @property
     def complaint(self) -> str:
-        """What is wrong with the messages, or an empty string."""
+        """The defect of the messages, or an empty string."""
         return '' if self._frame_length <= LONGEST_FRAME_ID else (
             f'the frame_id of the measurement has {self._frame_length} characters; only the first '
             f'{LONGEST_FRAME_ID} are forwarded: shorten it at the sensor')

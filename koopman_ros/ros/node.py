@@ -34,8 +34,8 @@ class LoopNode(HostedNode):
     """
     A node whose parameters are those of a table, and which may complete work before its end.
 
-    Every value that it was given is declared, so that the table finds names it does not know, and
-    the table answers what rclpy would answer less clearly itself.
+    Every given value is declared, so that the table finds unknown names and rejects values with a
+    clearer message than rclpy.
 
     :param hosting: in a process that it shares with others; alone by default.
     :ivar exit_code: ends the process, or the node in a process of many, when a node whose work is
@@ -54,7 +54,7 @@ class LoopNode(HostedNode):
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """What the node says of itself, once a second and on change."""
+        """The status of the node, once a second and on change."""
         return Diagnostics(self)
 
     def given(self) -> dict[str, Any]:
@@ -64,7 +64,7 @@ class LoopNode(HostedNode):
                 if parameter.value is not None}
 
     def complete(self) -> None:
-        """Complete that work, if there is any; what is published here goes out last."""
+        """Complete that work, if there is any; messages published here are sent last."""
 
     def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
                             *args: Any, **options: Any) -> Subscription:
@@ -171,7 +171,7 @@ class LoopNode(HostedNode):
         Keep a snapshot of a table, all of which is declared, in step with the parameters.
 
         :param apply: called with each new snapshot, after the change took effect.
-        :param accept: called before with a snapshot that fits and the names of what was set;
+        :param accept: called before with a valid snapshot and the names of the changed parameters;
             returns why it cannot be, or an empty string.
         """
         current = snapshot

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What each program does, and the help, parameter files and SROS2 policy that follow from it.
+Description of each program, with the help, parameter files and SROS2 policy made from it.
 
 Run it as ``python -m koopman_ros.ros.node_descriptions`` after a change to a table or in here.
 """

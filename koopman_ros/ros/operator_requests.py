@@ -25,7 +25,7 @@ _SHOWN = 60.0  # s for which a request that was refused or limited is a warning
 
 class OperatorRequests:
     """
-    Pass requests on to the control loop, and say which were refused or limited.
+    Pass requests on to the control loop, and report which were rejected or limited.
 
     :param applied: measured inputs, from which a first manual command begins.
     :param changed: called after each request.
@@ -103,7 +103,7 @@ class OperatorRequests:
         self._log.warning(note, throttle_duration_sec=1.0)
 
     def _limited(self, requested: Array) -> str:
-        """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
+        """Return the message for a manual command (n_u,) outside the limits, or ''."""
         within = self._loop.controller.tuning.limits.within(requested)
         return ', '.join(
             f'manual {base_name(name, unit)} {quantity_text(wanted, unit, ".2f")} is limited to '

@@ -79,10 +79,10 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
 
 def events_executor(context: Context | None = None) -> Executor:
     """
-    Return an executor that is told of each message, for nodes without clients.
+    Return an executor that is notified of each message, for nodes without clients.
 
-    rclpy's others set up their wait anew for each message, which takes longer than a control
-    step. The first releases for Jazzy have no other.
+    rclpy's other executors rebuild their wait set for each message, which takes longer than a
+    control step. The first releases for Jazzy have no other.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -94,7 +94,7 @@ def events_executor(context: Context | None = None) -> Executor:
 def run_task(name: str, prepare: Callable[[], Callable[[], int]],
              args: list[str] | None = None) -> int:
     """
-    Run what needs ROS for its parameters and names alone; an interrupt ends it.
+    Run a task that needs ROS for its parameters and names only; an interrupt ends it.
 
     :param prepare: reads them, and returns a task without ROS that returns the exit code, which
         is 1 when it could not start or complete, 2 for an unknown argument.
@@ -117,7 +117,7 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
 
 def take_down(name: str, node: LoopNode | None, executor: Executor | None,
               patience: float = TAKE_DOWN_PATIENCE) -> None:
-    """Take a node down, and the middleware, by force where that takes longer than so many s."""
+    """Take a node down, and the middleware, by force after `patience` s."""
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see
     # docs/explanation/fast_dds_deadlock.md
     disarm = force_exit_after(patience, 0, (
@@ -143,7 +143,7 @@ def init(args: list[str] | None) -> None:
 
 
 def _loops_file(args: list[str] | None) -> str | None:
-    """Return the file of loops that is given alone beside ROS's arguments, or None."""
+    """Return the file of loops if it is the only argument that is not ROS's, or None."""
     try:
         rest = remove_ros_args(args)[1:]
     except RuntimeError:

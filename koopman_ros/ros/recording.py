@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recording as the trainer does it: starts and stops, names, room on the disk, what went wrong."""
+"""Recording by the trainer: starts and stops, names, disk space, errors."""
 
 from collections.abc import Callable
 import contextlib
@@ -84,7 +84,7 @@ class Recording:
         return self._path
 
     def complete(self) -> None:
-        """Complete the bag, if there is one, with all that has arrived, and say what it holds."""
+        """Complete an open bag with all received messages, and report its content."""
         if self._recorder is not None:
             with contextlib.suppress(OSError):
                 self.stop()
@@ -104,7 +104,7 @@ class Recording:
         return recorder
 
     def _attempt(self, work: Callable[[Recorder], None]) -> None:
-        """Do a part of the recording, or else give it up: what was flushed stays readable."""
+        """Run a part of the recording; an error ends it, flushed messages stay readable."""
         if self._recorder is None:
             return
         try:

@@ -77,7 +77,7 @@ class TrainingProgress:
     """
     How far a training is: a bar on a terminal, else a line every five seconds.
 
-    :param say: prints such a line.
+    :param say: prints a line.
     """
 
     def __init__(self, say: Callable[[str], object]) -> None:
@@ -111,7 +111,7 @@ class Training:
         self._timer = wall_timer(node, POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
-        """Start a training and say from what; ValueError without a bag, OSError of the system."""
+        """Start a training, return a message; ValueError without a bag, OSError of the system."""
         settings = self.settings
         bags = [bag for bag in (settings.bags if any(settings.bags) else (self._recorded(),))
                 if bag]

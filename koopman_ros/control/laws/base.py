@@ -100,7 +100,7 @@ class Weights:
 
 @dataclass(frozen=True, slots=True)
 class SolutionInfo:
-    """What a law says of its solution; NaN and '' for what it does not have."""
+    """Figures of a law's solution; NaN and '' for those that it does not have."""
 
     form: str = ''  #: which form of the law was used, for the operator
     residual: float = math.nan  #: relative residual of the Riccati equation
@@ -115,9 +115,9 @@ NO_SOLUTION = SolutionInfo()
 @dataclass(frozen=True, slots=True)
 class Plan:
     """
-    What a law with a horizon expects, in units of states and inputs, and which limits it meets.
+    The plan of a law with a horizon, in units of states and inputs, and its active limits.
 
-    Of a limit -1 says that the lower one is active, 1 the upper one, and 0 none.
+    A limit is -1 if the lower one is active, 1 for the upper one, and 0 for none.
     """
 
     times: Array  #: (N + 1,) of the nodes in s, from 0, when the plan was made
@@ -130,7 +130,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class LawResult:
-    """What a law gives, or why it gives nothing."""
+    """The result of a law: an input, or the reason of its failure."""
 
     #: (n_u,) in input units, which the controller brings within the limits; None with a failure
     u: Array | None
@@ -147,11 +147,10 @@ class Law(ABC):
     """
     A control law on a model: from an estimate and a target to an input.
 
-    To add one, derive a class in any module and name it in `fallback_order` as
-    ``module:Class``. It is
-    constructed when the controller is configured, and then called once a sample. What it has to
-    remember it returns as `memory` and is given at the next sample; it keeps nothing itself, so
-    that a replay finds the same commands. An exception is a failure: the next level acts.
+    To add one, derive a class in any module and name it in `fallback_order` as ``module:Class``.
+    It is constructed when the controller is configured, and then called at each sample. Its memory
+    is returned as `memory` and passed in at the next sample; the law itself has no state, so a
+    replay gives the same commands. An exception is a failure: the next level acts.
 
     Example::
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The receding-horizon law; what it computes a plan with is loaded when it is constructed."""
+"""The receding-horizon law; numba and the solver are loaded when it is constructed."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ class Planner:
             terminal, grid.since_change * self._rate)
 
     def grid(self, interval: float) -> HorizonGrid:
-        """Return the horizon for samples so many seconds apart."""
+        """Return the horizon for a sample interval in s."""
         return self._grid(interval / self._model.seconds_per_time_unit)
 
     def _new_grid(self, sample: float) -> HorizonGrid:

@@ -119,10 +119,10 @@ def two_state_reactor(parameters: ReactorParameters | None = None,
 def fed_reactor(parameters: ReactorParameters | None = None,
                 nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
-    Build the two-state reactor with its feed flow as an input beside the coolant.
+    Build the two-state reactor with its feed flow as a second input.
 
-    What the flow q does depends on the state: q/V (C_Af - C_A) and q/V (T_i - T). Parameters and
-    errors are those of :func:`one_state_reactor`; the flow rate is the nominal one.
+    The effect of the flow q depends on the state: q/V (C_Af - C_A) and q/V (T_i - T). Parameters
+    and errors are those of :func:`one_state_reactor`; the flow rate is the nominal one.
     """
     constants = parameters or ReactorParameters()
     fixed = two_state_reactor(constants, nominal_state=nominal_state)
