@@ -137,7 +137,7 @@ class ClosedLoopTest:
         """Return the ranges of starts and set-points of failed loops; empty where none failed."""
         failed = self.failed
         return '' if not failed.any() else (
-            f'begun at {self._ranges(self.starts[failed])} and bound for '
+            f'from {self._ranges(self.starts[failed])} to set-points '
             f'{self._ranges(self.setpoints[failed])}')
 
     def _ranges(self, x: Array) -> str:
@@ -160,13 +160,14 @@ class ClosedLoopTest:
             sound = self.ratios[~self.poor]
             worst = float(np.max(sound)) if len(sound) else math.nan
             rest = '' if not self.poor.any() else (
-                f', but for {np.sum(self.poor)} in which it would with a perfect model, too')
-            return f'{text}, costing at most {worst:.3g} times as much as a linear one{rest}'
+                f', except in {np.sum(self.poor)} loops that are costly with a perfect model as '
+                'well')
+            return f'{text}; its cost is at most {worst:.3g} times that of a linear law{rest}'
         failed, lost = self.failed, np.isinf(self.excess)
         counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
-                  (int(np.sum(failed & lost & ~self.no_gain)), 'not arriving'),
+                  (int(np.sum(failed & lost & ~self.no_gain)), 'without reaching the set-point'),
                   (int(np.sum(failed & ~lost)),
-                   f'costing over {MOST_EXCESS:g} times as much as with a perfect model'))
+                   f'at over {MOST_EXCESS:g} times the cost with a perfect model'))
         return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
 
     def __repr__(self) -> str:

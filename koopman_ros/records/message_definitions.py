@@ -84,7 +84,7 @@ def _split(type_name: str) -> tuple[str, str]:
 
 
 def _read(package: str, file_name: str, type_name: str) -> str:
-    """Return a file of a package's share/<package>/msg from the first prefix that has it."""
+    """Return a file of a package's share/<package>/msg from the first prefix that contains it."""
     listed = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     searched = [Path(prefix) / 'share' / package / 'msg'
                 for prefix in dict.fromkeys((*listed, sys.prefix)) if prefix]

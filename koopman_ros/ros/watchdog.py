@@ -19,7 +19,7 @@ _PATIENCE = 5.0  # s from a signal to the end of a callback, or of the start
 
 class Watchdog:
     """
-    Does what the executor's timer would, whenever the executor is too busy.
+    Acts in place of the executor's timer whenever the executor is too busy.
 
     It counts its own looks: time in which the whole process was suspended does not count.
 

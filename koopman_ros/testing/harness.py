@@ -145,7 +145,7 @@ class Harness:
     def wait_until(self, condition: Callable[[], T], what: str | Callable[[], str] = '',
                    timeout: float | None = None) -> T:
         """
-        Let the node work until a condition holds, and return what it returned.
+        Let the node work until a condition holds, and return its value.
 
         :param what: the awaited condition, or the present state, for the error.
         :raises HarnessError: after the timeout, or when a process ends unexpectedly.

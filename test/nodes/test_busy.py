@@ -146,7 +146,7 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
     code = bench.process.stop()
     busy.close()
     assert code == 1
-    assert 'controller: busy for 0.2 s after a signal: ended by force' in bench.process.output()
+    assert 'controller: still busy 0.2 s after a signal' in bench.process.output()
 
 
 def test_watchdog_acts_only_without_a_beat_and_tells_its_errors() -> None:

@@ -192,10 +192,10 @@ def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
     for k in range(60):
         # a thermometer that does not follow: the observer takes it for a plant that is cooled
         bench.measure(STEADY - 8.0 - 0.01 * (k % 2), 2.0 + k)
-    status = bench.status(lambda s: 'would need' in s.message)
+    status = bench.status(lambda s: 'would have to be' in s.message)
     assert status.level == DiagnosticStatus.WARN
-    needed = re.search(r'the set-point would need the coolant at ([\d.]+) degC, its range is 5 to '
-                       r'32: it is not reached', status.message)
+    needed = re.search(r'the set-point is not reached: the coolant would have to be ([\d.]+) '
+                       r'degC, but its range is 5 to 32', status.message)
     assert needed, status.message
     assert float(needed[1]) > 32.0
 

@@ -185,7 +185,7 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     # code that was not named at the start
     for name, code in (('fallback_order', ['sdre', 'json:dumps']), ('estimator', 'this:s')):
         (result,) = ros.set_parameters('controller', **{name: code})
-        assert 'fixed at start' in result.reason
+        assert 'at start-up: restart' in result.reason
     bad = tmp_path / 'bad.safetensors'
     bad.write_text('nonsense')
     for model, words in ((str(bad), str(bad)),
@@ -309,7 +309,7 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     assert not [s for s in ros.statuses if s.name.startswith('trainer')]
     assert len(loop.commands) == count
     (result,) = ros.set_parameters('trainer', physical_model='this:s')
-    assert 'fixed at start' in result.reason
+    assert 'at start-up: restart' in result.reason
     assert ros.set_parameters('trainer', **{'coolant_temperature.safe_value': 10.0})[0].successful
     assert change(ros, 'trainer', 'configure')
     assert change(ros, 'trainer', 'activate')

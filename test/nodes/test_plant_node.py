@@ -170,7 +170,7 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
     """Of the two-state reactor, which stays at its steady state."""
     def wait() -> None:
         status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
-        assert status.message == 'waiting for the loop: no controller yet'
+        assert status.message == 'waiting for a controller or trainer to subscribe'
 
     concentrations = ros.listen(JointState, reactor.CONCENTRATION)
     bench = Bench(ros, wait, system='two_state', speed=20.0, sample_period=0.5, start_time=7.0)
@@ -199,7 +199,7 @@ def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> 
         f'reset to temperature {initial:.6g} degC, coolant {NOMINAL_COOLANT:.6g} degC')
     bench.resume()
     assert bench.wait_for_more(1)[0].temperature == pytest.approx(initial, abs=0.5)
-    bench.status(lambda s: s.message == 'finished: the duration is over')
+    bench.status(lambda s: s.message == 'finished: simulated duration reached')
     ros.wait_until(lambda: len(bench.measured) >= 301)
     assert [seconds(message) for message in bench.measured] == pytest.approx(
         [10.0 + 0.7 * k for k in range(301)], abs=1e-9)
@@ -222,7 +222,7 @@ def test_stamps_and_frames_that_a_message_can_hold() -> None:
     for parameters, words in (
             ({'start_time': 2147483648.0}, 'must be in [0.001, 2147483647] s'),
             ({'start_time': 2e9, 'duration': 1e9}, 'start_time + duration = 3000000000 s must be'),
-            ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, must have at most 256')):
+            ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, the maximum is 256')):
         assert words in TABLE.check(TABLE.snapshot(parameters))
 
 

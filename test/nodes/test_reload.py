@@ -314,7 +314,7 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     slow.close()
     ros.wait_until(reloaded.done)
     assert not reloaded.result().success
-    assert 'the model was changed to reactor_linear' in reloaded.result().message
+    assert 'reactor_linear became the current model' in reloaded.result().message
     ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_linear')
     # the other is still being read when the process is told to end
     assert ros.processes[0].stop() == 0

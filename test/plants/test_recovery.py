@@ -65,7 +65,7 @@ def test_episodes_stay_where_the_input_outweighs_the_plant():
                                       'both sides of the nominal state'),
     (UNSTABLE, {'input_lower': 0.0}, 'must lie on both sides of the nominal input'),
     (UNSTABLE, {'state_lower': -np.inf}, 'state_lower'),
-    (linear([[1.0]], [[0.0]]), {}, 'no feedback of its inputs stabilises it')])
+    (linear([[1.0]], [[0.0]]), {}, 'no state feedback stabilises')])
 def test_ranges_and_plants_from_which_nothing_comes_back(system, change, message):
     with pytest.raises(ValueError, match=message):
         recoverable(system, np.zeros((1, 1)), **{**BOX, **change})

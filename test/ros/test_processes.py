@@ -160,7 +160,7 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
         message.clock.sec, message.clock.nanosec = sec, nanosec
         clock.publish(message)
         ros.meet('controller')
-    ros.wait_until(lambda: '/clock has sec -5, nanosec 0, which is no valid time: ignored' in (
+    ros.wait_until(lambda: 'ignored an invalid /clock message (sec -5, nanosec 0; ' in (
         process.output()))
     # the true time is taken still
     clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))
@@ -181,8 +181,8 @@ def test_help_and_unknown_arguments(name: str, capsys: pytest.CaptureFixture[str
     assert answer(name, [name, '__ns:=/unit']) is None
     assert answer(name, [name, 'speed:=2.0', 'more']) == 2
     assert capsys.readouterr().err == (
-        f"{name}: unknown argument 'speed:=2.0': parameters are given as --ros-args -p "
-        'name:=value; --help says more\n')
+        f"{name}: unknown argument 'speed:=2.0': pass parameters as --ros-args -p "
+        'name:=value; see --help\n')
 
 
 @pytest.mark.parametrize(('name', 'given', 'code', 'said'), [
@@ -194,9 +194,9 @@ def test_help_and_unknown_arguments(name: str, capsys: pytest.CaptureFixture[str
     ('controller', ["system:=''", 'model:=two_tanks'], 0, 'publishes: pump_1_setpoint, '),
     ('panel', ["system:=''", 'model:=two_tanks'], 0, '\n  level_2.shown_unit: '),
     ('player', ['system:=none'], 0, '\n  bag: '),
-    ('plant', ['system:=none'], 1, "there is no plant 'none'"),
+    ('plant', ['system:=none'], 1, "plant 'none': choose"),
     ('controller', ['system:=none'], 1, "'none' has no model: name one"),
-    ('trainer', ['system:=none'], 1, 'give states_measured and inputs_commanded'),
+    ('trainer', ['system:=none'], 1, 'states_measured and inputs_commanded'),
 ])
 def test_help_for_a_system(name: str, given: list[str], code: int, said: str,
                            capsys: pytest.CaptureFixture[str]) -> None:

@@ -255,11 +255,11 @@ class Silent(Constants):
 
 
 @pytest.mark.parametrize(('plant', 'equations', 'ranges', 'words'), [
-    (VESSEL, Silent, {}, 'does not say which of its constants are to be estimated: name some of '
+    (VESSEL, Silent, {}, 'marks no constants as estimated: name some of '
      'leak'),
     (VESSEL, Vessel, {'height': None}, 'height is no constant of Vessel: it has gain, strength'),
     (VESSEL, Vessel, {'leak': (0.5, 0.1)},
-     r'the range of leak is \[0.5, 0.1\] 1/s, must rise and lie in \[0, 10\] 1/s'),
+     r'the range of leak is \[0.5, 0.1\] 1/s, must increase and lie in \[0, 10\] 1/s'),
     (VESSEL, Vessel, {'leak': (0.5, 11.0)}, r'lie in \[0, 10\] 1/s'),
     (description(('depth',), ('pump',)), Vessel, {},
      r'the record has the states depth \[m\], Vessel has level \[m\]'),
