@@ -152,7 +152,7 @@ def test_a_costly_law_is_refused_by_what_it_costs():
     assert found.ratios == pytest.approx(np.full(16, expected), rel=1e-4)
     # of a linear plant it is the same law
     assert found.excess == pytest.approx(found.ratios, rel=1e-4)
-    assert '(16 costing over 1.05 times as much as with a perfect model)' in str(found)
+    assert '(16 at over 1.05 times the cost with a perfect model)' in str(found)
 
 
 def test_what_no_law_can_do_within_the_limits_is_judged_without_them():
@@ -205,8 +205,8 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
     assert np.all(found.excess[found.poor] <= 1.001)
     assert found.accepted
     assert found.region == ''
-    assert str(found).endswith(f', but for {np.sum(found.poor)} in which it would with a perfect '
-                               'model, too')
+    assert str(found).endswith(f', except in {np.sum(found.poor)} loops that are costly with a '
+                               'perfect model as well')
     # here it is to blame
     blamed = too_steady_on_its_plant()
     assert not blamed.accepted
@@ -226,7 +226,7 @@ def test_what_a_better_model_would_save_is_held_against_a_model():
     assert alone.any()
     assert (found.ratios[alone] == 0.0).all()
     assert found.arrived == found.loops - alone.sum()
-    assert 'costing over 1.05 times as much as with a perfect model' in str(found)
+    assert 'at over 1.05 times the cost with a perfect model' in str(found)
 
 
 def test_what_is_slow_and_cheap_has_not_failed():

@@ -412,7 +412,8 @@ SHAFT = linear_model()
     ({'x_ref': 3.0}, 'incompatible set-point: expected one number for each of x0, x1, got 3.0'),
     ({'x_ref': [3.0], 'controlled': ()}, 'incompatible set-point: expected one number for each'),
     # 0 = 0.4 a + b + 0.2 v and 0 = -0.3 a - 0.5 b + 1.5 v hold a and b on a line
-    ({'x_ref': [3.4, 2.0]}, r'no input of the model holds x0, x1 at \[3\.4, 2\.0\]; the nearest steady state is'),
+    ({'x_ref': [3.4, 2.0]},
+     r'no input of the model holds x0, x1 at \[3\.4, 2\.0\]; the nearest steady state is'),
     ({'x0': 3.0}, r'incompatible x0: expected \(2,\), got \(\)'),
     ({'x0': [3.0, np.nan]}, 'x0 must be finite'),
     ({'weights': Weights(np.eye(1), np.eye(1))}, r'incompatible Q: expected \(2, 2\), got \(1,'),
