@@ -30,7 +30,7 @@ def odd_phrases(prose: str, odd: tuple[str, ...]) -> list[str]:
     """Return the odd phrases in a text, each with its surroundings."""
     prose = re.sub(r'\s+', ' ', prose)
     return [prose[max(0, found.start() - 30):found.end() + 30]
-            for found in re.finditer(rf'\b(?:{"|".join(odd)})\b', prose, re.IGNORECASE)]
+            for found in re.finditer(rf'(?<![.\w])(?:{"|".join(odd)})\b', prose, re.IGNORECASE)]
 
 
 def prose_of(file: Path) -> Iterator[str]:

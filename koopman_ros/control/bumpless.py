@@ -47,7 +47,7 @@ class BumplessTransfer:
     """
 
     offset: Array  #: (n_u,) now, in input units
-    feed: Array  #: (n_u,) what it follows, which fades exponentially
+    feed: Array  #: (n_u,) offset that it follows, which fades exponentially
 
     def after(self, seconds: float, time_constant: float) -> BumplessTransfer | None:
         """Return the rest of the transfer after seconds, or None; T = 0 s ends it at once."""

@@ -30,7 +30,7 @@ class Configuration:
 
     model: LiftedModel  #: the lift
     tuning: Tuning  #: with one number for each signal
-    outputs: Outputs | None = None  #: what is measured; every state by default
+    outputs: Outputs | None = None  #: measured outputs; every state by default
 
     __repr__ = short_repr
 

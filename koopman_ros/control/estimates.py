@@ -27,7 +27,7 @@ class Observation:
     """A measurement as it was taken into account."""
 
     verdict: Verdict  #: whether it is accepted
-    expected: Array | None  #: (n_y,) what was expected of it; None when nothing was
+    expected: Array | None  #: (n_y,) its prediction, or None
     x: Array  #: (n_x,) state that it is taken for, in state units
     outside: float  #: its distance from the training data, in half-ranges
 
@@ -48,7 +48,7 @@ class StateEstimation:
     """
 
     model: LiftedModel  #: the lift
-    outputs: Outputs  #: what is measured of its states
+    outputs: Outputs  #: its measured outputs
     tuning: Tuning  #: for these signals
     levels: dict[str, FallbackLevel]  #: by name, best first
 

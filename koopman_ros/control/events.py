@@ -22,7 +22,7 @@ class Measurement:
     """A measurement, for which a command is calculated."""
 
     stamp_ns: int  #: its stamp
-    measured: Array  #: (n_y,) in the model's units; NaN for what cannot be
+    measured: Array  #: (n_y,) in the model's units; NaN for impossible values
     applied: Array | None = None  #: (n_u,) measured input that goes with it, or None
     #: how many of the seconds since the last stamp the rate limit may count, or None for all
     seconds: float | None = None
@@ -33,7 +33,7 @@ class Silence:
     """No measurement was received up to a time, for which a command is calculated."""
 
     stamp_ns: int  #: that time, in the time of the measurements' stamps
-    #: why the command is held; None where it goes on from what is estimated
+    #: why the command is held; None where it continues from the estimate
     cause: StatusCode | None = StatusCode.NO_MEASUREMENT
 
 
@@ -43,7 +43,7 @@ class SetpointRequest:
 
     stamp_ns: int  #: time at which it takes effect; 0: immediately
     value: Array  #: of the signals, in the model's units
-    #: which of the controlled ones are asked for, the others stay as they are; None for all
+    #: which of the controlled ones are requested, others are unchanged; None for all
     signals: tuple[str, ...] | None = None
 
 

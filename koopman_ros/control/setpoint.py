@@ -24,9 +24,9 @@ class Setpoint:
     """The state of the set-point."""
 
     #: (n_c,) where the operator wants to be, or None before the first request; NaN, before the
-    #: first measurement, for what was not asked for
+    #: first measurement, for signals without a request
     requested: Array | None = None
-    #: (n_c,) what is tracked now, on its ramp to the requested value; None at first
+    #: (n_c,) active set-point, on its ramp to the requested value; None at first
     active: Array | None = None
     #: (time in ns, (n_c,) value) of requests that take effect later, in time order; NaN for what
     #: they do not ask for

@@ -36,7 +36,7 @@ class PlantDescription:
     time_unit: str  #: ``'s'`` or ``'min'``
     #: (n_x,) steady state under the nominal input; NaN where it is not known yet
     nominal_state: Array
-    nominal_input: Array  #: (n_u,) nominal input, likewise
+    nominal_input: Array  #: (n_u,) nominal input, or NaN
     #: (n_x, n_u) input matrix, in units; None to learn it; where it depends on the state, a
     #: function of states (..., n_x), in their units, to (..., n_x, n_u)
     B: Array | Callable[[Array], Array] | None

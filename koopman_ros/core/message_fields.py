@@ -23,8 +23,8 @@ class FieldDefaults:
 
     field: str  #: where in the message; '{name}' stands for the name of the signal
     unit: str = ''  #: of the number there; empty for that of the signal
-    lowest: float = -math.inf  #: that it can be, in this unit; what is below is no measurement
-    highest: float = math.inf  #: likewise
+    lowest: float = -math.inf  #: possible value, in this unit; lower ones are no measurements
+    highest: float = math.inf  #: possible value, in this unit
 
 
 # One row a message type; any other type can be named with the field. Units are those of REP 103.

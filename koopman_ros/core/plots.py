@@ -37,7 +37,7 @@ class Picture:
     """A picture of a page."""
 
     file: str  #: its name, in the folder of the page
-    caption: str  #: what it shows, with its numbers
+    caption: str  #: with its numbers
 
     def __str__(self) -> str:
         """Return the picture with its caption, in Markdown."""

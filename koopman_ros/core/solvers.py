@@ -49,7 +49,7 @@ class RiccatiSolution:
     """
 
     P: Array  #: (n, n) symmetric; zeros when there is no stable subspace to take it from
-    K: Array  #: (m, n); zeros likewise
+    K: Array  #: (m, n); zeros without a solution
     residual: float  #: Frobenius norm of the equation's left side over the sum of its terms' norms
     gain: float  #: spectral norm of K
     status: RiccatiStatus  #: whether K may be used

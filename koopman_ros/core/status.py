@@ -150,7 +150,7 @@ UNMEASURED = (StatusCode.NO_MEASUREMENT, StatusCode.STAMPS_STAND, StatusCode.TWO
 class Reason:
     """A code with its values."""
 
-    code: StatusCode  #: what is the matter
+    code: StatusCode
     #: numbers in the signal's own unit, names, and the reason behind this one as `cause`; `signal`
     #: names the signal whose unit they have
     values: Mapping[str, Value] = field(default_factory=dict)

@@ -18,7 +18,7 @@ class Advance(Enum):
 
     NEW = 'new'  #: larger than all before it
     OLD = 'old'  #: repeated, or late by less than is tolerated
-    RESTARTED = 'restarted'  #: so much smaller that the count starts again from it
+    RESTARTED = 'restarted'  #: smaller by so far that the count restarts from it
     TWO_SOURCES = 'two sources'  #: one of a count that starts again and again
 
 

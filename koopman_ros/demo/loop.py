@@ -39,7 +39,7 @@ _TIMEOUT = 30.0  # s for the processes to find each other, and from one command 
 class Scenario:
     """The setup of a closed loop."""
 
-    #: new set-points, by signal and in its unit; none where somebody else gives them
+    #: new set-points, by signal and in its unit; none if another node publishes them
     setpoints: Mapping[str, float]
     system: str = 'reactor'  #: plant that is shipped
     step_time: float = 60.0  #: when they take effect, in s after the first measurement

@@ -69,7 +69,7 @@ class Estimate:
     w: Array  #: (n_x,) disturbance of its rate, taken as constant
     #: (2 n_x, 2 n_x) of the errors of both, or None where it is not known, or as at first
     covariance: Array | None = None
-    innovation: Innovation | None = None  #: of the last measurement, or None likewise
+    innovation: Innovation | None = None  #: of the last measurement, or None
 
     @property
     def finite(self) -> bool:

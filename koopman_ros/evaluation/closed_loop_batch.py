@@ -27,7 +27,7 @@ Rate = Callable[[Array, Array], Array]
 # inputs (M, n_u) of states (M, n_x), as far as these are active; NaN where there is none
 _Feedback = Callable[[Array, NDArray[np.bool_]], Array]
 
-#: A law fails where it costs more than so many times as much as with a perfect model.
+#: A law fails if its cost exceeds that with a perfect model by more than this factor.
 MOST_EXCESS = 1.05
 
 # A loop has arrived when it ends this close to the set-point, in units of the scale.

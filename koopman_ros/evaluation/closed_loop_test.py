@@ -30,7 +30,7 @@ from koopman_ros.tuning import InputLimits, Tuning
 
 #: Closed loops that a law is judged by.
 LOOPS = 128
-#: A law is poor that costs more than so many times as much as a linear one.
+#: A law is poor if its cost exceeds that of a linear one by more than this factor.
 MOST_COST = 1.1
 #: Share of the closed loops that may fail.
 MOST_FAILURES = 0.01

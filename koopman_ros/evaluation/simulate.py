@@ -53,7 +53,7 @@ class Loop:
     """A closed loop at one time."""
 
     controller: Controller  #: that acts
-    state: State  #: what it remembers
+    state: State  #: of the controller
     plant: Plant  #: under it
 
     __repr__ = short_repr
@@ -102,7 +102,7 @@ class Simulation:
 
     times: Array  #: (N,) in s from the start
     states: Array  #: (N, n) of the plant
-    measured: Array  #: (N, n_y) what the controller received; NaN where nothing
+    measured: Array  #: (N, n_y) received measurements; NaN for none
     inputs: Array  #: (N, n_u) that acted when it was measured
     commands: Array  #: (N, n_u) answered; NaN before the first
     setpoints: Array  #: (N, n_c) active; NaN before the first

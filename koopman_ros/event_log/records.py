@@ -55,7 +55,7 @@ class EventRecord:
     run: str  #: of the controller, another one each time it is started
     number: int  #: counts within a run, from 0 without a gap
     event: str  #: name of the event
-    fields: Mapping[str, Any]  #: what else is written
+    fields: Mapping[str, Any]  #: further fields
 
     def text(self) -> str:
         """Return the record as a line of JSON."""

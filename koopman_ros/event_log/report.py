@@ -59,8 +59,8 @@ class ReplayedBag:
     recorded: Array  #: (n, n_u) recorded commands
     commands: Array  #: (n, n_u) commands of the replay; NaN where it has no state
     new_commands: Array  #: (n, n_u) commands of the new model; NaN where it has no state
-    check: CommandComparison  #: the replay beside the record
-    new: CommandComparison | None  #: the new model beside the record, or None without one
+    check: CommandComparison  #: of the replay with the record
+    new: CommandComparison | None  #: of the new model with the record, or None
 
     @property
     def seconds(self) -> Array:

@@ -22,7 +22,7 @@ class JobState:
     """Where a retraining stands, with the figures of a lift that was judged."""
 
     share: float = 0.0  #: done, in [0, 1]
-    text: str = 'starting'  #: what is done now, or how it ended
+    text: str = 'starting'  #: the present stage, or the result
     ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
     #: those of a fleet that have ended, by name

@@ -126,7 +126,7 @@ class Box:
     """The range of states and inputs that a model is learned over, and its scaled coordinates."""
 
     states: Coordinates  #: the states' names, units, scaling and range
-    inputs: Coordinates  #: the inputs' likewise
+    inputs: Coordinates  #: coordinates of the inputs
     time_unit: str  #: ``'s'`` or ``'min'``
 
     __repr__ = short_repr

@@ -86,7 +86,7 @@ class VerifiedLoops:
     """
 
     starts: Array  #: (N, n_x) initial states in scaled deviations, N from 1 to 1024
-    setpoints: Array  #: (N, n_x) likewise
+    setpoints: Array  #: (N, n_x) set-points of the loops
     #: (N,) whether the law did not arrive, or had no gain, where a linear law arrived
     lost: NDArray[np.bool_]
 

@@ -37,7 +37,7 @@ class LoadedModel:
     model: LiftedModel
     file_time: str  #: when the file was written, in UTC
     digest: str  #: SHA-256 of the file
-    comparison: str = ''  #: with the model before, on what was measured then; empty at the start
+    comparison: str = ''  #: with the previous model, on the measurements then; empty at the start
 
     @property
     def identity(self) -> dict[str, str]:
@@ -58,7 +58,7 @@ class ModelCheckContext:
     parameters: ControllerParameters
     state: State
     measured: Array  #: (n_y,) last measurement; NaN before the first
-    recent: PredictionWindows | None  #: what was measured lately; None while that is too little
+    recent: PredictionWindows | None  #: recent measurements; None while they are too few
 
     def controller(self, model: LiftedModel) -> Controller:
         """Return the controller of a model; ModelFileError where it cannot be."""

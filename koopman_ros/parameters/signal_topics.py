@@ -31,7 +31,7 @@ AUDIT_LOG = 'audit_log'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 
-#: what is controlled where nothing else is said
+#: the default system
 DEFAULT_SYSTEM = 'reactor'
 
 LONGEST_FRAME_ID = 256  # characters that are passed on

@@ -13,7 +13,7 @@ from koopman_ros.plants.constants import in_plant_units
 from koopman_ros.plants.system import ControlAffineSystem
 
 _LIBRARY = 'koopman_ros.plants.library'
-#: the classes of the library by name, each imported when it is asked for
+#: the classes of the library by name, each imported on first use
 PLANTS = {
     'reactor': f'{_LIBRARY}.reactor:OneStateReactor',
     'two_state': f'{_LIBRARY}.reactor:TwoStateReactor',

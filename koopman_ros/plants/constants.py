@@ -61,7 +61,7 @@ class Constant:
     unit: str  #: of SI; degC for a temperature
     lower: float  #: lowest value
     upper: float  #: highest value
-    description: str  #: what it is
+    description: str  #: in words
     #: the range in which it is estimated from a record, None where it is taken as known
     estimated: tuple[float, float] | None = None
 

@@ -42,9 +42,9 @@ class RandomStepDesign:
     """
 
     input_lower: ArrayLike  #: lowest input, a scalar or (n_u,), in input units
-    input_upper: ArrayLike  #: highest input, likewise; levels are uniform between the two
+    input_upper: ArrayLike  #: highest input; levels are uniform between the two
     state_lower: ArrayLike  #: lower corner of the box, a scalar or (n_x,), in state units
-    state_upper: ArrayLike  #: upper corner of the box, likewise
+    state_upper: ArrayLike  #: upper corner of the box
     #: how long each level is held, in time units: a number, or a shortest and a longest between
     #: which whole sample periods are equally likely
     hold_time: float | tuple[float, float]

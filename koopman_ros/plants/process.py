@@ -37,7 +37,7 @@ class Process:
     x: Array  #: present state (n_x,)
     u: Array  #: input (n_u,) that acts, up to the present time
     actuator: Actuator = Actuator()  #: between commands and input
-    command: Array | None = None  #: what the input follows (n_u,); None for what it is
+    command: Array | None = None  #: (n_u,) that the input follows; None for u
     #: commands that take effect later, by rising time: (time in ns, number of the input, value)
     pending: tuple[tuple[int, int, float], ...] = ()
 

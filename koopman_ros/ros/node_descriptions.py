@@ -106,7 +106,7 @@ class Program:
     subscribes: tuple[str, ...] = ()  #: topics; /clock where it follows simulated time
     serves: tuple[str, ...] = ()  #: services
     calls: tuple[str, ...] = ()  #: services of others
-    many: str = ''  #: what it does with ``--loops``, a file of namespaces
+    many: str = ''  #: clause about its action with ``--loops``
 
 
 def _wiring(given: Mapping[str, Any]) -> tuple[SignalTopics, tuple[str, ...]]:

@@ -30,7 +30,7 @@ class Target:
     z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
     drift: Array  #: (n_x,) the model's drift there
     u: Array  #: (n_u,) input that balances drift and disturbance
-    forcing: Array  #: (n_x,) B(x_ref) u_ref + w, what acts on the state beside the drift
+    forcing: Array  #: (n_x,) B(x_ref) u_ref + w, added to the drift
     residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
@@ -136,7 +136,7 @@ class LawResult:
     u: Array | None
     failure: Reason | None = None  #: why it may not be used; None when it may
     info: SolutionInfo = NO_SOLUTION  #: about the solution, as far as there is one
-    memory: object = None  #: what the law wants to be given at the next sample
+    memory: object = None  #: passed to the law at the next sample
     plan: Plan | None = None  #: of a law with a horizon
     clipped: bool = False  #: whether the range cut it
     #: whether a failure is of this sample alone, so that the law acts again at the next

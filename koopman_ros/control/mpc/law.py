@@ -69,7 +69,7 @@ class RecedingHorizon(Law):
                              f'{np.asarray(parameters.lower).tolist()} and '
                              f'{np.asarray(parameters.upper).tolist()}')
         self._riccati = StateDependentRiccati(model, tuning, None)
-        #: what computes the plans; None where it cannot be loaded
+        #: computes the plans; None where it cannot be loaded
         self.planner: Planner | None = None
         self._unusable: Reason | None = None
         try:
