@@ -113,7 +113,7 @@ class PlantExperiment:
             return True, (f'ended: {self._run.return_text}; call again with data: false to '
                           'release the inputs')
         self._release(self._verdict(self._run))
-        return True, 'the trainer does not command any more'
+        return True, 'the trainer has released the inputs'
 
     def _on_end(self, why: Reason | None) -> None:
         """Report the end of the steps, or stop commanding at once for a reason."""

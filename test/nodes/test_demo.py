@@ -51,7 +51,7 @@ def test_demo_says_in_one_line_why_it_cannot_run(
     (tmp_path / 'taken').write_text('a file, not a folder')
     for options, words in ((['--output', str(tmp_path / 'taken')], str(tmp_path / 'taken')),
                            (['--plant', 'volcano', '--output', str(tmp_path)],
-                            "no demo of 'volcano': choose one of fed_reactor, pendulum")):
+                            "no demo for the plant 'volcano': choose one of fed_reactor,")):
         assert setpoint_demo.main(options) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith('demo: ')

@@ -116,7 +116,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
     ros.meet('trainer')
     # who asks for set-points beside the experiment is in its way; its name may be known later
     said = ros.set_bool(SERVICE, True).message
-    assert re.match('refused: (/bench|another node) publishes on /level_1/setpoint: end it, or '
+    assert re.match('refused: (/bench|another node) publishes on /level_1/setpoint: stop it, or '
                     'choose', said)
     for name, publisher, level in zip(LEVELS, asked, before, strict=True):
         publisher.publish(JointState(name=[name], position=[float(level)]))

@@ -126,14 +126,12 @@ class Failing:
 
 @pytest.mark.parametrize(('program', 'given', 'words'), [
     (plant, {'system': 'ovn'}, ("plant 'ovn': choose one of", 'workspace sourced')),
-    (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check the '
-                                                                                  'name, and '
-                                                                                  'that')),
+    (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check the name')),
     (plant, {'system': 'bad_oven:Empty'}, ('must be a ControlAffineSystem', 'method system')),
-    (plant, {'system': 'bad_oven:Failing'}, ('cannot be constructed', 'its class')),
+    (plant, {'system': 'bad_oven:Failing'}, ('cannot be constructed', 'correct the class')),
     (trainer, {}, ('the measured signals and inputs of the system', "like ['level [m]']")),
     (trainer, {**SIGNALS, 'states_measured': '["temperature [Kelvin]"]'},
-     ("there is no unit 'Kelvin'", 'write one like K')),
+     ("there is no unit 'Kelvin'", 'use e.g. K')),
     (controller, {**SIGNALS, 'model': 'reactor_nz4'},
      ('has states temperature [K] and inputs power [W]', 'choose a model of that system',
       '-p "system:=\'\'"')),

@@ -158,7 +158,7 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
     ros.set_parameters('plant', **{'constants.heat_transfer_coefficient': reactor.constant(
         'heat_transfer_coefficient')})
     # also where none ever came
-    status = ros.wait_for_status(STATUS, lambda s: 'no command arrives' in s.message)
+    status = ros.wait_for_status(STATUS, lambda s: 'no command is received' in s.message)
     assert status.level == DiagnosticStatus.WARN
     command = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
     command.publish(temperature(26.0))
@@ -336,11 +336,11 @@ def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
         intruder.create_publisher(Temperature, f'/{topic}', topics.LOOP_QOS)
     # names come a moment after their topics
     status = bench.ros.wait_for_status(STATUS, lambda s: (
-        s.message.count('end all but one') == 2 and 'UNKNOWN' not in s.message))
+        s.message.count('stop all but one') == 2 and 'UNKNOWN' not in s.message))
     assert status.level == DiagnosticStatus.WARN
     assert status.message == (
-        '2 nodes command the coolant: /bench, /elsewhere/intruder; end all but one; '
-        '2 nodes publish the temperature: /elsewhere/intruder, /plant; end all but one')
+        '2 nodes command the coolant: /bench, /elsewhere/intruder; stop all but one; '
+        '2 nodes publish the temperature: /elsewhere/intruder, /plant; stop all but one')
     intruder.destroy_node()
     status = bench.status(lambda s: s.level == DiagnosticStatus.OK)
     assert status.message == 'running'

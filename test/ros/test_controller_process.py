@@ -171,7 +171,7 @@ def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros
         commands += measured(bench, first, 5)
     assert np.max(np.abs(np.diff(commands))) < 0.05
     assert np.ptp(commands) > 0.0
-    ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
+    ros.wait_until(lambda: 'controller time is reset' in bench.process.output())
     status = bench.status()
     assert value(status, 'measurements') == '16'
     assert status.level == DiagnosticStatus.OK
@@ -337,7 +337,7 @@ def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(
     manual = running.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
     manual.publish(temperature(20.0))
     running.wait_for_status('controller: control', lambda s: (
-        'the applied coolant is not known' in s.message))
+        'the applied coolant is unknown' in s.message))
     # before the first measurement, from what is applied
     commands = running.listen(Temperature, reactor.COOLANT_SETPOINT)
     coolant = running.speak(

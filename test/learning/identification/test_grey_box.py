@@ -257,7 +257,8 @@ class Silent(Constants):
 @pytest.mark.parametrize(('plant', 'equations', 'ranges', 'words'), [
     (VESSEL, Silent, {}, 'marks no constants as estimated: name some of '
      'leak'),
-    (VESSEL, Vessel, {'height': None}, 'height is no constant of Vessel: it has gain, strength'),
+    (VESSEL, Vessel, {'height': None},
+     'height is not a constant of Vessel: choose from gain, strength'),
     (VESSEL, Vessel, {'leak': (0.5, 0.1)},
      r'the range of leak is \[0.5, 0.1\] 1/s, must increase and lie in \[0, 10\] 1/s'),
     (VESSEL, Vessel, {'leak': (0.5, 11.0)}, r'lie in \[0, 10\] 1/s'),
