@@ -177,7 +177,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None) -> Retrai
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` returned True; nothing is written.
     :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
-    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
+    :raises SchedulerLost: when a scheduler is not reached, or lost; nothing is written then.
     """
     checked_device(task.device)
     with backend_of(task.executor) as backend, progress_line() as report:
@@ -200,7 +200,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
                          hidden=bool(task.unmeasured_states or task.physical_model),
                          tick=progress.reading(2 * source.size()), backend=backend)
     if not record.episodes:
-        raise ValueError('the bags hold no usable segment of measurements: '
+        raise ValueError('the bags contain no usable segment of measurements: '
                          + '; '.join(record.account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
@@ -227,7 +227,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     decision = replace(decision, warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
-        *[f'it is not compared with the present model {task.model}, which has other states'
+        *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     progress('decide', 0.9, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
@@ -246,8 +246,8 @@ def _checked(task: TrainingTask) -> Thresholds:
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     if task.warm_start_model == FIRST:
-        raise ValueError(f'warm_start_model = {FIRST!r} is the first of a fleet: retrain several '
-                         'plants in one call, or name a model file')
+        raise ValueError(f'warm_start_model = {FIRST!r} means the first model of a fleet: retrain '
+                         'several plants in one call, or name a model file')
     return Thresholds(task.margin, task.condition)
 
 
@@ -263,7 +263,7 @@ class _Progress:
             raise Stopped
 
     def reading(self, total: int) -> Callable[[int], None]:
-        """Return a tick that is given the samples that were read, of so many in all."""
+        """Return a tick that is given the samples that were read, of a total."""
         def tick(samples: int) -> None:
             self._read += samples
             self('read', min(1.0, self._read / total), 'reading bags')
@@ -325,8 +325,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
             reasons = decision.reasons
         if not reasons:
             break
-        warnings = ('it was learned from nothing, as what training made of '
-                    f'{task.warm_start_model} would be refused: {"; ".join(reasons)}',)
+        warnings = (f'trained without warm start, because the model from {task.warm_start_model} '
+                    f'would be rejected: {"; ".join(reasons)}',)
     return learned, decision, reasons
 
 

@@ -109,4 +109,4 @@ def _start(shared: tuple[ScaledSamples, int, TrainedLift | None], item: tuple[Re
         with _one_thread():
             return recipe.start(data, n_z, parent, seed, lambda *step: tell(step))
     except torch.linalg.LinAlgError as error:
-        return f'a start is degenerate ({error}): check that all states move on their own'
+        return f'a start is degenerate ({error}): check that all states move independently'

@@ -200,11 +200,11 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
 def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple[int, ...]:
     """Return the rounds from those of a lift to begin from on."""
     if not isinstance(recipe, IncrementalTraining):
-        raise ValueError('only a lift by growth begins from another one: choose its class, or '
-                         'begin from nothing')
+        raise ValueError('only IncrementalTraining can start from a lift: use it, or pass no '
+                         'initial lift')
     if begin.n_z not in rounds:
-        raise ValueError(f'the lift that is begun from has {begin.n_z} coordinates, must have '
-                         f'{rounds[0]} to {rounds[-1]} for one of {rounds[-1]}')
+        raise ValueError(f'the initial lift has {begin.n_z} coordinates, must have {rounds[0]} to '
+                         f'{rounds[-1]} for a lift of {rounds[-1]}')
     return tuple(n_z for n_z in rounds if n_z >= begin.n_z)
 
 
@@ -275,8 +275,8 @@ def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bo
                 backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
-            raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} is no controller: '
-                                 f'{law_check}: use {_remedies(winner.model)}')
+            raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} does not control the '
+                                 f'plant: {law_check}: use {_remedies(winner.model)}')
     models, figures = [], []
     for candidate in path:
         figures.append(evaluate(candidate.model, test))
