@@ -126,7 +126,8 @@ class Failing:
 
 @pytest.mark.parametrize(('program', 'given', 'words'), [
     (plant, {'system': 'ovn'}, ("plant 'ovn': choose one of", 'workspace sourced')),
-    (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check the name')),
+    (plant, {'system': 'no_oven:Oven'},
+     ('cannot be loaded (ModuleNotFoundError', 'check the name')),
     (plant, {'system': 'bad_oven:Empty'}, ('must be a ControlAffineSystem', 'method system')),
     (plant, {'system': 'bad_oven:Failing'}, ('cannot be constructed', 'correct the class')),
     (trainer, {}, ('the measured signals and inputs of the system', "like ['level [m]']")),
