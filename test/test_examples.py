@@ -180,8 +180,8 @@ def test_unreachable_set_point_of_the_tanks_is_refused_as_the_truth_has_it(tanks
         [np.sqrt(0.15), np.sqrt(0.08) - np.sqrt(0.15)])
     assert _numbers(r'in truth it takes (\S+) V and (\S+) V', tanks.text) == pytest.approx(
         [u1, u2], abs=0.005)
-    assert _numbers(r'^level_2 set-point 0.08 m cannot be held, since pump_2 would have to be '
-                    r'(\S+) V, its range is 0 V to 12 V', tanks.names['refusal']) == [
+    assert _numbers(r'^level_2 set-point 0.08 m cannot be held, because pump_2 would have to be '
+                    r'(\S+) V, but its range is 0 V to 12 V', tanks.names['refusal']) == [
         pytest.approx(u2, rel=0.2)]
 
 

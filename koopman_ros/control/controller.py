@@ -99,7 +99,7 @@ class Controller(ControlStep):
             return reason(StatusCode.SETPOINT_NOT_TRIED, error=contained(error))
 
     def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
-        """Return what of a set-point, requested already, is outside the trained range, or None."""
+        """Return the part of a requested set-point that is outside the trained range, or None."""
         for value in (*(value for _, value in setpoint.scheduled), setpoint.requested,
                       setpoint.active):
             if value is not None:
@@ -154,7 +154,7 @@ class Controller(ControlStep):
         """
         Start from the input (n_u,) that is applied already, as after a restart.
 
-        Nothing is changed after the first command, nor by what is not finite; another size is a
+        It is ignored after the first command, and if it is not finite; another size is a
         ValueError.
         """
         applied = numbers('applied input', applied, self.model.inputs.names)

@@ -28,7 +28,7 @@ class Observation:
     """A measurement as it was taken into account."""
 
     verdict: Verdict  #: whether it is accepted
-    expected: Array | None  #: (n_y,) what was expected of it; None when nothing was
+    expected: Array | None  #: (n_y,) its prediction, or None
     x: Array  #: (n_x,) state that it is taken for, in state units
     outside: float  #: its distance from the training data, in half-ranges
 
@@ -49,7 +49,7 @@ class StateEstimation:
     """
 
     model: LiftedModel  #: the lift
-    outputs: Outputs  #: what is measured of its states
+    outputs: Outputs  #: its measured outputs
     tuning: Tuning  #: for these signals
     levels: dict[str, FallbackLevel]  #: by name, best first
 
@@ -101,7 +101,7 @@ class StateEstimation:
         Check a measurement (n_y,) and take it into account.
 
         :param elapsed: seconds since the last command.
-        :return: the state with measurement, time and estimate, and what became of the measurement.
+        :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
         before, last = state.estimate, state.accepted
         predicted = self.predict(state, time_ns, elapsed)
@@ -148,7 +148,7 @@ class StateEstimation:
         """
         Return the state (n_x,), in state units, that goes with a measurement (n_y,).
 
-        What the measurement leaves open is as it is known, or where it may rest.
+        States that it does not determine are those of the estimate, or of a steady state.
         """
         outputs, states = self.outputs, self.model.states
         if outputs.determine_state:
@@ -183,7 +183,7 @@ class StateEstimation:
         return estimator.correct(predicted, xi, elapsed)
 
     def _lost(self, state: State, time_ns: int) -> bool:
-        """Tell whether no measurement was accepted for so long that the state is not known."""
+        """Whether the state is unknown, because no measurement was accepted for too long."""
         if state.accepted is None:
             return False
         seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS

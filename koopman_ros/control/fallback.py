@@ -220,7 +220,7 @@ class FallbackLevel:
         return replace(result, u=within, clipped=bool(result.clipped or np.any(within != u)))
 
     def _within_reach(self, target: Target, w: Array) -> Target:
-        """Return the target, or what is nearest to it where the inputs do not suffice."""
+        """Return the target, or the nearest one where the inputs do not suffice."""
         model, limits = self.model, self.limits
         # a single one at its end goes there by itself
         if self.law.model_free or model.n_u == 1 or len(self.controlled) > model.n_u:
@@ -237,8 +237,8 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
     """
     Build the levels that a tuning names, best first.
 
-    :raises ValueError: for a law or an estimator that there is not, or one that cannot do with
-        what is measured.
+    :raises ValueError: for an unknown law or estimator, or one for which the measured signals do
+        not suffice.
     """
     name = tuning.estimator or (
         'extended_kalman_filter' if not outputs.determine_state else

@@ -53,10 +53,10 @@ class ControlStep(Configuration):
         """
         Answer one measurement.
 
-        A repeated stamp and one out of order, earlier by at most a second, return the last
-        command again; a still earlier stamp starts time afresh. After a gap in the measurements
-        ramp and rate limit count twice the interval before it, not the gap. Stamps that return to
-        where they were before they went back count from the newest of those.
+        A repeated stamp and one out of order, earlier by at most a second, return the last command
+        again; a still earlier stamp resets the time. After a gap in the measurements ramp and rate
+        limit count twice the interval before it, not the gap. Stamps that return to where they
+        were before they went back count from the newest of those.
 
         :param y: (n_y,) measured, in the signals' units.
         :param applied: (n_u,) measured input at that time, or None; see
@@ -156,7 +156,7 @@ class ControlStep(Configuration):
                 before.restarted(time_ns), Verdict(before.accepted, fault), measured, time)
 
     def _advanced(self, state: State, x: Array, time: StepTime) -> State:
-        """Return the state with the set-point of now; `x` (n_x,) is what it begins from."""
+        """Return the state with the set-point of now; it begins from `x` (n_x,)."""
         return replace(state, setpoint=setpoints.advance(
             state.setpoint, self.best.controlled_of(x), self.controlled,
             self.tuning.setpoint_ramp, time.now_ns, time.counted,
@@ -246,7 +246,7 @@ class ControlStep(Configuration):
     def _act(self, state: State, supervisor: Supervisor, recovery: SafeStateRecovery | None,
              result: LawResult | None, transfer: BumplessTransfer | None
              ) -> tuple[dict[str, Any], Array, CommandReport]:
-        """Return what changes of the state, the command before limits, and its report."""
+        """Return the changes of the state, the command before limits, and its report."""
         level, held = supervisor.level, self._last_command(state)
         if result is None or result.u is None:
             done = NO_COMMAND if result is None else CommandReport(

@@ -35,9 +35,9 @@ def usual_interval(state: State) -> float:
 
 def afresh(state: State, by_ns: int) -> State:
     """
-    Return the state after the clock was set: what was timed by it has lost its meaning.
+    Return the state after the clock was set: without times of the former clock.
 
-    :param by_ns: how far it was set, by which inputs under way act at other times.
+    :param by_ns: the change of the clock, by which inputs under way act at other times.
     """
     supervisor = replace(state.supervisor, bad_since_ns=None, better_since_ns=None)
     newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
@@ -49,7 +49,7 @@ def afresh(state: State, by_ns: int) -> State:
 
 def time_of_measurement(state: State, time_ns: int, countable: float | None
                          ) -> tuple[State, StepTime, int]:
-    """Return the state with its usual interval, the times of the step, and what was missed."""
+    """Return the state with its usual interval, the times of the step, and the missed time."""
     since_ns = state.commanded_ns
     ahead_of_stamps = since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS
     if ahead_of_stamps:

@@ -68,10 +68,10 @@ class ExtendedKalmanFilter(Estimator):
     The extended Kalman filter of state and disturbance: dx/dt = f(x) + B u + w, y = C x + noise.
 
     There is one disturbance for each output, a random walk: where there are as many inputs, it
-    acts like a change of them, otherwise on the outputs' own rates. It is what leaves no offset
-    (G. Pannocchia, J. B. Rawlings, AIChE J. 49 (2003)). Prediction is by Runge-Kutta steps with
-    their variational equations, correction in the form of Joseph. See A. H. Jazwinski,
-    *Stochastic Processes and Filtering Theory* (1970), section 8.3.
+    acts like a change of them, otherwise on the outputs' own rates. It removes the offset (G.
+    Pannocchia, J. B. Rawlings, AIChE J. 49 (2003)). Prediction is by Runge-Kutta steps with their
+    variational equations, correction in the form of Joseph. See A. H. Jazwinski, *Stochastic
+    Processes and Filtering Theory* (1970), section 8.3.
 
     :raises ValueError: where the outputs leave states or disturbances open.
     """
@@ -108,12 +108,12 @@ class ExtendedKalmanFilter(Estimator):
             if self._determined(found):
                 return found
         names = ', '.join(self.outputs.names)
-        raise ValueError(f'{names}, measured, do not determine the states '
+        raise ValueError(f'the measurements of {names} do not determine the states '
                          f'{", ".join(model.states.names)} and a disturbance for each: measure '
                          'another signal')
 
     def _determined(self, directions: Array) -> bool:
-        """Tell whether outputs show all modes that do not decay, and each disturbance."""
+        """Whether the outputs determine all modes that do not decay, and each disturbance."""
         n, H = self.model.n_x, self._H
         n_d = directions.shape[1]
         A = np.zeros((n + n_d, n + n_d))
@@ -166,7 +166,7 @@ class ExtendedKalmanFilter(Estimator):
 
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:
-        """Return state and covariance after so many steps of h, in time units."""
+        """Return state and covariance after a number of steps of h, in time units."""
         model = self.model
         n = model.n_x
         forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
@@ -232,7 +232,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
 
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:
-        """Return mean and covariance of points that are moved so many steps of h."""
+        """Return mean and covariance of points after a number of steps of h."""
         model, n = self.model, self.model.n_x
         values, vectors = np.linalg.eigh(P)
         size = int(np.count_nonzero(values > _NO_VARIANCE * values[-1]))

@@ -14,11 +14,11 @@ import sys
 import time
 from typing import Any
 
+from koopman_ros.core.progress import show_bar
 from koopman_ros.execution.job import Job
 
-_CANCELLED = 'cancelled, nothing was written'
+_CANCELLED = 'cancelled; nothing was written'
 _LINE_PERIOD = 5.0  # s between plain lines of progress
-_BAR_WIDTH = 30
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class JobState:
     """Where a retraining stands, with the figures of a lift that was judged."""
 
     share: float = 0.0  #: done, in [0, 1]
-    text: str = 'starting'  #: what is done now, or how it ended
+    text: str = 'starting'  #: the present stage, or the result
     ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
     #: those of a fleet that have ended, by name
@@ -62,11 +62,7 @@ class TrainingProgress:
     def show(self, state: JobState) -> None:
         """Show a state of the training."""
         if sys.stderr.isatty():
-            full = round(_BAR_WIDTH * state.share)
-            bar = '#' * full + '-' * (_BAR_WIDTH - full)
-            text, end = ('', '\n') if state.ended else (state.text, '')
-            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
-                  file=sys.stderr, flush=True)
+            show_bar(state.share, *(('', '\n') if state.ended else (state.text,)))
         elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
             self._last_line = time.monotonic()
             self._say(f'{100.0 * state.share:.0f} %: {state.text}')
@@ -132,12 +128,12 @@ class TrainingJob(Job):
             text = _CANCELLED
         elif code < 0:
             name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
-            remedy = ('a day of processor time is its limit: train on fewer bags'
+            remedy = ('the limit is one day of processor time; train on fewer bags'
                       if name == 'SIGXCPU' else
-                      'see whether the memory suffices, and train again')
+                      'check the free memory, and train again')
             text = f'the training process was killed by {name}: {remedy}'
         else:
-            last = self.errors[-1] if self.errors else 'it said nothing'
+            last = self.errors[-1] if self.errors else 'no error message'
             text = f'the training process ended with code {code}: {last}'
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): '
@@ -149,15 +145,15 @@ def outcome_text(summary: Mapping[str, Any]) -> str:
     """Return the result of a training in a sentence."""
     if not summary['accepted']:
         reasons = '; '.join(summary['reasons'])
-        kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
-        return f'the new model ({summary["model_class"]}) is refused: {reasons}{kept}'
+        kept = f'; saved as {summary["model_file"]}' if summary['model_file'] else ''
+        return f'the new model ({summary["model_class"]}) is rejected: {reasons}{kept}'
     present = summary['heldout_error_of_present_lift']
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
         'heldout_error_of_present_lift', 'present one'))
     units = summary['units']
-    return (f'the new model ({summary["model_class"]}) is accepted: error on held-out records '
+    return (f'the new model ({summary["model_class"]}) is accepted: its error on held-out data is '
             f'{_errors(summary["heldout_error"], units)}, that of the {name} '
-            + ('infinite, as it diverges' if None in summary[other].values()
+            + ('infinite (diverges)' if None in summary[other].values()
                else _errors(summary[other], units))
             + f'; written to {summary["model_file"]}')
 

@@ -18,6 +18,7 @@ from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.plots import finite
+from koopman_ros.core.progress import progress_line
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import (
@@ -182,7 +183,7 @@ class Retrained:
         return finite_figures
 
 
-def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False, *,
+def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
             record: Record | None = None, test: Record | None = None) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
@@ -192,19 +193,22 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False, *,
     training makes of a sibling's would be refused, training starts again without the sibling.
     The result does not depend on the executor of the task.
 
+    :param on_progress: called with the share done and a text; True stops the training. By default
+        a terminal shows both on one line.
     :param record: to learn from, in place of the bags of the task.
-    :param test: a record that takes no part in the training. The new model is refused if its free
+    :param test: a record that takes no part in the training. The new model is rejected if its free
         run errs more there than that of the best linear model.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` returned True; nothing is written.
     :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
-    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
+    :raises SchedulerLost: when a scheduler is not reached, or lost; nothing is written then.
     """
     checked_device(task.device)
-    with backend_of(task.executor) as backend:
-        return _retrain(backend, task, on_progress, record, test)
+    with backend_of(task.executor) as backend, progress_line() as report:
+        return _retrain(backend, task, on_progress or (lambda *now: bool(report(*now))), record,
+                        test)
 
 
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
@@ -221,7 +225,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     record = (_read(backend, task, states, inputs, current, progress) if given is None else
               reduced(given.of(*units), task.most_samples, task.seed, hidden=_hidden(task)))
     if not record.episodes:
-        raise ValueError('the bags hold no usable segment of measurements: '
+        raise ValueError('the bags contain no usable segment of measurements: '
                          + '; '.join(record.account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
@@ -258,7 +262,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         *decision.reasons, *_failed_test(runs, found, test)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
-        *[f'it is not compared with the present model {task.model}, which has other states'
+        *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     progress('decide', 0.9, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
@@ -325,8 +329,8 @@ def _checked(task: TrainingTask) -> Thresholds:
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     if task.warm_start_model == FIRST:
-        raise ValueError(f'warm_start_model = {FIRST!r} is the first of a fleet: retrain several '
-                         'plants in one call, or name a model file')
+        raise ValueError(f'warm_start_model = {FIRST!r} means the first model of a fleet: retrain '
+                         'several plants in one call, or name a model file')
     return Thresholds(task.margin, task.condition)
 
 
@@ -342,7 +346,7 @@ class _Progress:
             raise Stopped
 
     def reading(self, total: int) -> Callable[[int], None]:
-        """Return a tick that is given the samples that were read, of so many in all."""
+        """Return a tick that is given the samples that were read, of a total."""
         def tick(samples: int) -> None:
             self._read += samples
             self('read', min(1.0, self._read / total), 'reading bags')
@@ -355,9 +359,7 @@ class _Progress:
 
     def learning(self, now: MultistartProgress) -> bool:
         self.learned = now.finished / now.total
-        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
-        self('learn', self.learned, f'learning: {now.name}, n_z {now.n_z}, start '
-             f'{min(now.finished + 1, now.total)} of {now.total}{rw}')
+        self('learn', self.learned, f'learning: {now.name}, {now.text}')
         return False
 
     def judging(self, name: str, share: float) -> bool:
@@ -406,8 +408,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
             reasons = decision.reasons
         if not reasons:
             break
-        warnings = ('it was learned from nothing, as what training made of '
-                    f'{task.warm_start_model} would be refused: {"; ".join(reasons)}',)
+        warnings = (f'trained without warm start, because the model from {task.warm_start_model} '
+                    f'would be rejected: {"; ".join(reasons)}',)
     return learned, decision, reasons
 
 

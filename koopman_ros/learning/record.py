@@ -66,11 +66,10 @@ class Reduction:
 
     def text(self) -> str:
         """Say it in words."""
-        means = (f'means of {self.group} samples each, over which the motion is straight but for '
-                 'the noise, ' if self.group > 1 else '')
-        return (f'a long record: {means}{self.chosen} of {self.segments} segments are learned '
-                f'from and judged by ({self.used} of {self.samples} samples), drawn so that they '
-                'visit the cells of the range evenly')
+        means = (f'means of {self.group} samples each, over which the motion is linear except for '
+                 'noise, ' if self.group > 1 else '')
+        return (f'a long record: {means}{self.chosen} of {self.segments} segments are used '
+                f'({self.used} of {self.samples} samples), selected to cover the range evenly')
 
 
 @dataclass(frozen=True)
@@ -87,9 +86,9 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
     """
     Read the episodes of some bags: all of them, or a selection where they are many.
 
-    A record of more than `most` samples is read twice. The first reading tells its range, and
-    over how many samples the motion is a straight line but for the noise: so many are averaged,
-    which loses nothing. The second one chooses segments, see :class:`Selection`.
+    A record of more than `most` samples is read twice. The first reading tells its range, and over
+    how many samples the motion is linear except for noise: these are averaged, which loses
+    nothing. The second one chooses segments, see :class:`Selection`.
 
     :param hidden: whether states are to be found that are not measured.
     :param tick: told of the samples of a long record as they are read.
@@ -162,7 +161,7 @@ def _chosen(survey: RecordStatistics, found: Selection, account: ImportReport) -
 
 def _streamed(source: RecordSource, bag: str, account: ImportReport, tell: Tell
               ) -> Iterator[Episode]:
-    """Yield the episodes of a bag, and tell of the samples so far."""
+    """Yield the episodes of a bag, and report the samples so far."""
     read = 0
     for episode in stream_episodes([bag], source.states, source.inputs, account,
                                    tolerance_ns=source.tolerance_ns,

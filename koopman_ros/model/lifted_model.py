@@ -65,7 +65,7 @@ class Provenance:
     def __post_init__(self) -> None:
         if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
                 self.accepted is not None):
-            raise ValueError(f'accepted = {self.accepted} does not fit the reasons '
+            raise ValueError(f'accepted = {self.accepted} contradicts the reasons '
                              f'{list(self.reasons)}')
 
     @property
@@ -253,7 +253,7 @@ class LiftedModel:
             xi = solver.y.reshape(shape)
             if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
                 raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
-                                   'inputs within the training box')
+                                   'inputs within the trained range')
             path.append(xi)
         return self.states.to_physical(np.stack(path, axis=-2))
 
@@ -348,7 +348,7 @@ class LiftedModel:
 
     def failed_near(self, x: Array, x_ref: Array) -> bool:
         """
-        Tell whether the law failed in the tested loop nearest to a state and a set-point.
+        Whether the law failed in the tested loop nearest to a state and a set-point.
 
         Both (n_x,) in scaled deviations; see :attr:`verified_loops`.
         """

@@ -80,8 +80,8 @@ class ControllerNode(ManagedNode):
         model = str(given.get('model') or plant_defaults(system, 'controller').get('model', ''))
         if not model:
             raise ConfigurationError(
-                f'there is no model of the system {system!r}: name one in model, or in system one '
-                f'of {", ".join(bundled_plants())}')
+                f'no model is known for the system {system!r}: set model, or set system to one of '
+                f'{", ".join(bundled_plants())}')
         loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
@@ -214,8 +214,8 @@ class ControllerNode(ManagedNode):
                                     advance is not Advance.OLD)
         if outcome is None or outcome.report is None:
             self.get_logger().error(
-                'a measurement is not answered, as a control step takes longer than the watchdog '
-                'waits: choose a smaller model', throttle_duration_sec=1.0)
+                'no command for a measurement, because a control step takes longer than the '
+                'watchdog waits: choose a smaller model', throttle_duration_sec=1.0)
             return
         report = outcome.report
         self._recent.add(
@@ -272,8 +272,8 @@ class ControllerNode(ManagedNode):
                 self.get_logger().info(change, throttle_duration_sec=1.0)
             self._logged = report
         if report.measurement.clock_went_back:
-            self.get_logger().warning('the measurement is older than the last one: time starts '
-                                      'afresh', throttle_duration_sec=1.0)
+            self.get_logger().warning('the stamp of the measurement jumped back by more than 1 s: '
+                                      'controller time is reset', throttle_duration_sec=1.0)
         # of many measurements within PERIOD the status shows the first, and then the last
         until, *told = self._last_status
         now = time.monotonic()

@@ -148,8 +148,8 @@ class PanelNode(LoopNode):
             store = AlarmStore(self.view.alarms, Path(path), time.time())
         except (OSError, ValueError) as error:
             raise ConfigurationError(
-                f'alarm_file = {path!r} cannot be used ({error}): name a new file in a folder '
-                'that can be written, or one that a panel wrote') from error
+                f'alarm_file = {path!r} cannot be used ({error}): name a new file in a writable '
+                'folder, or a file written by a panel') from error
         if store.complaint:
             self.get_logger().warning(store.complaint)
         return store
@@ -159,8 +159,8 @@ class PanelNode(LoopNode):
             from koopman_ros.panel.server import PanelServer
         except ImportError as error:
             raise ConfigurationError(
-                f'the panel needs {error.name}, which is missing: pip install '
-                "'nicegui>=3' argon2-cffi itsdangerous limits") from error
+                f"the panel needs {error.name}, which is not installed: pip install 'nicegui>=3' "
+                'argon2-cffi itsdangerous limits') from error
         settings = self.settings
         server = PanelServer(
             self, settings.host, settings.port, settings.users, settings.tls_certificate,
@@ -271,7 +271,7 @@ class PanelNode(LoopNode):
         try:
             model = load(model_path(name))
         except (OSError, ValueError) as error:
-            self.get_logger().warning(f'no training range is shown: {error}')
+            self.get_logger().warning(f'trained ranges are not shown: {error}')
             self._training_ranges, card = {}, {}
         else:
             self._training_ranges, card = training_ranges(model), model_card(model)
@@ -375,7 +375,7 @@ class PanelNode(LoopNode):
         return f'outside {to_read(low):.6g} to {to_read(high):.6g} {read}, the trained range'
 
     def _status(self) -> TaskReport:
-        return TaskReport(Severity.OK, f'{self._server.pages} pages open', {
+        return TaskReport(Severity.OK, f'{self._server.pages} pages are open', {
             'address': self._server.address, 'pages': self._server.pages})
 
 

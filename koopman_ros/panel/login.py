@@ -53,7 +53,7 @@ class AccessControl:
         return scope['session'].get(_ID)
 
     def session(self, scope: Mapping[str, Any], *, use: bool = True) -> Session | None:
-        """Return the session of a request, None if nobody is logged in."""
+        """Return the session of a request, None if no user is logged in."""
         if self.users is None:
             return Session('operator', Role.OPERATOR)
         return self.sessions.find(self.session_id(scope), use=use)

@@ -55,7 +55,7 @@ _PAGES: dict[str, Callable[[PageLayout], None]] = {
 
 
 class _AuthMiddleware:
-    """Middleware that refuses requests of other origins, and those without a log-in."""
+    """Middleware that rejects requests of other origins, and those without a login."""
 
     def __init__(self, app: Any, keeper: AccessControl, listener: Listener) -> None:
         self._app, self._keeper, self._listener = app, keeper, listener
@@ -192,7 +192,7 @@ class PanelServer:
         while not self._server.started and self._thread.is_alive() and time.monotonic() < end:
             time.sleep(_POLL)
         if not self._server.started:
-            raise OSError(f'the pages cannot be served, or not within {_START:g} s')
+            raise OSError(f'the web server failed, or did not start within {_START:g} s')
 
     def stop(self) -> None:
         """Stop to serve."""
@@ -203,16 +203,15 @@ class PanelServer:
 def _check(host: str, file: str, users: Users | None, certificate: str, key: str,
            proxies: Sequence[str]) -> None:
     if users is not None and not len(users):
-        raise ValueError(f'users = {file!r} has no user in it: add one with '
-                         f'python -m koopman_ros.panel.access {file} NAME operator')
+        raise ValueError(f'users = {file!r} contains no user: add one with python -m '
+                         f'koopman_ros.panel.access {file} NAME operator')
     if users is None and not is_loopback(host):
         raise ValueError(
-            f'the panel is not served on {host!r} without passwords: name a file of users, '
-            'written by python -m koopman_ros.panel.access FILE NAME ROLE, or serve it on '
-            '127.0.0.1')
+            f'host = {host!r} requires passwords: set users to a file written by python -m '
+            'koopman_ros.panel.access FILE NAME ROLE, or set host to 127.0.0.1')
     if users is None and proxies:
-        raise ValueError('trusted_proxy needs users: a proxy lets other machines reach the panel; '
-                         'name a file of users')
+        raise ValueError('trusted_proxy requires users, because a proxy lets other machines reach '
+                         'the panel: set users')
     if certificate:
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)

@@ -39,7 +39,7 @@ class Process:
     x: Array  #: present state (n_x,)
     u: Array  #: input (n_u,) that acts, up to the present time
     actuator: Actuator = Actuator()  #: between commands and input
-    command: Array | None = None  #: what the input follows (n_u,); None for what it is
+    command: Array | None = None  #: (n_u,) that the input follows; None for u
     #: commands that take effect later, by rising time: (time in ns, number of the input, value)
     pending: tuple[tuple[int, int, float], ...] = ()
 
@@ -47,7 +47,7 @@ class Process:
 
     @property
     def followed(self) -> Array:
-        """What the input follows (n_u,)."""
+        """The delayed command (n_u,) that the input follows."""
         return self.u if self.command is None else self.command
 
     @property
@@ -116,7 +116,7 @@ class Process:
 
 
 def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Array:
-    """Return a state (n_x,) so many nanoseconds later."""
+    """Return a state (n_x,) after a duration in nanoseconds."""
     if time_ns == 0:
         return x
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
@@ -127,7 +127,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> Contr
     Put a first-order lag before each input: d[x; v]/dt = [f(x) + B(x) v; -v / tau] + [0; u / tau].
 
     The inputs v that act become states; the time constants tau (n_u,) are in time units. An input
-    without one, of which tau is 0, stands still where it is.
+    without lag, of which tau is 0, stays where it is.
     """
     n_x, n_u = system.n_x, system.n_u
     rate = np.zeros(n_u)

@@ -49,7 +49,7 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Recor
                   least_jumps: Sequence[float] | None = None) -> tuple[list[Episode],
                                                                        ImportReport]:
     """
-    Return all episodes of some bags, see :func:`stream_episodes`, and what was made of the bags.
+    Return all episodes of some bags, see :func:`stream_episodes`, and the account of the import.
 
     :raises BagReadError: as it does.
     """
@@ -76,10 +76,10 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     stamp; where the stamps are those of the wall clock, it acts later by the time between the two
     receipts. A command without a stamp acts when it is received.
 
-    Episodes end at gaps, where time is set back, and where a state jumps to another level as
-    after a reset. Spikes of a single sample are dropped, and so are measurements before the first
-    input, since nobody knows what acted on them. A bag that was not closed or is damaged is read
-    as far as it goes. The account tells all that.
+    Episodes end at gaps, where time is set back, and where a state jumps to another level as after
+    a reset. Spikes of a single sample are dropped, and so are measurements before the first input,
+    because the applied input is unknown before. A bag that was not closed or is damaged is read as
+    far as it goes. The account lists all of that.
 
     Memory does not grow with the bags: of a long record some ten thousand measurements are
     put together at a time, at whose ends an episode ends, too.
@@ -87,7 +87,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     :param account: is added to as the episodes come.
     :param tolerance_ns: how far stamps of one sample of several states may lie apart.
     :param least_jumps: smallest change of each state, in its unit, that may be a spike or a jump;
-        by default the record alone tells.
+        by default the one in the record.
     :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there,
         and for states without stamps whose receipts run at another pace than /clock in the bag.
     """
@@ -108,7 +108,7 @@ def distinct(bags: Sequence[str | os.PathLike[str]], account: ImportReport
     read: set[str] = set()
     for bag in bags:
         if (path := os.path.realpath(bag)) in read:
-            account.note(f'{os.fspath(bag)} is named twice: read once')
+            account.note(f'{os.fspath(bag)} is listed twice: read once')
             continue
         read.add(path)
         yield bag
@@ -152,8 +152,8 @@ class _BagImport:
         lacks = [found.topic not in self.content.types
                  for found in (signal.measured, signal.command)]
         if lacks == [True, False]:
-            self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: {signal.name} '
-                              'is taken from its command')
+            self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: the command is '
+                              f'used as the applied {signal.name}')
             return replace(signal, measured=None)
         if lacks == [False, True]:
             self.account.note(f'{self.bag} has no topic {signal.command.topic!r}: {signal.name} '
@@ -164,7 +164,7 @@ class _BagImport:
     def segments(self) -> Iterator[Segment]:
         """Yield the numbers between resets of time, long ones in portions."""
         if not self.content.complete:
-            self.account.note(f'{self.bag} was not closed or is damaged: read up to its last '
+            self.account.note(f'{self.bag} was not closed or is damaged: read up to the last '
                               'complete record')
         counts, n_x = self.content.counts, len({signal.place for signal in self.states})
         places = list(self.scales)
@@ -190,8 +190,7 @@ class _BagImport:
                 yield segment
                 segment = segment.following()
         if left := sum(counts[topic] for topic in topics) - read:
-            self.account.note(f'{self.bag} is damaged: {left} messages that it counts could not '
-                              'be read')
+            self.account.note(f'{self.bag} is damaged: {left} of its messages could not be read')
         yield segment
 
     def _accepted(self, message: BagMessage, place: MessageField, lowest: float, highest: float
@@ -206,7 +205,7 @@ class _BagImport:
             return None
         if stamp_ns is None:
             self.account.note(f'{self.bag}: messages of {place.topic} ({place.type}) have no '
-                              'stamp: their receipt counts')
+                              'stamp: the time of receipt is used')
             return NO_STAMP, value
         return stamp_ns, value
 
@@ -223,10 +222,10 @@ class _BagImport:
         plant, receipt = np.sum(steps[np.all(steps >= 0.0, axis=1)], axis=0).tolist()
         if abs(plant - receipt) > max(_SAME_PACE * receipt, _SAME_PACE_SECONDS):
             raise BagReadError(
-                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and '
-                f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
-                "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
-                "--use-sim-time'), or use a type with a header")
+                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and its times of receipt '
+                f'are not plant time ({plant:.6g} s on /clock in {receipt:.6g} s): record with '
+                "use_sim_time (of the trainer, or 'ros2 bag record --use-sim-time'), or use a "
+                'message type with a header')
 
     def episodes(self, segment: Segment) -> Iterator[Episode]:
         """Align one segment and cut it at its gaps and jumps."""
@@ -342,9 +341,9 @@ class _BagImport:
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
                 or np.max(np.diff(times)) > reach):
             if len(measured[0]):
-                self.account.note(f'{self.bag}: {name} was not measured throughout, and is taken '
-                                  'from its command there' if len(commands[0]) else
-                                  f'{self.bag}: {name} was not measured throughout, and has no '
+                self.account.note(f'{self.bag}: {name} was not always measured: the command is '
+                                  'used in between' if len(commands[0]) else
+                                  f'{self.bag}: {name} was not always measured, and has no '
                                   'commands')
             return *applied_inputs.around(*commands, stamps), False
         for held in (commands[1], np.clip(commands[1], values.min(), values.max())):
@@ -352,5 +351,5 @@ class _BagImport:
                 return *applied_inputs.around(commands[0], held, stamps), False
         if not len(commands[0]) and np.mean(values[1:] == values[:-1]) > _AT_REST:
             return *applied_inputs.changes(times, values), False
-        self.account.note(f'{self.bag}: {name} is taken as it was measured')
+        self.account.note(f'{self.bag}: {name} is the measured applied input')
         return times, values, True

@@ -48,7 +48,7 @@ class SimulatedPlant:
         self.process = self.process.until(time_ns)
 
     def skip_to(self, time_ns: int) -> None:
-        """Set its time, which stood still."""
+        """Set its time, which did not advance."""
         self.process = replace(self.process, time_ns=max(time_ns, self.process.time_ns))
 
     def command(self, values: Array) -> None:

@@ -84,12 +84,12 @@ class Training:
         self._timer = wall_timer(node, POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
-        """Start a training and say from what; ValueError without a bag, OSError of the system."""
+        """Start a training, return a message; ValueError without a bag, OSError of the system."""
         settings = self.settings
         bags = [bag for bag in (settings.bags if any(settings.bags) else (self._recorded(),))
                 if bag]
         if not bags:
-            raise ValueError('there is no bag to train from: record one, or name it in bags')
+            raise ValueError('no bag to train from: record one, or set bags')
         self._job = TrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
         self._progress = TrainingProgress(self._node.get_logger().info)

@@ -149,7 +149,7 @@ def two_inputs(dead_time, **given):
 class Linear:
     """The plant of that model, whose inputs act late."""
 
-    def __init__(self, dead_time, x, time_ns=0, commands=((-SECOND * 100, np.zeros(2)),)):
+    def __init__(self, dead_time, x, time_ns=0, commands=((-SECOND * 100, (0.0, 0.0)),)):
         self.dead_time, self.x, self.time_ns, self.commands = dead_time, x, time_ns, commands
 
     @property

@@ -65,7 +65,7 @@ def test_a_short_record_is_taken_whole(bags: list[Path]) -> None:
     assert [len(one) for one in found.episodes] == [LENGTH, LENGTH]
     # a bag that is named twice is read once, here and there
     twice = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH - 1000, 0)
-    assert twice.account.notes[0] == f'{bags[0]} is named twice: read once'
+    assert twice.account.notes[0] == f'{bags[0]} is listed twice: read once'
     assert twice.account.used == 2 * LENGTH
 
 

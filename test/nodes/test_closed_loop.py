@@ -89,7 +89,7 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
     assert abs(float(value(status, 'disturbance [K of coolant]'))) > 1.0
 
     loop.controller.stop(signal.SIGKILL)
-    ros.wait_for_status('plant: simulation', lambda s: 'no command arrives' in s.message)
+    ros.wait_for_status('plant: simulation', lambda s: 'no command is received' in s.message)
     coolants = ros.listen(Temperature, reactor.COOLANT_TEMPERATURE)
     # what the old one said is still on its way to the other subscription
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)

@@ -185,7 +185,7 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     # code that was not named at the start
     for name, code in (('fallback_order', ['sdre', 'json:dumps']), ('estimator', 'this:s')):
         (result,) = ros.set_parameters('controller', **{name: code})
-        assert 'fixed at start' in result.reason
+        assert 'at start-up: restart' in result.reason
     bad = tmp_path / 'bad.safetensors'
     bad.write_text('nonsense')
     for model, words in ((str(bad), str(bad)),
@@ -299,7 +299,7 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT))
     assert change(ros, 'trainer', 'deactivate')
     ros.wait_until(asked.done)
-    assert asked.result().message == 'refused: it was ended before the first measurement'
+    assert asked.result().message == 'refused: it was stopped before the first measurement'
 
     record = ros.node.create_client(SetBool, 'trainer/record')
     ros.wait_until(record.service_is_ready)
@@ -309,7 +309,7 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     assert not [s for s in ros.statuses if s.name.startswith('trainer')]
     assert len(loop.commands) == count
     (result,) = ros.set_parameters('trainer', physical_model='this:s')
-    assert 'fixed at start' in result.reason
+    assert 'at start-up: restart' in result.reason
     assert ros.set_parameters('trainer', **{'coolant_temperature.safe_value': 10.0})[0].successful
     assert change(ros, 'trainer', 'configure')
     assert change(ros, 'trainer', 'activate')

@@ -112,7 +112,7 @@ def opened(url: str, *headers: str) -> str:
     ({'trusted_proxy': '[127.0.0.1]'}, 'trusted_proxy needs users'),
     ({'tls_certificate': 'here.pem'}, 'tls_certificate and tls_key'),
     ({'tls_certificate': 'a.pem', 'tls_key': 'b.pem'}, "tls_certificate = 'a.pem'"),
-    ({'temperature.shown_unit': 'm'}, "temperature.shown_unit = 'm' must be a unit"),
+    ({'temperature.shown_unit': 'm'}, "temperature.shown_unit = 'm' must have the dimension"),
     ({'controlled': '[nothing]'}, "controlled = ['nothing'] must name"),
 ])
 def test_a_bad_parameter_is_named_in_one_line(

@@ -214,7 +214,7 @@ def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callab
     (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
     assert episode.linear == ()
     assert episode.u[:, 0] == pytest.approx(np.array([293.15, 303.15, 283.15]))
-    assert noted(account, 'jacket', 'not measured throughout')
+    assert noted(account, 'jacket', 'not always measured')
     path.unlink()
     write([s for s in run if s.topic != '/jacket'])
     (again,), account = records.loop_episodes([path], [WARM], [JACKET])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The receding-horizon law; what it computes a plan with is loaded when it is constructed."""
+"""The receding-horizon law; numba and the solver are loaded when it is constructed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ class MPCParameters:
     upper: Array = value_column(
         'states', UNBOUNDED, 'Soft upper limit of this state.', name='max', none=NO_UPPER)
     time_limit: float = parameter(
-        0.0, 'Computing time of a plan after which the next law acts; 0: any.', 's', 0.0, 3600.0)
+        0.0, 'Computing time of a plan above which the next law takes over; 0: no '
+             'limit.', 's', 0.0, 3600.0)
 
 
 class RecedingHorizon(Law):
@@ -68,7 +69,7 @@ class RecedingHorizon(Law):
                              f'{np.asarray(parameters.lower).tolist()} and '
                              f'{np.asarray(parameters.upper).tolist()}')
         self._riccati = StateDependentRiccati(model, tuning, None)
-        #: what computes the plans; None where it cannot be loaded
+        #: computes the plans; None where it cannot be loaded
         self.planner: Planner | None = None
         self._unusable: Reason | None = None
         try:

@@ -111,7 +111,7 @@ class Planner:
             terminal, grid.since_change * self._rate)
 
     def grid(self, interval: float) -> HorizonGrid:
-        """Return the horizon for samples so many seconds apart."""
+        """Return the horizon for a sample interval in s."""
         return self._grid(interval / self._model.seconds_per_time_unit)
 
     def _new_grid(self, sample: float) -> HorizonGrid:
@@ -206,7 +206,7 @@ class Planner:
         ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
                       roll_out(self._arrays, *given))
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
-            return reason(StatusCode.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
+            return reason(StatusCode.PLAN_NOT_SOLVED, flag='the trajectory is not finite')
         nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
         A, lower, upper, sense = self._constraints(problem, u, nodes, by_inputs)
         v, _, flag, _ = daqp.solve(H, f, A, upper, lower, sense)

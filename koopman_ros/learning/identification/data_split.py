@@ -63,12 +63,12 @@ class SplitRecord:
         self.period = float(np.median(np.concatenate([np.diff(p.time) for p in self.parts])))
 
     def segments(self, parts: Sequence[int], samples: int | None = None) -> Segments:
-        """Return some segments on grids, cut into pieces of at most so many samples."""
+        """Return some segments on grids, cut into pieces of a largest number of samples."""
         return Segments.of(self._pieces([self.parts[i] for i in parts], samples), self.step)
 
     def foreseen(self, predictor: Predictor[Drift], parts: Sequence[int],
                  samples: int | None = None) -> Array:
-        """Return the states (M, n_x) foreseen for the first samples of these, in deviations."""
+        """Return the predicted states (M, n_x) of the first samples of these, in deviations."""
         run = self._run(predictor)
         pieces = self._pieces([replace(self.parts[i], x=self._rows[i][:, None].astype(float))
                                for i in parts], samples)
@@ -76,9 +76,9 @@ class SplitRecord:
 
     def simulated(self, predictor: Predictor[Drift], samples: int) -> tuple[Segments, Array]:
         """
-        Return the whole record in pieces of at most so many samples, for simulations.
+        Return the whole record in pieces with at most a number of samples, for simulations.
 
-        Beside it the states (M, n_x) foreseen for their first samples, in deviations.
+        With them the predicted states (M, n_x) of their first samples, in deviations.
         """
         rows = [int(piece.x[0, 0]) for piece in cut(self._numbered, samples)]
         return (Segments.of(cut(self._episodes, samples), self.step),
@@ -90,7 +90,7 @@ class SplitRecord:
         return self._run(predictor).innovations[self._rows_of(parts)]
 
     def estimates(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None) -> Array:
-        """Return the states (N, n_x) as they are estimated there, likewise, in deviations."""
+        """Return the estimated states (N, n_x) there, in deviations."""
         return self._run(predictor).estimates[self._rows_of(parts)]
 
     def identified(self, predictor: Predictor[Drift], method: str, scores: Sequence[Score],

@@ -71,7 +71,7 @@ class PolynomialCoefficients:
             drift, B=B, coefficients=theta[:n].reshape(drift.coefficients.shape)))
 
     def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
-        """Evaluate rates of states and sensitivities as :class:`Refinable` has it."""
+        """Evaluate rates of states and sensitivities; see :class:`Refinable`."""
         drift, n_x = self.drift, xi.shape[1]
         features, inputs = drift.features(xi), drift.regressors(xi, v)
         rate = drift.rate_of(features, inputs)
@@ -157,12 +157,12 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
                      iterations: int = _MAX_ITERATIONS,
                      monitor: Callable[[int, float], bool] | None = None) -> Refined[_Model]:
     """
-    Refine a drift model and a filter's gain until the next measurement is foreseen best.
+    Refine a drift model and a filter's gain for the best prediction of the next measurement.
 
-    dx/dt = f(x) + B u, and at each measurement y of the first n_y states x becomes
-    x + K (y - C x), C = [1 0] (the innovations form, Ljung 1999, section 4.3). The predictor is
-    stable where the plant is not, and the other states need not be measured: their coordinates
-    are what they come out as, where the model does not say what they are.
+    dx/dt = f(x) + B u, and at each measurement y of the first n_y states x becomes x + K (y - C
+    x), C = [1 0] (the innovations form, Ljung 1999, section 4.3). The predictor is stable where
+    the plant is not, and the other states need not be measured: their coordinates are arbitrary
+    unless the model defines them.
 
     :param gain: (n_x, n_y) K to begin with, in deviations.
     :param segments: with n_y columns of measurements.
@@ -357,6 +357,6 @@ def _step_slopes(model: Refinable, x: Array, v: Array, steps: Array) -> Array:
 
 
 def _rates(model: Refinable, v: Array, y: Array) -> Array:
-    """Evaluate the rates of states and, beside them, of their sensitivities: (M, n_x, 1 + ...)."""
+    """Evaluate the rates of states and of their sensitivities: (M, n_x, 1 + ...)."""
     rate, dS = model.rates(y[..., 0], v, y[..., 1:])
     return np.concatenate((rate[..., None], dS), axis=-1)

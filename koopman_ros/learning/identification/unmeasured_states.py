@@ -96,14 +96,14 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
-    First the next measurement is foreseen by a filter, see :func:`innovations_form`: linear
-    models, from filters that know nothing of the plant, then polynomials of higher degree. From
-    each of them simulations of the record are refined (output error), also with a small network
-    beside a linear drift. Of all numbers of states that are not measured and all drifts the
-    smallest model is taken whose simulations err about as little as the best, at samples that
-    were left out of the fit, see :meth:`Refined.left_out`. At last the gain of its filter is
-    fitted. States that are not measured are what the filter makes of them: of the unit 1, from
-    -1 to 1; no record tells their own names and units.
+    First a filter predicts the next measurement, see :func:`innovations_form`: linear models, from
+    filters that know nothing of the plant, then polynomials of higher degree. From each of them
+    simulations of the record are refined (output error), also with a small network added to a
+    linear drift. Of all numbers of states that are not measured and all drifts the smallest model
+    is taken whose simulations err about as little as the best, at samples that were left out of
+    the fit, see :meth:`Refined.left_out`. At last the gain of its filter is fitted. Unmeasured
+    states are those of the filter: dimensionless, from -1 to 1, because no record gives their
+    names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
@@ -113,11 +113,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
         nothing fits.
-    :raises Stopped: when `watch` asked for it.
+    :raises Stopped: when `watch` requested it.
     """
     if callable(plant.B) or plant.input_matrix_degree:
-        raise ValueError('where states are not measured, B must not depend on them: set '
-                         'input_matrix_degree to 0')
+        raise ValueError('B must not depend on unmeasured states: set input_matrix_degree to 0')
     record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
     kinds = highest_degree + len(_UNITS)
@@ -173,7 +172,7 @@ def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
 
 @dataclass(frozen=True)
 class _Shared:
-    """What all candidates are made of."""
+    """The common data of all candidates."""
 
     record: SplitRecord
     highest_degree: int
@@ -188,7 +187,7 @@ class _Shared:
 
 
 def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]:
-    """Return candidates with so many hidden states: polynomials of rising degree, and networks."""
+    """Return candidates with a number of hidden states: polynomials of rising degree, networks."""
     record, found = shared.record, list[_StructureCandidate]()
     last = shared.linear if count == 1 else None
     search = _Search(record, None if last is None else shared.deviation)
@@ -277,7 +276,7 @@ def _spanned(predictor: Predictor[NetworkDrift], xi: Array) -> Predictor[Network
 
 @dataclass(frozen=True)
 class _Known:
-    """A drift that is not refined, beside a gain that is."""
+    """A drift that is not refined, with a gain that is."""
 
     drift: Drift
 
