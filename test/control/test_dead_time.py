@@ -146,10 +146,13 @@ def two_inputs(dead_time, **given):
     return Controller(model, Tuning.for_model(model, **given))
 
 
+AT_REST = ((-100 * SECOND, np.zeros(2)),)
+
+
 class Linear:
     """The plant of that model, whose inputs act late."""
 
-    def __init__(self, dead_time, x, time_ns=0, commands=((-SECOND * 100, np.zeros(2)),)):
+    def __init__(self, dead_time, x, time_ns=0, commands=AT_REST):
         self.dead_time, self.x, self.time_ns, self.commands = dead_time, x, time_ns, commands
 
     @property
