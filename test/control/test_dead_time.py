@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from koopman_ros.control import Controller, SetpointRequest, State
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import AppliedInputs
 from koopman_ros.evaluation import at, exchange, perfect, simulate
@@ -197,3 +197,24 @@ def test_each_input_is_what_the_law_gives_for_the_state_when_it_acts(dead_time):
             None, x, None), target, None, PERIOD, None).u
         assert run.commands[k, i] == pytest.approx(law[i], abs=0.02), (k, i)
     np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
+
+
+def test_a_plan_knows_what_is_under_way():
+    """With different dead times it costs less than the law that acts on predicted states."""
+    dead_time, goal, costs = (0.2, 3.3), np.array([2.0, -1.0]), []
+    for law in ('sdre', 'mpc'):
+        loop = two_inputs(dead_time, fallback_order=(law,), limits=InputLimits(
+            np.full(2, -4.0), np.full(2, 4.0), np.array([2.0, 0.8])))
+        run = simulate(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
+                       duration=30.0, period=PERIOD)
+        assert set(run.levels) == {law}
+        target, e = loop.best.target(goal, np.zeros(2), None), run.states[4:] - goal
+        acted = np.array([run.loop.plant.acting(time) for time in run.times[4:]])
+        costs.append(np.sum(e ** 2) + np.sum((acted - target.u) ** 2))
+        np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
+    assert costs[1] < costs[0]
+    # the plan keeps the rates by itself
+    reports = [report.command for report in run.reports[5:]]
+    assert not any(report.at_rate for report in reports)
+    assert any(report.plan.at_rate[1] for report in reports)
+    assert reports[0].plan.times[0] == 0.2
