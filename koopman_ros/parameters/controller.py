@@ -7,10 +7,12 @@ from collections.abc import Mapping
 import contextlib
 from dataclasses import dataclass, replace
 from functools import partial
+import math
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
@@ -128,10 +130,14 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     return found
 
 
+def _modes(model: LiftedModel) -> NDArray[np.complex128]:
+    return np.asarray(np.linalg.eigvals(
+        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit)
+
+
 def _dynamics(model: LiftedModel) -> dict[str, Any]:
     """Return what suits a model's modes: an unstable plant cannot wait, and is planned for."""
-    modes = np.linalg.eigvals(
-        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
+    modes = _modes(model)
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
     stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
     levels = {} if np.all(modes.real <= 0.0) else {'fallback_order': ('mpc', 'sdre', 'linear')}
@@ -184,9 +190,11 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
                      if name in signals.units}
     defaults |= {**own, 'system': system}
     if dead_time := _longest_dead_time(model, {**defaults, **given}):
-        # the maximum sensitivity stays below 2, and the dead time may be twice as long
+        # the disturbance then settles with a time constant of three dead times; see method.md
+        slowest = float(np.min(np.abs(_modes(model))))
+        bandwidth = (1.0 + math.sqrt(1.0 + 3.0 * slowest * dead_time)) / (3.0 * dead_time)
         defaults['observer_bandwidth'] = min(
-            defaults['observer_bandwidth'], float(f'{1.0 / dead_time:.2g}'))
+            defaults['observer_bandwidth'], float(f'{bandwidth:.2g}'))
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),
