@@ -29,7 +29,7 @@ from koopman_ros.model_classes import (
     POLYNOMIAL,
 )
 
-LONGEST_DEAD_TIME = 86400.0  #: s
+LONGEST_DEAD_TIME = 3600.0  #: s
 
 _SAMPLES = 256  # random states of a box whose training states are not known
 # Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
