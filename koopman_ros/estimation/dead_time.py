@@ -8,6 +8,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 import itertools
+import math
 
 import numpy as np
 
@@ -71,3 +72,16 @@ class PendingInputs:
     def between(self, start_ns: int, end_ns: int) -> list[tuple[float, Array]]:
         """Return :meth:`AppliedInputs.pieces` between two times after that of the estimate."""
         return self.applied.pieces(self.time_ns + start_ns, self.time_ns + end_ns, self.dead_ns)
+
+
+def largest_bandwidth(dead_time: float, slowest: float) -> float:
+    """
+    Return the bandwidth of an observer in 1/s with which its loop keeps a margin.
+
+    The disturbance settles with a time constant of three dead times. For first-order plants the
+    maximum sensitivity is below 2, and gain and dead time may be twice as large as known.
+
+    :param dead_time: the longest of the inputs, in s, above 0.
+    :param slowest: rate of the model's slowest mode, in 1/s.
+    """
+    return (1.0 + math.sqrt(1.0 + 3.0 * slowest * dead_time)) / (3.0 * dead_time)

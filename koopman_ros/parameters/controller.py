@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import contextlib
 from dataclasses import dataclass, replace
 from functools import partial
-import math
 from types import MappingProxyType
 from typing import Any
 
@@ -25,7 +24,7 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
-from koopman_ros.estimation import Estimator, ESTIMATORS
+from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
     box_defaults,
@@ -190,9 +189,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
                      if name in signals.units}
     defaults |= {**own, 'system': system}
     if dead_time := _longest_dead_time(model, {**defaults, **given}):
-        # the disturbance then settles with a time constant of three dead times; see method.md
-        slowest = float(np.min(np.abs(_modes(model))))
-        bandwidth = (1.0 + math.sqrt(1.0 + 3.0 * slowest * dead_time)) / (3.0 * dead_time)
+        bandwidth = largest_bandwidth(dead_time, float(np.min(np.abs(_modes(model)))))
         defaults['observer_bandwidth'] = min(
             defaults['observer_bandwidth'], float(f'{bandwidth:.2g}'))
     return ParameterTable(
