@@ -32,14 +32,14 @@ class AppliedInputs:
     values: tuple[Array, ...] = ()  #: (n_u,) each
 
     def followed_by(self, time_ns: int, u: Array, dead_ns: tuple[int, ...]) -> AppliedInputs:
-        """Append an input in place of those from its time on; forget what acts no more."""
+        """Append an input in place of those from its time on; drop those that no longer act."""
         end = bisect_left(self.times_ns, time_ns)
         times, values = (*self.times_ns[:end], time_ns), (*self.values[:end], u)
         begin = max(0, bisect_right(times, time_ns - max(dead_ns, default=0)) - 1)
         return AppliedInputs(times[begin:], values[begin:])
 
     def corrected(self, u: Array) -> AppliedInputs:
-        """Replace the last input by the one (n_u,) that was applied in fact."""
+        """Replace the last input by the measured one (n_u,)."""
         return AppliedInputs(self.times_ns or (_ALWAYS,), (*self.values[:-1], read_only(u)))
 
     def shifted(self, by_ns: int) -> AppliedInputs:

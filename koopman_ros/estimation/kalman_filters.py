@@ -59,8 +59,8 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half))
     dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
     if dead_time > 0.0:
-        # the bandwidth of a filter sampled once a second is the fourth root of the square of what
-        # a disturbance adds to the rate of an output, over its noise
+        # at one sample a second the bandwidth of a filter is the root of the ratio between the
+        # rate of an output that a disturbance causes and the output's noise
         rates = np.abs(outputs.C * model.states.scale @ model.B) / (
             model.inputs.scale * model.seconds_per_time_unit)
         with np.errstate(divide='ignore'):
