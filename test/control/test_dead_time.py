@@ -71,6 +71,12 @@ def test_a_late_coolant_leaves_no_offset_on_a_changed_plant(seconds, known, dura
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
 
 
+def test_a_dead_time_twice_as_long_as_known_leaves_the_loop_stable():
+    run = step(*late_reactor(20.0, 10.0), 400)
+    assert np.ptp(run.states[-60:]) < 0.1 < np.ptp(run.states[100:200])
+    assert abs(run.states[-1, 0] - SETPOINT) < 0.1
+
+
 def test_a_takeover_a_record_and_the_next_level_keep_what_is_under_way():
     loop, plant, state = late_reactor(20.0)
     whole = step(loop, plant, state, 60.0)
