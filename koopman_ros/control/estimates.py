@@ -79,7 +79,7 @@ class StateEstimation:
 
     def applied(self, state: State, measured: Array | None = None) -> tuple[State, bool]:
         """
-        Take into account what has been applied since the last command, as far as it is known.
+        Take the input into account that has been applied since the last command.
 
         That is the command, unless a measurement (n_u,) of the input says that it was not
         reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from koopman_ros.control.bumpless import limit
 from koopman_ros.control.laws import LAWS
 from koopman_ros.control.laws.base import (
+    LaterInputs,
     Law,
     LawResult,
     Plan,
@@ -155,13 +156,16 @@ class FallbackLevel:
         dead_ns = np.array(pending.dead_ns)
         shortest, longest = int(dead_ns.min()), int(dead_ns.max())
         estimate = self._predicted(estimate, pending.between(0, shortest))
-        first = result = self._checked(
-            self.law.compute(estimate, target, memory, interval, previous))
+        planned = None if shortest == longest else self.law.compute_later(
+            estimate, target, memory, interval, previous, LaterInputs(
+                (dead_ns - shortest) / NANOSECONDS, pending.between(shortest, longest)))
+        first = result = self._checked(planned or self.law.compute(
+            estimate, target, memory, interval, previous))
         if first.plan is not None:
             first = replace(first, plan=replace(
                 first.plan, times=first.plan.times + shortest / NANOSECONDS))
         # a law without a model moves from its last command, not from the state
-        if first.u is None or shortest == longest or self.law.model_free:
+        if first.u is None or shortest == longest or planned or self.law.model_free:
             return first
         u, held = first.u.copy(), first.u
         count = min(_MOST_EVALUATIONS, math.ceil(

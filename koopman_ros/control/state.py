@@ -44,7 +44,7 @@ class State:
     former_ns: int | None = None  #: newest stamp before the stamps went back, or None
     command: Array | None = None  #: (n_u,) last command, or None before the first
     commanded_ns: int | None = None  #: when it was given, or None
-    #: what was applied, as far back as it still acts; empty before the first command
+    #: applied inputs that act, or will act; empty before the first command
     applied: AppliedInputs = field(default_factory=AppliedInputs)
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
     accepted: Accepted | None = None  #: the last accepted measurement

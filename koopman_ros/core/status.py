@@ -114,7 +114,7 @@ class StatusCode(Enum):
         '{signal} would go to {value:value}, outside the trained range {lower:value} to '
         '{upper:value}')
     NOT_PREDICTED = 'not_predicted', (
-        'the model gives no state {seconds:.3g} s ahead, when the command acts')
+        'the model diverges {seconds:.3g} s ahead, before the command acts: check dead_time')
     NO_STEADY_STATE = 'no_steady_state', 'the model has no steady state there'
     SCHEDULE_FULL = 'schedule_full', (
         '{most} set-points are already scheduled, the maximum: wait until some have taken effect, '

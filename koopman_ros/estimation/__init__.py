@@ -4,7 +4,7 @@
 """Estimation of state and disturbance from measurements."""
 
 from koopman_ros.estimation.base import Estimate, Estimator, Innovation
-from koopman_ros.estimation.dead_time import AppliedInputs, PendingInputs
+from koopman_ros.estimation.dead_time import AppliedInputs, largest_bandwidth, PendingInputs
 from koopman_ros.estimation.disturbance_observer import (
     DisturbanceObserver,
     equivalent_bias,
@@ -23,4 +23,5 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
 
 __all__ = ['ESTIMATORS', 'Accepted', 'AppliedInputs', 'DisturbanceObserver', 'Estimate',
            'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'PendingInputs',
-           'Standstill', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias']
+           'Standstill', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias',
+           'largest_bandwidth']

@@ -15,6 +15,7 @@ from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import SECONDS_PER_MINUTE
 from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW, LOST
+from koopman_ros.estimation.dead_time import largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -54,10 +55,20 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
     disturbance_noise = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
         max(slowest, 1.0 / _LONGEST))
-    noise, disturbance_noise, error = (
+    noise = np.where(tuning.measurement_noise > 0.0, tuning.measurement_noise, np.where(
+        recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half))
+    dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
+    if dead_time > 0.0:
+        # at one sample a second the bandwidth of a filter is the root of the ratio between the
+        # rate of an output that a disturbance causes and the output's noise
+        rates = np.abs(outputs.C * model.states.scale @ model.B) / (
+            model.inputs.scale * model.seconds_per_time_unit)
+        with np.errstate(divide='ignore'):
+            disturbance_noise = np.minimum(
+                disturbance_noise, largest_bandwidth(dead_time, slowest) ** 2 * np.min(
+                    noise[:, None] / rates, axis=0))
+    disturbance_noise, error = (
         np.where(own > 0.0, own, default) for own, default in (
-            (tuning.measurement_noise, np.where(
-                recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half)),
             (tuning.disturbance_noise / math.sqrt(SECONDS_PER_MINUTE), disturbance_noise),
             (tuning.initial_error, _GUESS * half)))
     return noise, disturbance_noise / model.inputs.scale, error / model.states.scale

@@ -114,7 +114,7 @@ class PredictionWindows:
 
     def delayed(self, dead_time: Array) -> PredictionWindows:
         """
-        Return the same with the inputs that acted, each so long (n_u,) after it was applied, in s.
+        Return the windows with the inputs that acted, each (n_u,) seconds after its application.
 
         The first one is taken to have been applied before, too.
         """

@@ -29,7 +29,7 @@ from koopman_ros.model_classes import (
     POLYNOMIAL,
 )
 
-LONGEST_DEAD_TIME = 86400.0  #: s
+LONGEST_DEAD_TIME = 3600.0  #: s
 
 _SAMPLES = 256  # random states of a box whose training states are not known
 # Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
@@ -218,7 +218,8 @@ class LiftedModel:
         Simulate the states under inputs that are held: dx/dt = f(x) + B(x) u.
 
         :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
-        :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
+        :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units, from
+            the time at which they act on: :attr:`dead_time` does not count.
         :param sample_period: in the model's time unit, or (K,) periods.
         :return: (..., K + 1, n_x) states at the samples, in state units.
         :raises RuntimeError: when the prediction diverges.

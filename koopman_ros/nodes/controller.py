@@ -90,7 +90,7 @@ class ControllerNode(ManagedNode):
         self._loaded: LoadedModel | None = loaded
         # (n_u,) last command before the node became inactive, which is still in force at the plant
         self._last_command: Array | None = None
-        self._applied = AppliedInputs()  # what may still act then
+        self._applied = AppliedInputs()  # inputs that may still act then
 
     def configure(self) -> None:
         """Load the model and create the loop, which does not command yet."""

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
@@ -23,7 +24,7 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
-from koopman_ros.estimation import Estimator, ESTIMATORS
+from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
     box_defaults,
@@ -129,10 +130,14 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     return found
 
 
+def _modes(model: LiftedModel) -> NDArray[np.complex128]:
+    return np.asarray(np.linalg.eigvals(
+        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit)
+
+
 def _dynamics(model: LiftedModel) -> dict[str, Any]:
     """Return defaults for a model's modes: an unstable plant cannot wait, and needs a plan."""
-    modes = np.linalg.eigvals(
-        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
+    modes = _modes(model)
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
     stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
     levels = {} if np.all(modes.real <= 0.0) else {'fallback_order': ('mpc', 'sdre', 'linear')}
@@ -185,9 +190,9 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
                      if name in signals.units}
     defaults |= {**own, 'system': system}
     if dead_time := _longest_dead_time(model, {**defaults, **given}):
-        # the maximum sensitivity stays below 2, and the dead time may be twice as long
+        bandwidth = largest_bandwidth(dead_time, float(np.min(np.abs(_modes(model)))))
         defaults['observer_bandwidth'] = min(
-            defaults['observer_bandwidth'], float(f'{1.0 / dead_time:.2g}'))
+            defaults['observer_bandwidth'], float(f'{bandwidth:.2g}'))
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),

@@ -200,7 +200,7 @@ class TrainerParameters:
         's', 0.0, 3600.0)
     dead_time: Array = column(
         'inputs', -1.0, 'Dead time between the applied input and its effect; -1: found from the '
-        'record.', 's', -1.0, 86400.0)
+        'record.', 's', -1.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """

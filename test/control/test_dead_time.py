@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from koopman_ros.control import Controller, SetpointRequest, State
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
 from koopman_ros.core.status import StatusCode
-from koopman_ros.estimation import AppliedInputs
+from koopman_ros.estimation import AppliedInputs, largest_bandwidth
+from koopman_ros.estimation.kalman_filters import uncertainty
 from koopman_ros.evaluation import at, exchange, perfect, simulate
 from koopman_ros.event_log.records import decoded, encoded
 from koopman_ros.model import Coordinates, linearised_model, Provenance
@@ -70,6 +71,12 @@ def test_a_late_coolant_leaves_no_offset_on_a_changed_plant(seconds, known, dura
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
 
 
+def test_a_dead_time_twice_as_long_as_known_leaves_the_loop_stable():
+    run = step(*late_reactor(20.0, 10.0), 400)
+    assert np.ptp(run.states[-60:]) < 0.1 < np.ptp(run.states[100:200])
+    assert abs(run.states[-1, 0] - SETPOINT) < 0.1
+
+
 def test_a_takeover_a_record_and_the_next_level_keep_what_is_under_way():
     loop, plant, state = late_reactor(20.0)
     whole = step(loop, plant, state, 60.0)
@@ -102,8 +109,8 @@ def test_a_prediction_that_diverges_is_a_failure_of_the_level():
 
 
 @pytest.mark.parametrize(('known', 'given', 'bandwidth'), [
-    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.025), (40.0, {'dead_time': 0.0}, 0.1),
-    (0.0, {'dead_time': 80.0}, 0.013), (40.0, {'dead_time': -1.0}, 0.025),
+    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.023), (40.0, {'dead_time': 0.0}, 0.1),
+    (0.0, {'dead_time': 80.0}, 0.013), (40.0, {'dead_time': -1.0}, 0.023),
     (40.0, {'observer_bandwidth': 0.1}, 0.1)])
 def test_the_default_bandwidth_falls_with_the_dead_time(known, given, bandwidth):
     model = replace(REACTOR_MODEL, dead_time=np.array([known]))
@@ -116,20 +123,37 @@ def test_the_default_bandwidth_falls_with_the_dead_time(known, given, bandwidth)
     assert loop.estimation.dead_ns == (round((known if seconds < 0.0 else seconds) * SECOND),)
 
 
+def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
+    loop, outputs = late_reactor(0.0)[0], late_reactor(0.0)[0].measured
+    noise, usual, _ = uncertainty(loop.model, outputs, loop.tuning)
+    for seconds in (60.0, 120.0):
+        model = replace(REACTOR_MODEL, dead_time=np.array([seconds]))
+        slowest = -float(model.drift_jacobian(np.zeros(1))[0, 0]) / 60.0
+        # K/s of the temperature for a coolant of one scale more
+        gain = float((model.B[0, 0] * model.states.scale[0]) / 60.0)
+        limited = uncertainty(model, outputs, loop.tuning)[1]
+        assert limited < usual
+        assert limited == pytest.approx(
+            largest_bandwidth(seconds, slowest) ** 2 * noise / gain)
+        own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
+        np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
+                                      uncertainty(loop.model, outputs, own)[1])
+
+
 @pytest.mark.parametrize('levels', [('mpc', 'linear'), ('linear',), ('pi',)])
 @pytest.mark.parametrize('estimator', ['', 'extended_kalman_filter'])
 def test_every_law_and_filter_acts_on_the_prediction(levels, estimator):
     gains = {'pi.temperature.gain': 1.0, 'pi.temperature.integral_time': 60.0}
     loop, plant, state = late_reactor(
-        30.0, estimator=estimator, fallback_order=levels, **gains)
+        30.0, 27.0, estimator=estimator, fallback_order=levels, **gains)
     run = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
                    duration=440.0, period=2.0, state=state)
     assert set(run.levels) == {levels[0]}
     # a PI law has its own overshoot, and without prediction it would swing
-    assert SETPOINT - run.states.min() < (1.0 if levels == ('pi',) else 0.1)
+    assert SETPOINT - run.states.min() < (1.0 if levels == ('pi',) else 0.3)
     assert abs(run.states[-1, 0] - SETPOINT) < 0.5
     plan = run.reports[-1].command.plan
-    assert plan is None or plan.times[0] == 30.0
+    assert plan is None or plan.times[0] == 27.0
 
 
 # Several inputs.
@@ -146,10 +170,13 @@ def two_inputs(dead_time, **given):
     return Controller(model, Tuning.for_model(model, **given))
 
 
+AT_REST = ((-100 * SECOND, np.zeros(2)),)
+
+
 class Linear:
     """The plant of that model, whose inputs act late."""
 
-    def __init__(self, dead_time, x, time_ns=0, commands=((-SECOND * 100, (0.0, 0.0)),)):
+    def __init__(self, dead_time, x, time_ns=0, commands=AT_REST):
         self.dead_time, self.x, self.time_ns, self.commands = dead_time, x, time_ns, commands
 
     @property
@@ -194,3 +221,24 @@ def test_each_input_is_what_the_law_gives_for_the_state_when_it_acts(dead_time):
             None, x, None), target, None, PERIOD, None).u
         assert run.commands[k, i] == pytest.approx(law[i], abs=0.02), (k, i)
     np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
+
+
+def test_a_plan_knows_what_is_under_way():
+    """With different dead times it costs less than the law that acts on predicted states."""
+    dead_time, goal, costs = (0.2, 3.3), np.array([2.0, -1.0]), []
+    for law in ('sdre', 'mpc'):
+        loop = two_inputs(dead_time, fallback_order=(law,), limits=InputLimits(
+            np.full(2, -4.0), np.full(2, 4.0), np.array([2.0, 0.8])))
+        run = simulate(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
+                       duration=30.0, period=PERIOD)
+        assert set(run.levels) == {law}
+        target, e = loop.best.target(goal, np.zeros(2), None), run.states[4:] - goal
+        acted = np.array([run.loop.plant.acting(time) for time in run.times[4:]])
+        costs.append(np.sum(e ** 2) + np.sum((acted - target.u) ** 2))
+        np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
+    assert costs[1] < costs[0]
+    # the plan keeps the rates by itself
+    reports = [report.command for report in run.reports[5:]]
+    assert not any(report.at_rate for report in reports)
+    assert any(report.plan.at_rate[1] for report in reports)
+    assert reports[0].plan.times[0] == 0.2

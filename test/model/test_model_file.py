@@ -177,7 +177,7 @@ DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
     ('', {'identity': 1}, 'identity must be a bool'), ('', {'identity': False}, 'incompatible A'),
     *(('', {'dead_time': value}, words) for value, words in (
         (3.0, 'dead_time must be a list'), ([1.0, 2.0], 'incompatible dead_time'),
-        ([-0.1], 'dead time of u0 must be 0 to 86400 s'), ([9e4], 'got 90000 s'),
+        ([-0.1], 'dead time of u0 must be 0 to 3600 s'), ([9e4], 'got 90000 s'),
         ([INFINITE], 'dead_time must be finite'), ([None], ''))),
     ('', {'time_unit': 'h'}, 'time_unit'), ('', {'states': []}, ''), ('', {'provenance': 3}, ''),
     ('states', {'units': ['K']}, 'incompatible units'),

@@ -16,6 +16,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo import reactor
+from koopman_ros.event_log.records import parse, state_of
 from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
@@ -239,6 +240,17 @@ def test_controller_goes_on_from_the_last_command(ros: Harness) -> None:
         assert loop.commands[count].temperature == pytest.approx(8.0, abs=1.0 + 1e-9)
         assert ros.set_bool('controller/set_automatic', False).success
         ros.wait_until(loop.answered)
+    # what was commanded before may still act
+    assert ros.set_parameters(
+        'controller', **{'coolant_temperature.dead_time': 600.0})[0].successful
+    for _ in range(3):
+        ros.wait_until(loop.answered)
+    assert change(ros, 'controller', 'deactivate')
+    records.clear()
+    assert change(ros, 'controller', 'activate')
+    ros.wait_until(lambda: records)
+    assert len(state_of(parse(records[0].data)).applied.times_ns) > 3
+    ros.wait_until(loop.answered)
     # a measured input is where it starts from, also one that is not what was commanded
     assert change(ros, 'controller', 'deactivate')
     count = len(loop.commands)

@@ -143,6 +143,15 @@ class LawResult:
     passing: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class LaterInputs:
+    """Commands of some inputs act later than those of others; until then earlier ones act."""
+
+    seconds: Array  #: (n_u,) until a command of now acts; 0 for the first that does
+    #: durations in s and inputs (n_u,), in their units, that act one after another until then
+    pieces: list[tuple[float, Array]]
+
+
 class Law(ABC):
     """
     A control law on a model: from an estimate and a target to an input.
@@ -215,3 +224,15 @@ class Law(ABC):
         :param previous: (n_u,) the command before, in input units, as far as it was the law's;
             None at first.
         """
+
+    def compute_later(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                      previous: Array | None, later: LaterInputs) -> LawResult | None:
+        """
+        Find the input where some inputs act later than the others.
+
+        A law that plans ahead does so; of another one, which returns None, each input is computed
+        for the state that is predicted for the time at which it acts.
+
+        :param estimate: when the first input acts; otherwise as in :meth:`compute`.
+        """
+        return None

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
+from koopman_ros.control.laws.base import LaterInputs, Law, LawResult, SolutionInfo, Target
 from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
@@ -96,6 +96,16 @@ class RecedingHorizon(Law):
 
         At the first sample, whose interval is not known, it is that of the Riccati equation.
         """
+        return self._planned(estimate, target, memory, interval, previous, None)
+
+    def compute_later(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                      previous: Array | None, later: LaterInputs) -> LawResult | None:
+        """Plan each input from the time on at which its command acts."""
+        return None if previous is None or not interval > 0.0 else (
+            self._planned(estimate, target, memory, interval, previous, later))
+
+    def _planned(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                 previous: Array | None, later: LaterInputs | None) -> LawResult:
         planner = self.planner
         if planner is None:
             return LawResult(None, self._unusable)
@@ -103,7 +113,7 @@ class RecedingHorizon(Law):
             return self._riccati.compute(estimate, target, None, interval, previous)
         began, limit = time.perf_counter(), self.parameters.time_limit or math.inf
         try:
-            problem = planner.problem(estimate, target, interval, previous)
+            problem = planner.problem(estimate, target, interval, previous, later)
             u, x = planner.first_guess(problem, memory)
             for iteration in range(1, _MAX_ITERATIONS + 1):
                 found = planner.improve(problem, u, x)
@@ -128,5 +138,5 @@ class RecedingHorizon(Law):
                 StatusCode.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
         plan = planner.plan(problem, u, x)
         return LawResult(
-            plan.inputs[0], info=SolutionInfo('planned'), memory=(u, x, problem.grid.lengths),
-            plan=plan, clipped=bool(plan.at_range.any()))
+            self.model.inputs.to_physical(problem.commanded(u)), info=SolutionInfo('planned'),
+            memory=(u, x, problem.grid.lengths), plan=plan, clipped=bool(plan.at_range.any()))
