@@ -136,7 +136,6 @@ class Planner:
         """
         Return the horizon for a sample interval in s.
 
-
         :param after: time until all inputs act, by which it is longer.
         """
         return self._grid(interval / self._model.seconds_per_time_unit, after)

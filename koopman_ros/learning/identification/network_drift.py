@@ -64,6 +64,11 @@ class NetworkDrift(Drift):
         return False
 
     @property
+    def bounded(self) -> bool:
+        """Whether the state stays bounded with bounded inputs, whatever the network is."""
+        return bool(np.all(np.linalg.eigvals(self.A).real < 0.0))
+
+    @property
     def drift(self) -> NetworkDrift:
         """Itself."""
         return self

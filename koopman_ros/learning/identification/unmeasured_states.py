@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -137,7 +136,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
 
     first = _Search(record)
     linear = first.linear(1, lambda *_: progress(next(iter(words)), 1))
-    shared = _Shared(record, highest_degree, seed, linear, first.deviation)
+    shared = _Shared(record, highest_degree, seed, linear, first.deviation,
+                     _piece_length(record, linear, first.learn_B))
     with contextlib.closing((backend or Serial()).run(
             _tried, words, shared=shared, watch=progress)) as results:
         for name, found in results:
@@ -180,10 +180,16 @@ class _Shared:
     linear: _Polynomial  #: the linear predictor with one state that is not measured
     deviation: Array  #: of its innovations
 
-    @cached_property
-    def samples(self) -> int:
-        """Samples of a simulation."""
-        return self.record.memory(self.linear.drift)
+    samples: int  #: longest piece that is simulated
+
+
+def _piece_length(record: SplitRecord, linear: _Polynomial, learn_B: bool) -> int:
+    """Return the memory of the plant in samples, by simulations of a linear model."""
+    length = record.memory(linear.drift)
+    found = _simulated(PolynomialCoefficients(linear.drift, learn_B), linear.gain,
+                       *record.simulated(linear, length), lambda *_: False)
+    # a filter's own model forgets as fast as the filter does
+    return record.memory(found.model.drift) if np.isfinite(found.cost) else length
 
 
 def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]:
@@ -223,8 +229,16 @@ def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]
         networks = [_simulated(NetworkDrift.beside(
             linear.model.drift, units, _STARTS * shared.seed + start, ridge=_RIDGE,
             learn_input_matrix=search.learn_B), *simulated, monitor) for start in range(_STARTS)]
-        found += _candidate(min(networks, key=lambda one: one.cost), simulated[0], count)
+        # far from the data a network is constant, and the rest must not diverge there
+        bounded = [one for one in networks if one.model.bounded or not _stable(linear.model.drift)]
+        if bounded:
+            found += _candidate(min(bounded, key=lambda one: one.cost), simulated[0], count)
     return found
+
+
+def _stable(drift: Drift) -> bool:
+    center = np.zeros(len(drift.box.states))
+    return bool(np.all(np.linalg.eigvals(drift.scaled_slope(center)).real < 0.0))
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
