@@ -43,7 +43,7 @@ _PREDICTION_STEP, _MOST_STEPS = 0.1, 10
 
 
 class _NotPredictedError(Exception):
-    """The model gives no state so many seconds ahead."""
+    """The model cannot predict the state over the dead time."""
 
 
 @dataclass(frozen=True)
@@ -147,11 +147,11 @@ class FallbackLevel:
         """
         Evaluate the law for each input at the state predicted for the time at which it acts.
 
-        Until a slower input acts the faster ones are taken to follow the law. The prediction then
-        is what happens if the model is right, and each input is, when it acts, what the law gives
-        for the state of that time: the loop is the one without dead time. Held at their last
-        commands instead, the faster inputs would enter the prediction with a gain that grows with
-        the difference of the dead times, and make the loop unstable.
+        Until a slower input acts the faster ones are assumed to follow the law. With a correct
+        model each input then equals, at the time it acts, the value of the law for the state of
+        that time: the loop is the one without dead time. Held at their last commands instead, the
+        faster inputs would enter the prediction with a gain that grows with the difference of the
+        dead times, and make the loop unstable.
         """
         dead_ns = np.array(pending.dead_ns)
         shortest, longest = int(dead_ns.min()), int(dead_ns.max())
@@ -187,7 +187,7 @@ class FallbackLevel:
         return replace(first, u=u)
 
     def _predicted(self, estimate: Estimate, pieces: list[tuple[float, Array]]) -> Estimate:
-        """Predict an estimate under inputs (n_u,) that act for so many seconds one by one."""
+        """Predict an estimate under inputs (n_u,), each with the seconds for which it acts."""
         model, ahead, gathered, impulse = self.model, 0.0, 0.0, np.zeros(self.model.n_u)
         rate = model.linearised.fastest_rate / model.seconds_per_time_unit
         step = _PREDICTION_STEP / rate if rate > 0.0 else math.inf

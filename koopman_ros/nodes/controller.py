@@ -16,13 +16,12 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import Trigger
 
-from koopman_ros.control import events, MANUAL, Mode, StepReport
+from koopman_ros.control import AppliedInputs, events, MANUAL, Mode, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import AppliedInputs
 from koopman_ros.evaluation import MeasurementBuffer
 from koopman_ros.event_log import records
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of

@@ -68,7 +68,7 @@ def model_card(model: LiftedModel) -> dict[str, str]:
 def model_changes(now: Snapshot, new: LiftedModel, trained: Mapping[str, Range]
                   ) -> list[Sequence[str]]:
     """
-    Return what changes with a new model: a title, and the value of the active and the new model.
+    Return the changes by a new model: a title, and the value of the active and the new model.
 
     :param trained: training ranges of the new model, in the units in which people read them.
     """

@@ -120,7 +120,7 @@ def _model(page: PageLayout) -> None:
             try:
                 new = await asyncio.to_thread(load, model_path(name))
             except (OSError, ValueError) as error:
-                details.append(f'The panel cannot show what changes: {error}')
+                details.append(f'The panel cannot show the changes: {error}')
             else:
                 rejected = new.provenance.accepted is False
                 reasons = '; '.join(new.provenance.reasons)

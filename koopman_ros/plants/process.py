@@ -52,7 +52,7 @@ class Process:
 
     @property
     def applied(self) -> Array:
-        """Input (n_u,) that is applied, as a sensor has it, and acts after its dead time."""
+        """Input (n_u,) that is applied, as a sensor measures it, and acts after its dead time."""
         dead, lag = (np.broadcast_to(value, self.u.shape)
                      for value in (self.actuator.dead_time, self.actuator.lag))
         if not dead.any():

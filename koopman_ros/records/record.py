@@ -50,7 +50,8 @@ class Record:
         """
         Return the record with some signals alone, in their order and units.
 
-        :param states: units by name; inputs likewise.
+        :param states: units of the states by name.
+        :param inputs: units of the inputs by name.
         :raises ValueError: for a signal that the record does not have, or a unit of another kind.
         """
         about, taken = self.plant, []

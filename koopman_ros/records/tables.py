@@ -111,7 +111,7 @@ def _columns(arrays: Mapping[str, Any]) -> Any:
 
 
 def _header(table: Any, column: str) -> tuple[Any, str] | None:
-    """Return the header of a column as it stands, with its unit, or None for no such column."""
+    """Return the header of a column unchanged, with its unit, or None for no such column."""
     for header in table.columns:
         match = _SIGNAL.fullmatch(str(header))
         if column in (str(header), match and match[2]):

@@ -10,13 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from koopman_ros.control import Controller, events, HOLD, Mode, SAFE, Setpoint, State, StepReport
+from koopman_ros.control import (
+    AppliedInputs,
+    Controller,
+    events,
+    HOLD,
+    Mode,
+    SAFE,
+    Setpoint,
+    State,
+    StepReport,
+)
 from koopman_ros.control.events import Event, EventOutcome, Measurement, Silence
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import AppliedInputs
 from koopman_ros.ros.timing import Timing
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement

@@ -69,7 +69,7 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     highest = tuple(0 if fixed else longest for fixed in known or (False,) * n_u)
     tried: list[_LinearModel] = []
     for order in _ORDERS if data and any(highest) else ():
-        search = _Search(data, order, n_y)
+        search = _DeadTimeSearch(data, order, n_y)
         delays = search.best(highest, watch)
         # a larger model needs no longer dead time, but for chance
         highest = tuple(min(most, d + 2) for most, d in zip(highest, delays, strict=True))
@@ -141,7 +141,7 @@ class _Sampled:
                                 for j, d in enumerate(delays) for k in range(1, 1 + order)])
 
 
-class _Search:
+class _DeadTimeSearch:
     """Linear models of an order with any dead times."""
 
     def __init__(self, data: Sequence[_Sampled], order: int, n_y: int) -> None:

@@ -144,9 +144,11 @@ class Refined(Generic[_Model]):
         """
         Return the errors (N, n_y) of samples in models that were not fitted to them.
 
-        Of stretches of so many samples each is left out in turn, linearised about the parameters:
-        e = (I - H)^-1 r with the hat matrix H of the stretch (Cook and Weisberg 1982). They are
-        weighed as the cost weighs them, one piece of the record after the other.
+        Segments of this length are left out one by one, with a model linearised in its parameters:
+        e = (I - H)^-1 r with the hat matrix H of the segment (Cook and Weisberg 1982). The errors
+        have the weights of the cost; the pieces of the record follow each other.
+
+        :param samples: of a segment.
         """
         return self._problem.left_out(self._theta, samples)
 
