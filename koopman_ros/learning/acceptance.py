@@ -170,7 +170,7 @@ def _autocorrelation(drift: Drift, segments: Segments) -> Array:
     errors = segments.errors(drift.rate, starts)
     products, squares = np.zeros((2, errors.shape[2]))
     for j in range(errors.shape[1]):
-        own = errors[segments.measured[:, j], j]
+        own = errors[segments.sampled[:, j], j]
         products += np.sum(own[1:] * own[:-1], axis=0)
         squares += 0.5 * np.sum(own[1:] ** 2 + own[:-1] ** 2, axis=0)
     return products / np.where(squares > 0.0, squares, 1.0)
@@ -192,7 +192,7 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
                 'an unmeasured quantity. The record is equivalent to '
                 f'{100.0 * (1.0 - r) / (1.0 + r):.0f} % of its samples with white noise: record '
                 'longer, or without the filter')
-        noise = found.noise[i]
+        noise = np.fmin(found.noise[i], error[i])
         excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
         # the mean square of `count` white errors strays by this share
         chance = noise * (_SIGMAS * np.sqrt(2.0 / count)) ** 0.5

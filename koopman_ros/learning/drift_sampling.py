@@ -157,7 +157,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     :raises Stopped: when `judging` ended it.
     """
     held_out = HeldOut(found, thresholds)
-    noise = np.minimum(found.noise, held_out.rmse(found.drift.rate)) / held_out.scale
+    noise = np.fmin(found.noise, held_out.rmse(found.drift.rate)) / held_out.scale
 
     def judged(one: ModelCandidate) -> ModelCandidate:
         assert one.model is not None

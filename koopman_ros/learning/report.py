@@ -222,7 +222,7 @@ def _draw_prediction(axes: Any, retrained: Retrained, i: int) -> None:
     episode = found.held_out[0]
     segments = Segments.of([episode], longest_step([episode]))
     times = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
-    measured = segments.measured[:, 0]
+    measured = segments.measured[:, 0, min(i, segments.measured.shape[2] - 1)]
     axes.plot(times[measured], shown(segments.x[measured, 0, i], states.units[i]),
               '.', color='0.6', markersize=3.0, label='measured')
     for name, rate, color in _lifts(retrained):

@@ -203,7 +203,7 @@ def test_noise_that_is_coloured_is_named(found, trained, shipped, colour):
         for k in range(1, len(n)):
             n[k] = colour * n[k - 1] + np.sqrt(1.0 - colour ** 2) * n[k]
         segments = Segments.of([clean], longest_step([clean]))
-        path = segments.path(found.drift.rate, clean.x[:1])[segments.measured[:, 0], 0]
+        path = segments.path(found.drift.rate, clean.x[:1])[segments.sampled[:, 0], 0]
         episodes.append(replace(clean, x=path + NOISE * n[:, None]))
     decision = evaluate_model(replace(found, held_out=tuple(episodes)), trained, shipped,
                               Thresholds())

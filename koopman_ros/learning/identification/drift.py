@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ _STEP = 1e-4
 
 def box_of(plant: PlantDescription, episodes: Sequence[Episode]) -> Box:
     """Return the episodes' range, its middle the origin; ValueError when a signal never moves."""
-    return Box.of(plant, np.concatenate([episode.x for episode in episodes]),
+    return Box.of(plant, np.concatenate([episode.interpolated() for episode in episodes]),
                   np.concatenate([episode.u for episode in episodes]), nominal=False)
 
 
@@ -196,8 +197,9 @@ class Segments:
 
     steps: Array  #: (K, M) lengths of the steps, 0 in the padding, in time units
     u: Array  #: (K, M, n_u) inputs held over them, or their means where they were linear
-    x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
-    measured: np.ndarray  #: (K + 1, M) whether one was
+    #: (K + 1, M, n_x) measured states, lines between measurements, 0 between samples
+    x: Array
+    measured: NDArray[np.bool_]  #: (K + 1, M, n_x) whether a state was measured
 
     __repr__ = short_repr
 
@@ -208,20 +210,27 @@ class Segments:
         K, M = max(len(grid) for grid in grids) - 1, len(episodes)
         n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
         steps, u = np.zeros((K, M)), np.zeros((K, M, n_u))
-        x, measured = np.zeros((K + 1, M, n_x)), np.zeros((K + 1, M), dtype=bool)
+        x, measured = np.zeros((K + 1, M, n_x)), np.zeros((K + 1, M, n_x), dtype=bool)
         for j, (episode, grid) in enumerate(zip(episodes, grids, strict=True)):
             k = len(grid) - 1
             steps[:k, j] = np.diff(grid)
             u[:k, j] = 0.5 * np.add(*episode.inputs_between(grid))
             u[k:, j] = episode.u[-1]
             rows = np.searchsorted(grid, episode.time)
-            x[rows, j], measured[rows, j] = episode.x, True
+            x[rows, j], measured[rows, j] = episode.interpolated(), ~np.isnan(episode.x)
         return cls(steps, u, x, measured)
+
+    @property
+    def sampled(self) -> NDArray[np.bool_]:
+        """(K + 1, M) whether there is a sample of the episode."""
+        return np.asarray(self.measured.any(axis=2))
 
     def repeated(self, count: int) -> Segments:
         """Return all of them a number of times, one round after the other."""
-        return Segments(*(np.tile(one, (1, count, *[1] * (one.ndim - 2)))
-                          for one in (self.steps, self.u, self.x, self.measured)))
+        def tiled(one: Any) -> Any:
+            return np.tile(one, (1, count, *[1] * (one.ndim - 2)))
+
+        return Segments(*map(tiled, (self.steps, self.u, self.x, self.measured)))
 
     def path(self, rate: Rate, x0: Array) -> Array:
         """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
@@ -237,7 +246,7 @@ class Segments:
 
     def errors(self, rate: Rate, x0: Array) -> Array:
         """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""
-        return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
+        return np.where(self.measured, self.path(rate, x0) - self.x, 0.0)
 
 
 def longest_step(episodes: Sequence[Episode]) -> float:
@@ -258,7 +267,7 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     """
     x0 = segments.x[0]
     n_x = x0.shape[1]
-    count = np.sum(segments.measured, axis=0)[:, None]
+    count = np.maximum(np.sum(segments.measured, axis=0), 1)
     best, least = x0, np.full_like(x0, np.inf)
     # beside each segment the same from starts that differ in one state
     beside = segments.repeated(1 + n_x)

@@ -72,7 +72,8 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     plant = replace(plant, B=None, input_matrix_degree=0)
     sought = estimated_parameters_of(equations, ranges or {})
     progress = stage_by_stage(watch, 3)
-    start = Equations.of(equations, sought, plant, np.concatenate([e.x for e in episodes]),
+    start = Equations.of(equations, sought, plant,
+                         np.concatenate([e.interpolated() for e in episodes]),
                          np.concatenate([e.u for e in episodes]))
     n_y = len(plant.state_names)
     record = SplitRecord(plant, episodes, seed, hidden=len(start.box.states) > n_y)

@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 import itertools
 import math
@@ -132,7 +132,9 @@ class Identified:
     method: str  #: how it was found
     linear: DriftModel  #: the best linear model of the same episodes, by output error
     scores: tuple[Score, ...]  #: of all estimates, in the order of their making
-    noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
+    #: (n_x,) standard deviation of the measurement noise, from sample to sample; NaN of a state
+    #: that is measured too rarely
+    noise: Array
     fitted: tuple[Episode, ...]  #: the segments that it was fitted to
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
     #: unmeasured states, the last ones: the segments hold a filter's estimates of them
@@ -180,7 +182,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     fit, choose, held_out = ([parts[i] for i in share] for share in split(parts, seed))
     step = longest_step(parts)
     chooser, fitter = Segments.of(choose, step), Segments.of(fit, step)
-    inputs = InputModel.of(plant, box, np.concatenate([part.x for part in parts]))
+    inputs = InputModel.of(plant, box, np.concatenate([part.interpolated() for part in parts]))
     known = inputs.weights
     if methods is None:
         methods = methods_of(tuple(METHODS), {})
@@ -196,7 +198,8 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
 
     with contextlib.closing((backend or Serial()).run(
             _candidate, words, watch=progress, shared=_Given(
-                fit, fitter, chooser, box, known, inputs.degree, methods))) as candidates:
+                [replace(part, x=part.interpolated()) for part in fit], fitter, chooser, box,
+                known, inputs.degree, methods))) as candidates:
         for name, candidate in candidates:
             done += 1
             failures |= dict.fromkeys(candidate.failures)
@@ -229,8 +232,8 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
 class _Given:
     """The data of the estimates of all degrees."""
 
-    fit: Sequence[Episode]
-    fitter: Segments  # the same
+    fit: Sequence[Episode]  # with lines between measurements
+    fitter: Segments  # the same, by measurements alone
     chooser: Segments
     box: Box
     known: Array | None  # B as DriftModel has it
@@ -290,9 +293,9 @@ def split(parts: Sequence[Episode], seed: int) -> tuple[list[int], list[int], li
 
     Those that reach furthest are fitted to: the range should be known, not extrapolated to.
     """
-    lows = np.array([np.concatenate((part.x.min(axis=0), part.u.min(axis=0))) for part in parts])
-    highs = np.array([np.concatenate((part.x.max(axis=0), part.u.max(axis=0))) for part in parts])
-    furthest = {*lows.argmin(axis=0).tolist(), *highs.argmax(axis=0).tolist()}
+    lows, highs = (np.array([np.concatenate((of.reduce(part.x), of.reduce(part.u)))
+                             for part in parts]) for of in (np.fmin, np.fmax))
+    furthest = {*np.nanargmin(lows, axis=0).tolist(), *np.nanargmax(highs, axis=0).tolist()}
     free = [i for i in np.random.default_rng(seed).permutation(len(parts)).tolist()
             if i not in furthest]
     if len(free) < 2:
@@ -353,7 +356,7 @@ def _information(model: DriftModel, segments: Segments, learned_B: bool) -> floa
     scale = model.box.states.scale
     # an error below rounding tells nothing
     rmse = np.maximum(prediction_error(model.rate, segments, scale) / scale, 1e-12)
-    count = int(np.sum(segments.measured))
+    count = int(np.sum(segments.sampled))
     size = model.coefficients.size + learned_B * model.B.size
     return 2.0 * count * float(np.sum(np.log(rmse))) + size * math.log(count)
 

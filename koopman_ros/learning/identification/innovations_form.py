@@ -59,7 +59,7 @@ class Predictor(Generic[_Drift]):
         with np.errstate(all='ignore'):
             for k in range(len(target)):
                 foreseen[k] = x
-                errors[k] = np.where(data.measured[k][:, None], target[k] - x[:, :n_y], 0.0)
+                errors[k] = np.where(data.measured[k], target[k] - x[:, :n_y], 0.0)
                 estimates[k] = x = x + errors[k] @ self.gain.T
                 if k < len(v):
                     x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x,
@@ -72,7 +72,7 @@ class Predictor(Generic[_Drift]):
 
     def _starts(self, data: Segments) -> Array:
         """Return initial states (M, n_x) that predict the first measurements, in deviations."""
-        taken = np.cumsum(data.measured, axis=0).max(axis=1)
+        taken = np.cumsum(data.sampled, axis=0).max(axis=1)
         rows = min(int(np.sum(taken <= SETTLING)), len(data.steps))
         first = Segments(data.steps[:rows], data.u[:rows], data.x[:rows + 1],
                          data.measured[:rows + 1])
@@ -120,7 +120,7 @@ class FilterRun:
 
 def _run(data: Segments, values: Sequence[Array]) -> FilterRun:
     # episode by episode, each in the order of its times
-    return FilterRun(*(np.swapaxes(one, 0, 1)[data.measured.T] for one in values))
+    return FilterRun(*(np.swapaxes(one, 0, 1)[data.sampled.T] for one in values))
 
 
 def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:

@@ -126,8 +126,8 @@ class Refined(Generic[_Model]):
     _theta: Array
 
     @property
-    def count(self) -> int:
-        """Samples whose innovations count."""
+    def count(self) -> float:
+        """Samples whose innovations count, on average of the outputs."""
         return self._problem.count
 
     def information(self) -> Array:
@@ -214,9 +214,9 @@ class _Problem(Generic[_Model]):
         return model, theta[p:].reshape(self.gain.shape), self.starts
 
     @cached_property
-    def count(self) -> int:
-        """Samples whose errors count."""
-        return int(np.sum(self._counted))
+    def count(self) -> float:
+        """Samples whose errors count, on average of the outputs."""
+        return float(np.sum(self._counted)) / self._target.shape[2]
 
     @cached_property
     def _inputs(self) -> Array:
@@ -229,10 +229,9 @@ class _Problem(Generic[_Model]):
 
     @cached_property
     def _counted(self) -> NDArray[np.bool_]:
-        """(K + 1, M, 1) where an error counts."""
-        measured = self.segments.measured
-        counted: NDArray[np.bool_] = measured & (np.cumsum(measured, axis=0) > self.settling)
-        return counted[..., None]
+        """(K + 1, M, n_y) where an error counts."""
+        settled = np.cumsum(self.segments.sampled, axis=0) > self.settling
+        return self.segments.measured & settled[..., None]
 
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
         """Add the scaled prediction errors at given parameters."""
@@ -260,16 +259,16 @@ class _Problem(Generic[_Model]):
         p, (M, n_x), n_y = len(self.model.theta), starts.shape, self._target.shape[2]
         q = p + (n_x if self.smooth else K.size)
         before, after = self._path(model.drift, K, starts)
-        errors = (before[..., :n_y] - self._target) / self.deviation
+        errors = np.where(self._counted, before[..., :n_y] - self._target, 0.0) / self.deviation
         J = np.concatenate([S for _, S in self._sensitivities(model, K, before, after, q)])
-        J /= self.deviation[:, None]
+        J = np.where(self._counted[..., None], J / self.deviation[:, None], 0.0)
         matrix = normal_equations(self.add_residuals, torch.from_numpy(theta)).matrix.numpy()
         C = (np.linalg.pinv(matrix, hermitian=True) / self.count)[:p, :p]
         # a start is always fitted, within the range: nothing but the first samples tells it
-        prior = np.mean(errors[self._counted[..., 0]] ** 2) * np.eye(q - p)
+        prior = np.mean(errors[self._counted] ** 2) * np.eye(q - p)
         found = []
         for m in range(M):
-            rows = np.flatnonzero(self._counted[:, m, 0])
+            rows = np.flatnonzero(self._counted[:, m].any(axis=1))
             for part in np.array_split(rows, max(1, len(rows) // samples)):
                 S, start = np.split(J[part, m].reshape(-1, q), [p], axis=1)
                 if self.smooth:
@@ -287,7 +286,7 @@ class _Problem(Generic[_Model]):
         for k in range(len(before)):
             before[k] = x
             if after is not before:
-                error = np.where(data.measured[k][:, None], x[:, :n_y] - self._target[k], 0.0)
+                error = np.where(data.measured[k], x[:, :n_y] - self._target[k], 0.0)
                 after[k] = x = x - error @ K.T
             if k < len(v):
                 x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x, data.steps[k][:, None])
@@ -336,12 +335,14 @@ class _Problem(Generic[_Model]):
             for k, own in enumerate(found):
                 own[:] = S[:, :n_y]
                 if after is not before or not self.smooth:
-                    correction = K @ own
+                    measured = data.measured[first + k]
+                    correction = K @ np.where(measured[..., None], own, 0.0)
                     if not self.smooth:
-                        error = before[first + k, :, :n_y] - self._target[first + k]
+                        error = np.where(
+                            measured, before[first + k, :, :n_y] - self._target[first + k], 0.0)
                         for i in range(n_x):
                             correction[:, i, p + i * n_y:p + (i + 1) * n_y] += error
-                    S = S - np.where(data.measured[first + k][:, None, None], correction, 0.0)
+                    S = S - correction
                 if k < len(slopes):
                     S = slopes[k, ..., p:] @ S
                     S[..., :p] += slopes[k, ..., :p]

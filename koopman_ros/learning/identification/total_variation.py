@@ -77,17 +77,17 @@ def noise_level(episodes: Sequence[Episode], model: Drift) -> Array:
     From third differences of x - integral(B u), in which a motion that is well resolved leaves
     nothing but noise. ValueError when no episode is long enough.
     """
-    found = []
+    found: list[list[float]] = [[] for _ in model.box.states.names]
     # in the middle: kinks of the few steps of an input do not move the median
     B = model.scaled_input_matrix(np.zeros(len(model.box.states)))
     for episode in episodes:
-        if len(episode) >= _SHORTEST:
-            rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box, B)
-            D = _third_differences(episode.time)
-            found.append([_noise(D, rest[:, j]) for j in range(rest.shape[1])])
-    if not found:
+        rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box, B)
+        for own, column, known in zip(found, rest.T, ~np.isnan(rest.T), strict=True):
+            if np.sum(known) >= _SHORTEST:
+                own.append(_noise(_third_differences(episode.time[known]), column[known]))
+    if not any(found):
         raise ValueError(f'no episode has {_SHORTEST} samples: record longer')
-    return model.box.states.scale * np.median(np.array(found), axis=0)
+    return model.box.states.scale * np.array([np.median(own) if own else np.nan for own in found])
 
 
 def _moved(episode: Episode, box: Box, B: Array) -> Array:

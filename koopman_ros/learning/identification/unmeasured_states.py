@@ -347,7 +347,7 @@ class _Search:
         plant, parts = self._plant, self.record.parts
         n_y, n_x = len(plant.state_names), len(plant.state_names) + hidden
         names = tuple(f'hidden_{i + 1}' for i in range(hidden))
-        y = np.concatenate([part.x for part in parts])
+        y = np.concatenate([part.interpolated() for part in parts])
         rows = np.linspace(-1.0, 1.0, len(y))[:, None] * np.ones(hidden)
         B = None if plant.B is None else np.vstack([np.asarray(plant.B), np.zeros((hidden, len(
             plant.input_names)))])

@@ -88,8 +88,8 @@ def test_grid_has_samples_changes_and_steps_between():
     assert np.concatenate(([0.0], np.cumsum(grid.steps[:, 0]))) == pytest.approx(
         [0.0, 0.25, 1.0, 1.0 + 2.5 / 3, 1.0 + 5.0 / 3, 3.5])
     assert grid.u[:, 0, 0].tolist() == [5.0, 6.0, 6.0, 6.0, 6.0]
-    assert grid.measured[:, 0].tolist() == [True, False, True, False, False, True]
-    assert grid.x[grid.measured[:, 0], 0, 0].tolist() == [1.0, 2.0, 3.0]
+    assert grid.sampled[:, 0].tolist() == [True, False, True, False, False, True]
+    assert grid.x[grid.sampled[:, 0], 0, 0].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_longest_step_is_two_usual_periods_and_one_that_fits_is_not_halved():

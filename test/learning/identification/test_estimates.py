@@ -52,7 +52,7 @@ def test_normal_equations_against_differences(learn, smooth, corrected):
     records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (30, 25)]
     model, whole = start_of(PAIR, records, 2)
     n_y = 1 if corrected else 2
-    segments = replace(whole, x=whole.x[..., :n_y])
+    segments = replace(whole, x=whole.x[..., :n_y], measured=whole.measured[..., :n_y])
     rng = np.random.default_rng(0)
     gain, starts = corrected * rng.uniform(0.1, 0.4, (2, n_y)), rng.uniform(-0.5, 0.5, (2, 2))
     deviation, settling = np.array([0.3, 0.2])[:n_y], 5 * corrected
@@ -69,8 +69,8 @@ def test_normal_equations_against_differences(learn, smooth, corrected):
         drift, found = model.drift, []
         for j, record in enumerate(records):
             x, taken = box.states.to_physical(starts[j]), 0
-            for k in range(len(segments.measured)):
-                if segments.measured[k, j]:
+            for k in range(len(segments.sampled)):
+                if segments.sampled[k, j]:
                     error = (segments.x[k, j] - x[:n_y]) / scale[:n_y]
                     if taken >= settling:
                         found.append(error / deviation)

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Records in which states are missing now and then, or measured rarely."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.learning.identification import DriftModel, identify, Segments
+from koopman_ros.learning.identification.drift import box_of
+from koopman_ros.learning.identification.output_error import (
+    innovations_form,
+    PolynomialCoefficients,
+)
+
+A, B, PERIOD, NOISE = np.array([[-0.5, 0.3], [0.2, -1.0]]), np.array([[1.0], [0.5]]), 0.1, 0.01
+PLANT = PlantDescription('tanks', ('low', 'high'), ('m', 'm'), ('pump',), ('V',), 's',
+                         np.zeros(2), np.zeros(1), None)
+
+
+def record(count=800, seed=0):
+    """Return a run of a linear plant under random steps, solved exactly."""
+    rng = np.random.default_rng(seed)
+    step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), PERIOD)
+    u = np.repeat(rng.uniform(-1.0, 1.0, count // 10), 10)[:, None]
+    x = [np.zeros(2)]
+    for value in u[:-1]:
+        x.append(step @ x[-1] + gain @ value)
+    time = PERIOD * np.arange(count)
+    return Episode(time, x + NOISE * rng.standard_normal((count, 2)), time, u)
+
+
+def missing(episode, column, keep):
+    x = episode.x.copy()
+    x[~keep, column] = np.nan
+    return replace(episode, x=x)
+
+
+def rough(box):
+    return PolynomialCoefficients(
+        DriftModel(box, 1, np.array([[0.0, 0.0], [-0.4, 0.1], [0.2, -0.8]]),
+                   0.5 * np.ones((2, 1))), learn_input_matrix=True)
+
+
+@pytest.mark.parametrize('every', ['now and then', 'rarely'])
+def test_a_state_that_is_missing_leaves_the_other_usable(every):
+    whole = record()
+    keep = (np.random.default_rng(1).random(len(whole)) > 0.2 if every == 'now and then'
+            else np.arange(len(whole)) % 20 == 0)
+    found = identify(PLANT, [missing(whole, 1, keep)], degrees=(1,))
+    assert found.drift.slope(found.drift.box.states.center) == pytest.approx(A, abs=0.06)
+    assert found.drift.input_matrix == pytest.approx(B, abs=0.03)
+
+
+def test_missing_values_do_not_count():
+    # of a gap in the second state only its interpolation changes, which no estimate sees
+    episode = missing(record(200), 1, np.arange(200) % 3 == 0)
+    box = box_of(PLANT, [episode])
+    start = rough(box)
+
+    def refined(segments):
+        return innovations_form(start, np.zeros((2, 2)), segments, np.zeros((1, 2)), np.ones(2),
+                                smooth=True, tolerance=1e-9, iterations=100)
+
+    data = Segments.of([episode], 0.2)
+    changed = replace(data, x=np.where(data.measured, data.x, 7.0))
+    assert refined(changed).model.theta == pytest.approx(refined(data).model.theta, abs=1e-9)
+
+
+@pytest.mark.parametrize('pieces', [4, 8])
+def test_errors_of_samples_that_are_left_out(pieces):
+    # what fits without each piece in turn give for it
+    whole = record(80 * pieces)
+    parts = [whole.part(80 * i, 80 * i + 80) for i in range(pieces)]
+    box = box_of(PLANT, [whole])
+    start = rough(box)
+
+    def refined(model, episodes):
+        segments = Segments.of(episodes, 2.0 * PERIOD)
+        return innovations_form(model, np.zeros((2, 2)), segments, box.states.to_deviation(
+            segments.x[0]), np.ones(2), smooth=True, tolerance=1e-9, iterations=100)
+
+    own = refined(start, parts).left_out(1000)
+    own = np.sqrt(np.mean(own.reshape(pieces, -1) ** 2, axis=1))
+    for i, error in enumerate(own):
+        other = refined(start, parts[:i] + parts[i + 1:]).model
+        alone = Segments.of([parts[i]], 2.0 * PERIOD)
+        best = refined(Known(other.drift), [parts[i]])
+        path = alone.path(other.drift.rate, box.states.to_physical(best.starts))
+        real = (path - alone.x) / box.states.scale
+        assert error == pytest.approx(np.sqrt(np.mean(real ** 2)), rel=0.05)
+
+
+class Known:
+    """A drift without parameters to refine."""
+
+    theta = np.empty(0)
+
+    def __init__(self, drift):
+        self.drift = drift
+
+    def at(self, theta):
+        return self
+
+    def rates(self, xi, v, S):
+        return self.drift.scaled_rate(xi, v), self.drift.scaled_slope(xi, v) @ S
