@@ -226,8 +226,16 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         accepted = load(site.model)
         save(replace(accepted, provenance=replace(
             accepted.provenance, accepted=False, reasons=('too inaccurate',))), bad)
-        ros.set_parameters_atomically('controller', load_refused_model=True, model=str(bad))
-        ros.set_parameters_atomically('controller', load_refused_model=False, model='reactor_nz4')
+        for force, name in ((True, str(bad)), (False, 'reactor_nz4')):
+            # again if a busy machine did not read it in time
+            ros.wait_until(lambda force=force, name=name: ros.set_parameters_atomically(
+                'controller', load_refused_model=force, model=name).successful)
+        # the panel knows of it
+        page.goto(f'{site.url}/tuning')
+        card(page, 'Parameters of the controller').get_by_text('general', exact=True).click()
+        expect(page.locator('[data-parameter="load_refused_model"]').get_by_role(
+            'combobox')).to_have_value('false')
+        page.goto(f'{site.url}/model')
         activated(page, re.compile('Back to .*bad'), 'rejected this model: too inaccurate',
                   'refused', yes='Activate by force')
         ros.wait_until(lambda: ros.get_parameters('controller', 'load_refused_model') == [False])
