@@ -187,7 +187,7 @@ def test_the_command_may_be_cancelled(file: Path, error: type[BaseException],
 
 @pytest.mark.parametrize('secret', ['plain', SECRET + '\nmallory:operator:' + SECRET + 'x'])
 def test_only_a_hash_is_written(file: Path, secret: str) -> None:
-    with pytest.raises(ValueError, match='must (not contain spaces|be a hash)'):
+    with pytest.raises(ValueError, match=r'must (not contain spaces|be a hash)'):
         write_user(file, 'ada', Role.VIEWER, secret)
     assert not file.exists()
 
