@@ -161,3 +161,8 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
         print(f'{name}: {run}')
     print('report: ' + ', '.join(files))
     return 0 if retrained.accepted else 2
+
+
+if __name__ == '__main__':
+    from koopman_ros import process_entry
+    sys.exit(process_entry.learn())

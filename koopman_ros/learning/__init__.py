@@ -4,7 +4,7 @@
 """
 From records of a plant to an accepted model; in torch, never in a node.
 
-``python -m koopman_ros.learning`` learns from files; nodes start :mod:`.training_process`.
+``python -m koopman_ros.learn`` learns from files; nodes start :mod:`.training_process`.
 """
 
 from koopman_ros.learning.acceptance import AcceptanceResult, evaluate_model, Thresholds

@@ -268,7 +268,7 @@ class Alarms:
             record = self._records.get(key)
             if record is None or (record.state is AlarmState.NORMAL
                                   and not (shelved and record.shelved_until is not None)):
-                return f'this alarm no longer exists and cannot be used to {what}'
+                return f'cannot {what} this alarm: it is no longer active'
             refused = act(record)
             self._tidy(record)
             return refused

@@ -116,7 +116,8 @@ def test_a_lift_whose_law_goes_nowhere_is_no_controller(recipe, remedies):
     samples = bent_samples()
     x = samples.x - 3.0
     runaway = replace(samples, dxdt=x + 0.3 * x * x)
-    with pytest.raises(TrainingFailed, match=f'n_z = {recipe.n_z} is no controller: .*{remedies}'):
+    with pytest.raises(TrainingFailed, match=(
+            f'n_z = {recipe.n_z} does not control the plant: .*{remedies}')):
         train(replace(BENT, B=np.zeros((1, 1))), runaway, recipe, starts=1, loops=16)
 
 

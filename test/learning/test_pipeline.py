@@ -118,7 +118,7 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     output = tmp_path / 'deep' / 'er' / 'new.safetensors'
     retrained = retrain(small(bag, output, present))
     assert not retrained.accepted
-    assert 'is not 10 % below that of the present model' in retrained.reasons[0]
+    assert 'is not 10 % below that of the current model' in retrained.reasons[0]
     # nothing replaces the output, and the same data and seed give the same numbers
     assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
     refused = load(retrained.model_file)
@@ -144,7 +144,7 @@ def test_report(accepted):
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
     for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)',
-                  f'| the present model | {retrained.decision.current_rmse[0]:.5g} |'):
+                  f'| the current model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
     assert figures['free_runs']['record']['fit_percent']['temperature'] > 95.0
@@ -218,10 +218,9 @@ def test_a_task_survives_json():
 @pytest.mark.parametrize(('values', 'error', 'words'), [
     ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
     ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is not a regular file'),
-    ({'model': 'two.safetensors'}, ValueError, r'has the states x0 \[K\], x1 \[K\], the task has '
-     r'temperature \[K\]: give the same'),
-    ({'inputs': (replace(INPUTS[0], unit='degC'),)}, ValueError, r'inputs coolant_temperature '
-     r'\[K\], the task has coolant_temperature \[degC\]'),
+    ({'model': 'two.safetensors'}, ValueError, r'the task has temperature \[K\]: give the same'),
+    ({'inputs': (replace(INPUTS[0], unit='degC'),)}, ValueError, 'the task has '
+                                                                 'coolant_temperature'),
     ({'states': STATES * 2}, ValueError, r'has temperature \[K\], temperature \[K\]: give'),
     ({'states': ()}, ValueError, 'the task has none'),
     ({'input_gain': {'temperature': {'valve': 1.0}}}, ValueError,
@@ -234,7 +233,7 @@ def test_a_task_survives_json():
     ({'bags': ('short.mcap',)}, ValueError, 'no usable segment of measurements: 0 of 9 '
      'measurements used; 9 dropped: too short'),
     ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
-     BagReadError, "has no topic '/other', it has /coolant_se"),
+     BagReadError, "has no topic '/other'"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),
     ({'model': '', 'input_gain': {'temperature': {'steam': 1.0}}}, ValueError,
      'names steam acting on temperature: the lift has the st'),
@@ -296,4 +295,4 @@ def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
     assert figures['heldout_error_of_present_lift'] is None
     assert figures['heldout_error']['temperature'] < 0.9 * figures[
         'heldout_error_of_linear_model']['temperature']
-    assert 'present model' not in page_of(retrained)
+    assert 'current model' not in page_of(retrained)

@@ -105,11 +105,11 @@ def opened(url: str, *headers: str) -> str:
 
 
 @pytest.mark.parametrize(('parameters', 'words'), [
-    ({'host': '0.0.0.0'}, "'0.0.0.0' without passwords"),
+    ({'host': '0.0.0.0'}, '0.0.0.0 requires passwords'),
     ({'users': 'nowhere'}, "users = 'nowhere' cannot be read"),
     ({'alarm_file': '/proc/alarms'}, "alarm_file = '/proc/alarms'"),
     ({'trusted_proxy': '[proxy.example]'}, "trusted_proxy = 'proxy.example' must be an address"),
-    ({'trusted_proxy': '[127.0.0.1]'}, 'trusted_proxy needs users'),
+    ({'trusted_proxy': '[127.0.0.1]'}, 'trusted_proxy requires users'),
     ({'tls_certificate': 'here.pem'}, 'tls_certificate and tls_key'),
     ({'tls_certificate': 'a.pem', 'tls_key': 'b.pem'}, "tls_certificate = 'a.pem'"),
     ({'temperature.shown_unit': 'm'}, "temperature.shown_unit = 'm' must have the dimension"),

@@ -121,7 +121,7 @@ def test_a_file_of_something_else_is_refused_and_stays(tmp_path: Path, content: 
     path.write_bytes(content)
     path.chmod(0o640)
     before = os.stat(path)
-    with pytest.raises(ValueError, match='is no file of alarms, and is not replaced'):
+    with pytest.raises(ValueError, match='is not an alarm file and is not replaced'):
         AlarmStore(Alarms(), path, NOW)
     assert path.read_bytes() == content
     assert (os.stat(path).st_ino, os.stat(path).st_mode) == (before.st_ino, before.st_mode)
@@ -143,7 +143,7 @@ def test_a_file_that_another_program_has_put_there_since_is_not_replaced(file: P
     other.write_text('of another program')
     os.replace(other, file)
     alarms.report('another', True, Priority.LOW, '', AGAIN + 10.0)
-    with pytest.raises(FileExistsError, match='another program has written'):
+    with pytest.raises(FileExistsError, match='another program has changed'):
         store.save(AGAIN + 10.0)
     assert file.read_text() == 'of another program'
     assert [one.name for one in file.parent.iterdir()] == [file.name], 'nothing is left beside'

@@ -95,7 +95,7 @@ def test_states_follow_the_standard(steps: str, state: AlarmState | None,
 def test_an_unknown_alarm_cannot_be_changed(key: str, what: str) -> None:
     alarms = _raised()
     arguments = (60.0, 'Ada', NOW + 2.0) if what == 'shelve' else ('Ada', NOW + 2.0)
-    assert 'no such alarm' in getattr(alarms, what)(key, *arguments)
+    assert 'no longer active' in getattr(alarms, what)(key, *arguments)
     assert _states(alarms) == {'x': AlarmState.UNACKNOWLEDGED}
     assert _events(alarms) == ['raised']
 
@@ -154,7 +154,7 @@ def test_a_shelved_alarm_may_come_and_go_and_be_unshelved() -> None:
     alarms.report('x', False, MEDIUM, '', NOW + 4.0)
     alarms.advance(NOW + 20.0)
     assert alarms.shelved[0].state is AlarmState.NORMAL
-    assert 'no such alarm' in alarms.acknowledge('x', 'Ada', NOW + 20.0)
+    assert 'no longer active' in alarms.acknowledge('x', 'Ada', NOW + 20.0)
     alarms.report('x', True, MEDIUM, '', NOW + 21.0)
     alarms.advance(NOW + 30.0)
     assert not alarms.standing

@@ -64,15 +64,15 @@ def test_parameters_are_listed_read_and_set(harness: Harness) -> None:
 
 
 @pytest.mark.parametrize(('words', 'said'), [
-    (('pub', '/setpoint', '{temprature: 45}', '--timeout', '60'), 'fields are header'),
-    (('pub', '/setpoint', '[', '--timeout', '60'), 'is no Temperature'),
+    (('pub', '/setpoint', '{temprature: 45}', '--timeout', '60'), 'the fields are header'),
+    (('pub', '/setpoint', '[', '--timeout', '60'), 'is not a valid Temperature'),
     (('pub', '/none', '{}', '--timeout', '0.5'), 'no node uses /none'),
     (('pub', '/none', '{}', '--type', 'std_msgs/msg/Float64', '--timeout', '0.5'),
-     'no node listens'),
-    (('pub', '/none', '{}', '--type', 'std_msgs/msg/None'), 'is not installed here'),
+     'no node subscribes'),
+    (('pub', '/none', '{}', '--type', 'std_msgs/msg/None'), 'is not installed'),
     (('echo', '/none', '--type', 'std_msgs/msg/Float64', '--timeout', '0.5'), 'no message on'),
-    (('call', '/none', '--timeout', '0.5'), 'there is no service /none'),
-    (('param', '/none', '--timeout', '0.5'), 'there is no node /none'),
+    (('call', '/none', '--timeout', '0.5'), 'no service /none'),
+    (('param', '/none', '--timeout', '0.5'), 'no node /none'),
     (('param', '/controller', 'none', '--timeout', '60'), 'has no parameter none'),
 ])
 def test_what_cannot_be_done_has_a_reason(harness: Harness, words: tuple[str, ...], said: str

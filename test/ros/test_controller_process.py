@@ -301,7 +301,7 @@ def test_two_thermometers_of_one_clock_hold_the_coolant_while_both_measure(ros: 
         second.publish(temperature(STEADY + 1.0, at + 0.5))
         ros.wait_until(lambda: seconds(bench.commands[-1]) == at + 0.5)
         return any(status.level == DiagnosticStatus.ERROR and status.message.startswith(
-            'the last command is held: two sources') for status in ros.statuses)
+            'the last command is held: two nodes') for status in ros.statuses)
 
     ros.wait_until(held)
     ros.node.destroy_publisher(second)

@@ -143,7 +143,8 @@ class SplitRecord:
 
 def _linear(drift: Drift, episodes: Sequence[Episode]) -> DriftModel:
     """Return the linear drift closest to another one over the states of episodes."""
-    xi = drift.box.states.to_deviation(np.concatenate([episode.interpolated() for episode in episodes]))
+    xi = drift.box.states.to_deviation(
+        np.concatenate([episode.interpolated() for episode in episodes]))
     none = np.zeros((len(xi), len(drift.box.inputs)))
     B = drift.scaled_input_matrix(np.zeros(xi.shape[1]))
     first = DriftModel(drift.box, 1, np.empty(0), B)

@@ -196,7 +196,7 @@ def test_constants_that_act_alike_are_said():
     assert gain.standing is strength.standing is EstimateStatus.NOT_IDENTIFIABLE
     assert gain.value * strength.value == pytest.approx(1.2, rel=0.02)
     assert abs(leak.value - 0.4) < 3.0 * leak.standard_error
-    assert 'give its value in place of a range' in str(gain)
+    assert 'its value, or that of' in str(gain)
 
 
 def test_derivatives_by_constants_and_states_against_those_by_hand():
@@ -263,9 +263,9 @@ class Silent(Constants):
      r'the range of leak is \[0.5, 0.1\] 1/s, must increase and lie in \[0, 10\] 1/s'),
     (VESSEL, Vessel, {'leak': (0.5, 11.0)}, r'lie in \[0, 10\] 1/s'),
     (description(('depth',), ('pump',)), Vessel, {},
-     r'the record has the states depth \[m\], Vessel has level \[m\]'),
+     r'the record has the states depth \[m\]'),
     (description(('level',), ('tap',)), Vessel, {},
-     r'the record has the inputs tap \[V\], Vessel has pump \[V\]')])
+     r'the record has the inputs tap \[V\]')])
 def test_what_does_not_fit_is_refused(plant, equations, ranges, words):
     with pytest.raises(ValueError, match=words):
         estimate_parameters(plant, [vessel(0)], equations, ranges)

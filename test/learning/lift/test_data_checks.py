@@ -67,11 +67,10 @@ def test_times_or_rates_in_another_unit_are_refused(factor, noise):
     # times that are too long, or rates that are too small
     wrong = replace(samples, time=factor * samples.time) if factor > 1.0 else (
         replace(samples, dxdt=factor * samples.dxdt))
-    with pytest.raises(ValueError, match=r'level changes .* times as much from sample to sample '
-                                         r'as dxdt and time say, must be 1') as error:
+    with pytest.raises(ValueError, match='times as much from sample to sample') as error:
         train(DECAY, wrong, SMALL, starts=1)
     assert float(str(error.value).split()[2]) == pytest.approx(1.0 / factor, rel=0.1)
-    assert 'give time in s and dxdt in m per s, another time_unit, or no time' in str(error.value)
+    assert 'give time in s and dxdt in m per s, or another time_unit' in str(error.value)
 
 
 # -0.2 at -1, 0.3 at -0.8, 0 from -0.4 to 0, -0.7 at 0.3 and -0.4 from 0.4 on, besides 2 u
@@ -105,12 +104,12 @@ RISING = replace(bent_samples(), dxdt=bent_samples().dxdt + 20.0)
 @pytest.mark.parametrize(('plant', 'samples', 'words'), [
     # -0.1 - 0.3 * 0.1^2 = -0.103 m/s, which 0.0515 m/s of flow make up for
     *((replace(BENT, nominal_state=[3.1], B=B), bent_samples(),
-       r'-0\.103 m/s of level: by .* nominal_state = \[3\.1\] and nominal_input = \[0\.5515\]$')
+       r'-0\.103 m/s of level: .* nominal_state = \[3\.1\] and nominal_input = \[0\.5515\]$')
       for B in (BENT.B, None)),
     # dx1/dt = -0.1 x1 stands still at x1 = 0 alone, dx2/dt = x2 - x1^2 + u wherever u = -x2
     (replace(TWO_STATE, nominal_state=[0.5, 0.0]), two_state_samples(),
      r'-0\.05 1/s of x1, .* nominal_state = \[0\.0, '),
-    (BENT, RISING, '20 m/s of level: move the plant around a')],
+    (BENT, RISING, '20 m/s of level: excite the plant around a')],
     ids=['known B', 'learned B', 'more states than inputs', 'no steady state'])
 def test_a_nominal_point_where_the_plant_moves_is_refused(plant, samples, words):
     with pytest.raises(ValueError, match=f'moves with {words}'):

@@ -152,7 +152,7 @@ def test_the_frame_is_white_and_stable():
     (np.zeros((2, 0)), np.eye(2), 'without inputs'),
     # x2 decays, and it alone is moved
     (np.array([[0.0], [1.0]]), np.eye(2), 'no feedback of the inputs stabilises'),
-    (np.array([[1.0], [1.0]]), np.ones((2, 2)), 'do not move each on its own')])
+    (np.array([[1.0], [1.0]]), np.ones((2, 2)), 'do not move independently')])
 def test_what_has_no_frame(B, states, message):
     x = np.random.default_rng(0).normal(size=(50, 2)) @ states
     with pytest.raises(ValueError, match=message):

@@ -113,7 +113,7 @@ def test_when_there_is_a_decoder(n_x, identity, asked, expected):
 
 def test_a_lift_that_cannot_grow_says_so():
     x = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]], dtype=torch.float64)
-    with pytest.raises(ValueError, match='no new coordinate can be started: the samples are spa'):
+    with pytest.raises(ValueError, match='coordinate can be added'):
         grow(IncrementalTraining(4), ScaledSamples(x, -x))
 
 
