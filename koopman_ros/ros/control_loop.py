@@ -16,7 +16,6 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import AppliedInputs
 from koopman_ros.ros.timing import Timing
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
@@ -58,15 +57,15 @@ class ControlLoop:
         self._held_for: StatusCode | None = None
         self._settling = False
 
-    def begin(self, timing: Timing, applied: AppliedInputs) -> None:
+    def begin(self, timing: Timing, last: State) -> None:
         """
         Forget all but the mode and the requested set-points; the caller holds the lock.
 
-        :param applied: inputs that may still act.
+        :param last: that commanded, of whose inputs some may still act.
         """
         asked = self.state.setpoint
         self.state = State(self.state.mode, Setpoint(asked.requested, scheduled=asked.scheduled),
-                           applied=applied)
+                           applied=last.applied)
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True
 
     def answer(self, event: Measurement, present: Array | None, arrived: tuple[float, int, int],
