@@ -16,8 +16,7 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import Trigger
 
-from koopman_ros.control import AppliedInputs, events, MANUAL, Mode, StepReport
-from koopman_ros.core.arrays import Array
+from koopman_ros.control import events, MANUAL, Mode, State, StepReport
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words
 from koopman_ros.core.time_base import Advance
@@ -87,9 +86,8 @@ class ControllerNode(ManagedNode):
         self._signals = signals_of(
             loaded.model, self._settings.tuning.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded
-        # (n_u,) last command before the node became inactive, which is still in force at the plant
-        self._last_command: Array | None = None
-        self._applied = AppliedInputs()  # inputs that may still act then
+        # before the node became inactive: its last command is still in force at the plant
+        self._last = State()
 
     def configure(self) -> None:
         """Load the model and create the loop, which does not command yet."""
@@ -157,7 +155,7 @@ class ControllerNode(ManagedNode):
         """Begin to command, from the present inputs; earlier set-point requests are kept."""
         with self._loop.lock:
             self._timing, self._received = Timing(self), time.monotonic()
-            self._loop.begin(self._timing, self._applied)
+            self._loop.begin(self._timing, self._last)
             self._measurements.begin(
                 self._timing, lambda: self._settings.measurement_timeout or _SOURCES_WINDOW,
                 lambda: self._loop.state.command is not None)
@@ -169,8 +167,7 @@ class ControllerNode(ManagedNode):
             self._loop.active = False
             self._measurements.end()
             if self._loop.state.command is not None:
-                self._last_command = self._loop.state.command
-                self._applied = self._loop.state.applied
+                self._last = self._loop.state
 
     def complete(self) -> None:
         """Stop watchdog and model reload before the middleware shuts down."""
@@ -207,7 +204,7 @@ class ControllerNode(ManagedNode):
         measured = applied.at(stamp_ns, _SAME_TIME_NS)
         # the first command after an activation begins from the measured inputs, or else from the
         # last command before the node became inactive
-        present = applied.latest if self._last_command is None else self._last_command
+        present = applied.latest if self._last.command is None else self._last.command
         event = events.Measurement(stamp_ns, sample.values, measured, countable)
         outcome = self._loop.answer(event, present if measured is None else measured, arrived,
                                     advance is not Advance.OLD)

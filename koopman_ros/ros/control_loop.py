@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from koopman_ros.control import (
-    AppliedInputs,
     Controller,
     events,
     HOLD,
@@ -67,15 +66,15 @@ class ControlLoop:
         self._held_for: StatusCode | None = None
         self._settling = False
 
-    def begin(self, timing: Timing, applied: AppliedInputs) -> None:
+    def begin(self, timing: Timing, last: State) -> None:
         """
         Forget all but the mode and the requested set-points; the caller holds the lock.
 
-        :param applied: inputs that may still act.
+        :param last: that commanded, of whose inputs some may still act.
         """
         asked = self.state.setpoint
         self.state = State(self.state.mode, Setpoint(asked.requested, scheduled=asked.scheduled),
-                           applied=applied)
+                           applied=last.applied)
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True
 
     def answer(self, event: Measurement, present: Array | None, arrived: tuple[float, int, int],
