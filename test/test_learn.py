@@ -13,19 +13,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from koopman_ros import learn
+from koopman_ros import learn_files as learn
 from koopman_ros.model import load
 from support.quick_retraining import quick_retraining
 
 N, PERIOD = 600, 0.5
 
 
-def table(seed):
-    """Return a run of a tank that empties linearly, with a little noise."""
+def table(seed, late=0):
+    """Return a run of a tank that empties linearly, with a little noise and a late pump."""
     decay = np.exp(-0.2 * PERIOD)
     rng = np.random.default_rng(seed)
     pump, level = np.repeat(rng.uniform(0.0, 10.0, N // 10), 10), [2.0]
-    for value in pump[:-1]:
+    for value in np.concatenate([np.full(late, pump[0]), pump])[:N - 1]:
         level.append(decay * level[-1] + (1.0 - decay) * 0.5 * value)
     return pd.DataFrame({'time [s]': PERIOD * np.arange(N), 'pump [V]': pump,
                          'level [m]': level + 1e-3 * rng.standard_normal(N)})
@@ -60,6 +60,17 @@ def test_a_file_is_learned_tested_and_reported(folder, capsys):
     runs = json.loads((folder / 'day.json').read_text())['free_runs']
     assert [runs[name]['fit_percent']['level'] > 99.0 for name in ('record', 'test')] == [True] * 2
     assert '| test | level |' in (folder / 'day.md').read_text()
+
+
+def test_a_dead_time_is_found_and_belongs_to_the_model(folder):
+    table(0, late=6).to_csv('day.csv', index=False)
+    table(1, late=6).to_csv('other.csv', index=False)
+    assert learned('--test', 'other.csv') == 0
+    assert load(folder / 'day.safetensors').dead_time == pytest.approx([6 * PERIOD])
+    found = json.loads((folder / 'day.json').read_text())
+    assert found['dead_time'] == {'pump': 6 * PERIOD}
+    assert found['free_runs']['test']['fit_percent']['level'] > 99.0
+    assert f'dead time of pump: {6 * PERIOD:.4g} s' in (folder / 'day.md').read_text()
 
 
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
