@@ -115,7 +115,7 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
 
     # the one that cannot start keeps no other from it
     ros.wait_for_status('controller_host: loops', lambda s: s.level == DiagnosticStatus.ERROR and (
-        s.message.startswith('3 of 5 loops run, 2 failed: /line/bad: cannot start: no model file')
+        s.message.startswith('3 of 5 loops are running, 2 failed: /line/bad: cannot start: ')
         and 'SystemExit' in s.message
         and value(s, 'to be started') == '0'))
     assert ('controller', '/line/bad') not in ros.node.get_node_names_and_namespaces()

@@ -105,7 +105,7 @@ def opened(url: str, *headers: str) -> str:
 
 
 @pytest.mark.parametrize(('parameters', 'words'), [
-    ({'host': '0.0.0.0'}, '0.0.0.0 requires passwords'),
+    ({'host': '0.0.0.0'}, "'0.0.0.0' requires passwords"),
     ({'users': 'nowhere'}, "users = 'nowhere' cannot be read"),
     ({'alarm_file': '/proc/alarms'}, "alarm_file = '/proc/alarms'"),
     ({'trusted_proxy': '[proxy.example]'}, "trusted_proxy = 'proxy.example' must be an address"),

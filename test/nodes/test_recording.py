@@ -233,7 +233,7 @@ def test_does_not_start_on_a_disk_with_too_little_room(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     bag = tmp_path / 'deep' / 'run'
     assert run_here(trainer, output=bag, min_free_disk=1e9) == 1
-    assert re.search(rf'\d+ MB are free on the disk of {tmp_path}, below', complaint(capfd))
+    assert re.search(rf'\d+ MB are free on the disk of {tmp_path}, less than', complaint(capfd))
     assert not bag.parent.exists()
 
 

@@ -119,12 +119,12 @@ BUILT = ParameterTable(Odd, build=_reciprocal)
 
 @pytest.mark.parametrize(('before', 'now', 'reason'), [
     (Odd(), Odd(), ''),
-    (Odd(), Odd(count=3), 'count = 3 is not usable:  float division by zero'),
+    (Odd(), Odd(count=3), 'count = 3 is not usable: float division by zero'),
     (Odd(), Odd(count=4, whole=-4.0, tiny=0.5),
-     'whole = -4.0 and count = 4 is not usable:  float division by zero'),
+     'whole = -4.0 and count = 4 is not usable: float division by zero'),
     (Odd(count=4), Odd(count=4, whole=-4.0),
-     'whole = -4.0 is not usable:  float division by zero'),
-    (Odd(), Odd(whole=-1.0), 'whole = -1.0 is not usable:  whole and count are no pair'),
+     'whole = -4.0 is not usable: float division by zero'),
+    (Odd(), Odd(whole=-1.0), 'whole = -1.0 is not usable: whole and count are no pair'),
 ])
 def test_what_cannot_be_built_is_refused_with_the_error_and_what_was_changed(
         before: Odd, now: Odd, reason: str) -> None:
@@ -161,7 +161,7 @@ def test_names_of_other_nodes_are_ignored_with_one_warning(
     assert declared(ros, '--params-file', str(file)) == (Odd(count=5), False)
     (line,) = capfd.readouterr().err.splitlines()
     assert '[WARN]' in line
-    assert line.endswith("[odd]: parameters that this node does not have are ignored: 'foreign', "
+    assert line.endswith("[odd]: unknown parameters are ignored: 'foreign', "
                          "'cuont' (did you mean count?), 'more.than'")
 
 
@@ -191,7 +191,7 @@ def test_concentration_too_small_to_integrate_is_refused() -> None:
 
     assert check(one, 1e-312) == ''
     assert check(two, 1e-312).startswith(
-        'constants.feed_concentration = 1e-312 mol/m^3 is not usable:  atol is ')
+        'constants.feed_concentration = 1e-312 mol/m^3 is not usable: atol is ')
     assert [check(two, harmless) for harmless in (0.0, 1e-97)] == ['', '']
 
 
@@ -308,28 +308,28 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
 
 @pytest.mark.parametrize(('node', 'given', 'words'), [
     ('controller', {'coolant_temperature.command_topic': 'temperature'},
-     "coolant_temperature is commanded on 'temperature', where temperature is measured"),
+     "coolant_temperature is commanded on 'temperature', the topic on which temperature is"),
     ('controller', {'temperature.sensor_min': -300.0},
      r'temperature.sensor_min = -300.0 degC must be in \[-273.15, '),
     *(('trainer', given, words) for given, words in (
         ({'coolant_temperature.experiment_min': 30.0},
-         'cannot be used: coolant_temperature: lower = 303.15 must be below upper = 300.65'),
-        ({'experiment_max_hold_time': 10.0}, 'hold_shortest = 30.0 s must be above 0 and not'),
+         'is not usable: coolant_temperature: lower = 303.15 must be below upper = 300.65'),
+        ({'experiment_max_hold_time': 10.0}, 'hold_shortest = 30.0 s must be above 0 and at most'),
         ({'experiment_signal': 'setpoints'}, 'must be one of command, manual, setpoint'),
         *(({'output': 'run.mcap', **limit}, 'which max_bag_size and max_bag_duration cannot split')
           for limit in ({'max_bag_size': 1.0}, {'max_bag_duration': 60.0})),
-        ({'physical_model': 'two_thanks'}, "there is no plant 'two_thanks'"),
+        ({'physical_model': 'two_thanks'}, "unknown plant 'two_thanks'"),
         ({'physical_model': 'two_state', 'estimated_constants': ['volumes']},
-         'volumes is no constant of TwoStateReactor: it has flow_rate, volume'),
+         'volumes is not a constant of TwoStateReactor: choose from flow_rate, volume'),
         ({'physical_model': 'two_state', 'estimated_constants': ['volume [2, 1]']},
          r'the range of volume is \[2, 1\] m\^3, must increase and lie in \[0.001, 100\] m\^3'),
         ({'physical_model': 'two_state', 'estimated_constants': ['volume 2 1']},
-         'must be a name, or one'),
+         'must be a name, optionally'),
         ({'physical_model': 'two_state', 'estimated_constants': ['volume', 'volume']},
          'each name once'),
         ({'physical_model': 'quadruple_tank'},
          'marks no constants as estimated'),
-        ({'estimated_constants': ['volume']}, 'estimated_constants names volume, must be empty'),
+        ({'estimated_constants': ['volume']}, 'estimated_constants names volume, but there'),
         ({'physical_model': 'two_state', 'unmeasured_states': 1},
          'unmeasured_states is 1, must be 0'),
         ({'physical_model': 'two_state', 'input_matrix': [2.0]},

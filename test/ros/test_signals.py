@@ -164,9 +164,9 @@ def refuse(*_: Any) -> Any:
 
 
 @pytest.mark.parametrize(('unit', 'given', 'words'), [
-    ('K', {'type': 'no_such_msgs/msg/Thing', 'field': 'x'}, 'is not installed here'),
+    ('K', {'type': 'no_such_msgs/msg/Thing', 'field': 'x'}, 'is not installed'),
     ('K', {'field': 'heat'}, 'sensor_msgs/msg/Temperature has no heat'),
-    ('K', {'field': 'header.stamp'}, 'header.stamp of sensor_msgs/msg/Temperature is no number'),
+    ('K', {'field': 'header.stamp'}, 'header.stamp of sensor_msgs/msg/Temperature is not a'),
     ('m/s', {**TWIST, 'field': 'twist.linear.w'}, 'TwistStamped has no twist.linear.w'),
     ('K', {'unit': 'm'}, "'(K|m)' cannot be converted to '(K|m)'"),
 ])
