@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -34,12 +34,12 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 	@touch $@
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
-	$(INSTALL) --editable '.[ros,demo,train,test,bench]'
+	$(INSTALL) --editable '.[ros,learn,test,bench]'
 	$(COMPILE)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
-	$(INSTALL) --editable '.[demo,train]'
+	$(INSTALL) --editable '.[learn]'
 	@touch $@
 
 $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
@@ -69,75 +69,78 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(COMPILE)
 	@touch $@
 
-demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in a closed loop: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, operated from a browser)
+demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C)
 	$(BIN)/python -m koopman_ros.demo $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel)
 
-demo-retrain: $(VENV)/retrain.stamp  ## retrain the controller of a plant that drifts -> out/demo-retrain
+demo-retrain: $(VENV)/retrain.stamp  ## retrain the model of a plant that changes -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
 
 demo-saddle: SEEDS = 5
-demo-saddle: $(VENV)/saddle.stamp  ## learn an unstable reactor from its temperature under PI control, and hold it, SEEDS=5, a quarter of an hour -> out/demo-saddle
+demo-saddle: $(VENV)/saddle.stamp  ## train on an unstable reactor under PI control, temperature measured only, and stabilise it; SEEDS=5, 15 min -> out/demo-saddle
 	$(BIN)/python -m studies.saddle_act --seeds $(SEEDS)
 
 # Types are checked in parallel with the tests. Tests with processes mostly wait, so there are two more
 # workers than cores; the longest files come first (test/conftest.py). A killed worker is not replaced:
 # its successor would get the same test again.
-test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on all cores
+test: $(VENV)/test.stamp  ## lint, type checks and the whole test suite, on all cores
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
 	  $(BIN)/python -m pytest -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder \
 	    --max-worker-restart 0 -o faulthandler_exit_on_timeout=true; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
-test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: a minute and a half)
+test-machines: $(VENV)/test.stamp  ## numerical tests under emulated processors, 15 min (MACHINES=--quick: 90 s)
 	$(BIN)/python test/machines.py $(MACHINES)
 
-lint: $(VENV)/test.stamp  ## style and type checks
+lint: $(VENV)/test.stamp  ## lint and type checks
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
-models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
+models: $(VENV)/train.stamp  ## retrain the bundled models -> config/models
 	$(BIN)/python -m studies.shipped_models
 
-studies: $(VENV)/train.stamp  ## run the paper's experiments, SEEDS=20: figures, report -> out/studies
+studies: $(VENV)/train.stamp  ## experiments of the paper, SEEDS=20: figures and report -> out/studies
 	$(BIN)/python -m studies.paper --seeds $(SEEDS)
 
-studies-sensors: $(VENV)/train.stamp  ## learn from noisy sensor data, ten seeds -> out/studies-sensors
+studies-sensors: $(VENV)/train.stamp  ## training on noisy sensor data, 10 seeds -> out/studies-sensors
 	$(BIN)/python -m studies.paper --sensors --seeds 10
 
-studies-robustness: $(VENV)/bench.stamp  ## compute margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
+studies-robustness: $(VENV)/bench.stamp  ## margins, region of attraction, disturbances, noise, narrow data, 3 min -> out/studies-robustness
 	$(BIN)/python -m studies.robustness
 
 studies-general: SEEDS = 10
-studies-general: $(VENV)/bench.stamp  ## test the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
+studies-general: $(VENV)/bench.stamp  ## control of seven plants with models of each class, SEEDS=10 -> out/studies-general
 	$(BIN)/python -m studies.general --seeds $(SEEDS)
 
 studies-unstable: SEEDS = 10
-studies-unstable: $(VENV)/bench.stamp  ## learn an unstable reactor under a pre-feedback, SEEDS=10, six minutes
+studies-unstable: $(VENV)/bench.stamp  ## training on an unstable reactor under a pre-feedback, SEEDS=10, 6 min
 	$(BIN)/python -m studies.unstable --seeds $(SEEDS)
 
 studies-saddle: SEEDS = 10
-studies-saddle: $(VENV)/saddle.stamp  ## hold the unstable reactor from its temperature alone, SEEDS=10, half an hour
+studies-saddle: $(VENV)/saddle.stamp  ## control of the unstable reactor, temperature measured only, SEEDS=10, 30 min
 	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
 
 studies-partial: SEEDS = 10
-studies-partial: $(VENV)/bench.stamp  ## compare with do-mpc and LQG on three partly measured plants, SEEDS=10, five minutes -> out/studies-partial
+studies-partial: $(VENV)/bench.stamp  ## comparison with do-mpc and LQG on three partly measured plants, SEEDS=10, 5 min -> out/studies-partial
 	$(BIN)/python -m studies.partly_measured --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## compare the speed with other programs, twenty minutes (BENCH=--quick: two minutes) -> out/bench
+bench: $(VENV)/bench.stamp  ## benchmarks against other programs, 20 min (BENCH=--quick: 2 min) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)
 
-faults: $(VENV)/mpc.stamp  ## inject 167 faults into running loops of five plants, and run two reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
+faults: $(VENV)/mpc.stamp  ## inject 167 faults into running loops of five plants, run two reactors for a day, 45 min (FAULTS=--quick: 1 min; FAULTS=two_tanks: one plant) -> out/faults
 	$(BIN)/python -m studies.faults $(FAULTS)
 
-docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs
+docs: $(VENV)/docs.stamp  ## build the documentation with the Python API reference, 30 s -> out/docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env \
 	  --doctree-dir out/docs/.doctrees docs out/docs
 
-config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from their tables
+panel-pictures: $(VENV)/test.stamp  ## take the pictures of the panel, a minute -> docs
+	$(BIN)/python docs/panel_pictures.py
+
+config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from the parameter tables
 	$(BIN)/python -m koopman_ros.ros.node_descriptions
 
-lock: | $(BIN)/python  ## take the newest versions within the ranges of setup.py -> requirements.lock
+lock: | $(BIN)/python  ## lock the newest versions allowed by setup.py -> requirements.lock
 	$(BIN)/python -m pip install --quiet uv
 	UV_CUSTOM_COMPILE_COMMAND='make lock' $(BIN)/python -m uv pip compile --quiet --universal --upgrade \
 	  --python-version 3.11 --all-extras --no-annotate setup.py --output-file $(LOCK)

@@ -9,6 +9,7 @@ import os
 from setuptools import find_packages, setup
 
 PACKAGE = 'koopman_ros'
+TRAIN = ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm']
 
 
 def _data_files() -> list[tuple[str, list[str]]]:
@@ -52,7 +53,9 @@ setup(
         'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
         # the predictive law: solver of quadratic programs, and compiler
         'mpc': ['daqp', 'numba'],
-        'train': ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm'],
+        'train': TRAIN,
+        # learning from tables, without ROS
+        'learn': [*TRAIN, 'matplotlib', 'pandas', 'pyarrow'],
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
@@ -90,6 +93,7 @@ setup(
             'player = koopman_ros.process_entry:player',
             'replay = koopman_ros.process_entry:replay',
             'panel = koopman_ros.process_entry:panel',
+            'learn = koopman_ros.process_entry:learn',
             'koopman_ros = koopman_ros.process_entry:command_line',
         ],
     },

@@ -16,7 +16,7 @@ class WeakFormParameters:
     """Parameters of the weak form."""
 
     windows: tuple[float, ...] = parameter(
-        (10.0, 20.0, 40.0, 80.0), 'Samples of the windows that are tried, at least 4 each.')
+        (10.0, 20.0, 40.0, 80.0), 'Window lengths to try, in samples, at least 4 each.')
 
 
 #: By name; one that needs a rough input matrix comes after one that estimates it.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names of the classes of models, by which one is asked for; without torch."""
+"""Names of the model classes, by which one is selected; without torch."""
 
 LINEAR, POLYNOMIAL, NEURAL_DRIFT = 'linear', 'polynomial', 'neural drift'
 IDENTITY_LIFT, FREE_LIFT = 'identity lift', 'free lift'

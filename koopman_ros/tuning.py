@@ -21,7 +21,7 @@ from koopman_ros.core.declaration import (
     value_column,
 )
 from koopman_ros.core.plugins import short_name
-from koopman_ros.model import LiftedModel
+from koopman_ros.model import LiftedModel, LONGEST_DEAD_TIME
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class InputLimits:
     lower: Array = value_column('inputs', 0.0, 'Smallest command.', name='min')
     upper: Array = value_column('inputs', 0.0, 'Largest command.', name='max')
     rate: Array = column(
-        'inputs', 0.0, 'Fastest change of the command; 0: any.', '{unit}/s', name='rate_limit',
+        'inputs', 0.0, 'Rate limit of the command; 0: none.', '{unit}/s', name='rate_limit',
         none=ANY)
 
     def within(self, u: Array) -> Array:
@@ -41,103 +41,114 @@ class InputLimits:
 
 @dataclass(frozen=True)
 class SensorLimits:
-    """What the sensors can measure and their plant can do, one number per measured signal."""
+    """Limits of the sensors and of the rates of their signals, one number per measured signal."""
 
     lower: Array = value_column(
-        'measured', -UNBOUNDED, 'Lower end of the range of the sensor.', name='sensor_min')
+        'measured', -UNBOUNDED, 'Lower end of the sensor range.', name='sensor_min')
     upper: Array = value_column(
-        'measured', UNBOUNDED, 'Upper end of the range of the sensor.', name='sensor_max')
+        'measured', UNBOUNDED, 'Upper end of the sensor range.', name='sensor_max')
     rate: Array = column(
-        'measured', 0.0, 'Fastest change that is physically possible; 0: any.', '{unit}/s',
+        'measured', 0.0, 'Fastest physically possible change; 0: no check.', '{unit}/s',
         name='max_rate', none=ANY)
     jump: Array = column(
-        'measured', 0.0, 'Change between two measurements that noise alone may bring; 0: any.',
+        'measured', 0.0, 'Largest change between two measurements due to noise alone; 0: no '
+                         'check.',
         name='max_step', none=ANY)
     stuck_sensor_timeout: float = parameter(
-        20.0, 'Time for which a measurement may stay bit-identical while the model moves by more '
-        'than half of max_step; 0: for ever.', 's', 0.0, 86400.0)
+        20.0, 'Time after which an unchanged measurement counts as a stuck sensor, if the model '
+              'moved by more than half of max_step; 0: no check.', 's', 0.0, 86400.0)
 
 
 @dataclass(frozen=True)
 class Tuning:
     """
-    What an engineer tunes, in the units of the model's signals.
+    The tuning of a controller, in the units of the model's signals.
 
-    Field and parameter have one name, but for columns whose row says another one: a row
+    Field and parameter have one name, except for columns with a row of another name: a row
     ``weight`` of a state is the parameter ``<state>.weight``.
     """
 
     state_weight: Array = column(
-        'states', 0.0, 'Cost of the squared error of this state.', '1/({unit})^2', maximum=1e12,
+        'states', 0.0, 'Weight of the squared control error of this '
+                       'state.', '1/({unit})^2', maximum=1e12,
         name='weight')
     input_weight: Array = column(
-        'inputs', 1.0, 'Cost of the squared deviation of this input from its steady value.',
+        'inputs', 1.0, 'Weight of the squared deviation of this input from its steady value.',
         '1/({unit})^2', maximum=1e12, open_minimum=True, name='weight')
     limits: InputLimits = nested(InputLimits)
+    dead_time: Array = column(
+        'inputs', -1.0, 'Dead time between this input, as commanded or measured, and its effect; '
+        '-1: that of the model.', 's', -1.0, LONGEST_DEAD_TIME)
     sensor: SensorLimits = nested(SensorLimits)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point, at most as many as there are inputs; an empty '
         'name: all measured signals.', read_only=True)
     setpoint_ramp: Array = column(
-        'controlled', 0.0, 'Fastest change of the tracked set-point; 0: steps.', '{unit}/s',
+        'controlled', 0.0, 'Rate limit of the active set-point; 0: steps.', '{unit}/s',
         none=ANY)
     setpoint_filter_time: float = parameter(
-        0.0, 'Time constant with which the tracked set-point follows its ramp; 0: none.', 's',
+        0.0, 'Time constant of the set-point filter; 0: no filter.', 's',
         0.0, 86400.0)
     estimator: str = parameter(
-        '', 'State estimator: disturbance_observer or measured_state where all states are '
-        'measured; extended_kalman_filter or unscented_kalman_filter; module:class for one of '
-        'your own; empty: chosen by what is measured.', code=True)
+        '', 'State estimator: disturbance_observer or measured_state (all states measured), '
+            'extended_kalman_filter or unscented_kalman_filter, or module:class for your own; '
+            'empty: chosen automatically.', code=True)
     observer_bandwidth: float = parameter(
         0.0, 'Bandwidth of the disturbance observer. Higher removes offsets sooner and passes '
         'more noise to the inputs. 0: no observer.', '1/s', 0.0, 1000.0)
     max_disturbance: Array = column(
-        'inputs', 0.0, 'Largest estimated disturbance, as an equivalent change of this input; 0: '
-        'any.', none=ANY)
+        'inputs', 0.0, 'Bound of the estimated disturbance, as an equivalent change of this '
+                       'input; 0: none.', none=ANY)
     tracking_tolerance: Array = column(
-        'inputs', UNBOUNDED, 'Deviation of the measured input from its command above which the '
-        'estimator takes the measured one.')
+        'inputs', UNBOUNDED, 'Deviation of the applied input from its command above which the '
+                             'estimator uses the applied input.')
     measurement_noise: Array = column(
-        'measured', 0.0, 'Standard deviation of the measurement noise, for a Kalman filter; 0: '
-        'that of the training record.')
+        'measured', 0.0, 'Standard deviation of the measurement noise (Kalman filters); 0: that '
+                         'of the training data.')
     disturbance_noise: Array = column(
-        'inputs', 0.0, 'Random walk of the input disturbance in a minute, as a standard '
-        'deviation, for a Kalman filter; 0: derived from the model.')
+        'inputs', 0.0, "Standard deviation of the input disturbance's random walk in one minute "
+                       '(Kalman filters); 0: derived from the model.')
     initial_error: Array = column(
-        'states', 0.0, 'Standard deviation of the first estimate of this state, for a Kalman '
-        'filter; 0: a fourth of the trained range.')
+        'states', 0.0, 'Standard deviation of the initial estimate of this state (Kalman '
+                       'filters); 0: a quarter of the trained range.')
     fallback_order: tuple[str, ...] = parameter(
-        ('sdre', 'linear'), 'Control laws, the best first: mpc (model predictive), sdre '
-        '(state-dependent Riccati equation), linear (LQR), pi; module:class for one of your own.',
+        ('sdre', 'linear'), 'Control laws, best first: mpc (model predictive), sdre '
+                            '(state-dependent Riccati equation), linear (LQR), pi, or '
+                            'module:class for your own.',
         code=True)
     learned_model_margin: float = parameter(
         0.1, 'Distance outside the trained range, in half-ranges, up to which the nonlinear laws '
-        'act; beyond it the linear one acts.', '', 0.0, UNBOUNDED)
+             'act; the linear law acts beyond it.', '', 0.0, UNBOUNDED)
     linear_model_margin: float = parameter(
         0.5, 'Distance outside the trained range, in half-ranges, up to which the laws linear and '
-        'pi act; beyond it the safe inputs are commanded.', '', 0.0, UNBOUNDED)
+             'pi act; the safe inputs are commanded beyond it.', '', 0.0, UNBOUNDED)
     safe_value: Array = value_column(
-        'inputs', 0.0, 'Safe value: commanded when no law can act; brought within min and max.')
+        'inputs', 0.0, 'Safe value: commanded if no law can act; limited to min and max.')
     hold_timeout: float = parameter(
         60.0, 'Time without a usable measurement or law after which the safe inputs are '
-        'commanded.', 's', 0.0, 86400.0)
+              'commanded.', 's', 0.0, 86400.0)
     recovery_time: float = parameter(
-        10.0, 'Time for which a better law must have been possible before it acts again.', 's',
+        10.0, 'Time for which a better law must be available before it takes over again.', 's',
         0.0, 86400.0)
     bumpless_transfer_time: float = parameter(
-        0.0, 'Time constant of the bumpless transfer between laws, models, tunings and modes.',
+        0.0, 'Time constant of the bumpless transfer after a change of law, model, tuning or '
+             'mode.',
         's', 0.0, 86400.0)
     max_gain: float = parameter(
-        1000.0, 'Largest norm of a Riccati gain, in scaled coordinates, that a law may use.', '',
+        1000.0, 'Largest allowed norm of a Riccati gain, in scaled coordinates.', '',
         0.0, 1e9, open_minimum=True)
     # the root of the machine's precision; `ros2 param load` reads 1e-8 as a text
     max_riccati_residual: float = parameter(
-        1.5e-8, 'Largest relative residual of a Riccati equation with which a law may act.', '',
+        1.5e-8, 'Largest allowed relative residual of a Riccati equation.', '',
         0.0, 1.0, open_minimum=True)
     #: own parameters of laws and estimators, by name
     plugins: Mapping[str, Any] = plugin_parameters()
 
     __repr__ = short_repr
+
+    def dead_times(self, model: LiftedModel) -> Array:
+        """Return the dead time (n_u,) of each input of a model in s."""
+        return np.where(self.dead_time < 0.0, model.dead_time, self.dead_time)
 
     def of_plugin(self, name: str, kind: type[Any]) -> Any:
         """Return the own parameters of a plug-in by its name; those of `kind` by default."""
@@ -149,7 +160,7 @@ class Tuning:
         Return the tuning with one number for each signal.
 
         :param measured: names of the signals that are measured.
-        :raises ValueError: naming what does not fit.
+        :raises ValueError: naming the mismatch.
         """
         states, inputs = model.states.names, model.inputs.names
         controlled = tuple(filter(None, self.controlled)) or states
@@ -157,8 +168,8 @@ class Tuning:
             raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
                              f'once and in this order, got {", ".join(controlled)}')
         if len(inputs) < len(controlled) < len(states):
-            raise ValueError(f'{len(inputs)} inputs cannot hold {len(controlled)} signals '
-                             f'({", ".join(controlled)}): name at most {len(inputs)} in '
+            raise ValueError(f'{len(inputs)} inputs cannot control {len(controlled)} signals '
+                             f'({", ".join(controlled)}): list at most {len(inputs)} in '
                              'controlled, or leave it empty for a compromise between all states')
         signals = {'states': states, 'measured': measured, 'controlled': controlled,
                    'inputs': inputs}
@@ -174,14 +185,14 @@ class Tuning:
         if not np.all(np.isfinite(made.safe_value)):
             raise ValueError(f'safe_value must be finite, got {made.safe_value.tolist()}')
         if not made.fallback_order or len(set(made.fallback_order)) != len(made.fallback_order):
-            raise ValueError('fallback_order must be one law or more, each once, got '
+            raise ValueError('fallback_order must list at least one law, each once, got '
                              f'{made.fallback_order}')
         return made
 
     @classmethod
     def for_model(cls, model: LiftedModel, **given: Any) -> Self:
         """
-        Return a tuning whose weights, ranges and safe inputs are a model's, but for what is given.
+        Return a tuning with weights, ranges and safe inputs of a model, except the given ones.
 
         The weights are 1 on deviations scaled by the model, the inputs' limits their trained
         range, and the safe inputs the nominal ones.

@@ -103,7 +103,7 @@ def test_manifest_declares_what_is_imported(control_only: bool) -> None:
               for module in modules}
     without = {module for modules in keys['none'].values() for module in modules}
     # optional, or a part of the training
-    learning = {'torch', 'joblib', 'tqdm'} if control_only else set()
+    learning = {'torch', 'joblib', 'tqdm', 'pandas'} if control_only else set()
     manifest = parse_package(ROOT / 'package.xml')
     manifest.evaluate_conditions({'KOOPMAN_ROS_CONTROL_ONLY': '1'} if control_only else {})
 

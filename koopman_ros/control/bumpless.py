@@ -47,10 +47,10 @@ class BumplessTransfer:
     """
 
     offset: Array  #: (n_u,) now, in input units
-    feed: Array  #: (n_u,) what it follows, which fades exponentially
+    feed: Array  #: (n_u,) offset that it follows, which fades exponentially
 
     def after(self, seconds: float, time_constant: float) -> BumplessTransfer | None:
-        """Return what is left after seconds, None for nothing; T = 0 s ends it at once."""
+        """Return the rest of the transfer after seconds, or None; T = 0 s ends it at once."""
         if seconds > 100.0 * time_constant:
             return None
         share = seconds / time_constant if time_constant > 0.0 else 0.0

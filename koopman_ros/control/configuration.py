@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The configuration of a control loop: a model, its tuning, and what follows from both."""
+"""The configuration of a control loop: a model, its tuning, and values derived from both."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Configuration:
     """
     A model with its tuning.
 
-    :raises ValueError: when the tuning does not fit the model's signals, or the estimator cannot
-        do with what is measured.
+    :raises ValueError: when the tuning does not fit the model's signals, or the measured signals
+        do not suffice for the estimator.
     """
 
     model: LiftedModel  #: the lift
     tuning: Tuning  #: with one number for each signal
-    outputs: Outputs | None = None  #: what is measured; every state by default
+    outputs: Outputs | None = None  #: measured outputs; every state by default
 
     __repr__ = short_repr
 
@@ -42,7 +42,7 @@ class Configuration:
 
     @cached_property
     def measured(self) -> Outputs:
-        """What is measured: y = C x."""
+        """The measured outputs: y = C x."""
         states = self.model.states
         return self.outputs or Outputs(states.names, states.units, np.eye(self.model.n_x))
 
@@ -75,7 +75,7 @@ class Configuration:
 
     @cached_property
     def safe_input(self) -> Array:
-        """What is commanded when no law can act, (n_u,) in input units."""
+        """The safe input (n_u,), commanded when no law can act, in input units."""
         return read_only(self.tuning.limits.within(self.tuning.safe_value))
 
     @cached_property

@@ -99,7 +99,7 @@ class Controller(ControlStep):
             return reason(StatusCode.SETPOINT_NOT_TRIED, error=contained(error))
 
     def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
-        """Return what of a set-point, requested already, is outside the trained range, or None."""
+        """Return the part of a requested set-point that is outside the trained range, or None."""
         for value in (*(value for _, value in setpoint.scheduled), setpoint.requested,
                       setpoint.active):
             if value is not None:
@@ -154,13 +154,14 @@ class Controller(ControlStep):
         """
         Start from the input (n_u,) that is applied already, as after a restart.
 
-        Nothing is changed after the first command, nor by what is not finite; another size is a
+        It is ignored after the first command, and if it is not finite; another size is a
         ValueError.
         """
         applied = numbers('applied input', applied, self.model.inputs.names)
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
-        return replace(state, command=read_only(self.tuning.limits.within(applied)))
+        return replace(state, command=read_only(self.tuning.limits.within(applied)),
+                       applied=state.applied.corrected(applied))
 
     def switch_to(self, predecessor: Controller, state: State) -> State:
         """
@@ -184,7 +185,8 @@ class Controller(ControlStep):
                     return state
                 now = level.compute(
                     state.setpoint.active, state.estimate, None, usual_interval(state),
-                    state.target, state.own_command)[1]
+                    state.target, state.own_command,
+                    self.estimation.pending(state, state.commanded_ns or 0))[1]
                 return state if now.u is None else replace(
                     state, law_input=now.u, law_memory=now.memory, transfer=with_step(
                         state.transfer, state.law_input - now.u))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import check, Estimate, Standstill, Verdict
+from koopman_ros.estimation import check, Estimate, PendingInputs, Standstill, Verdict
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -27,7 +28,7 @@ class Observation:
     """A measurement as it was taken into account."""
 
     verdict: Verdict  #: whether it is accepted
-    expected: Array | None  #: (n_y,) what was expected of it; None when nothing was
+    expected: Array | None  #: (n_y,) its prediction, or None
     x: Array  #: (n_x,) state that it is taken for, in state units
     outside: float  #: its distance from the training data, in half-ranges
 
@@ -48,7 +49,7 @@ class StateEstimation:
     """
 
     model: LiftedModel  #: the lift
-    outputs: Outputs  #: what is measured of its states
+    outputs: Outputs  #: its measured outputs
     tuning: Tuning  #: for these signals
     levels: dict[str, FallbackLevel]  #: by name, best first
 
@@ -60,35 +61,50 @@ class StateEstimation:
         found = self.levels.get(name)
         return self.levels[next(reversed(self.levels))] if found is None else found
 
-    def applied(self, state: State, measured: Array | None = None) -> tuple[Array, bool]:
+    @cached_property
+    def dead_ns(self) -> tuple[int, ...]:
+        """The dead time (n_u,) of each input in ns."""
+        return tuple(round(seconds * NANOSECONDS)
+                     for seconds in self.tuning.dead_times(self.model).tolist())
+
+    def pending(self, state: State, time_ns: int) -> PendingInputs:
+        """Return the inputs of which some act after the time of the estimate."""
+        return PendingInputs(state.applied, time_ns, self.dead_ns)
+
+    def acting(self, state: State, time_ns: int) -> Array:
+        """Return the input (n_u,) that acts from a time on, in scaled deviations; 0 at first."""
+        if state.command is None:
+            return np.zeros(self.model.n_u)
+        return self.model.inputs.to_deviation(state.applied.acting(time_ns, self.dead_ns))
+
+    def applied(self, state: State, measured: Array | None = None) -> tuple[State, bool]:
         """
-        Return the input that has acted since the last command, as far as it is known.
+        Take the input into account that has been applied since the last command.
 
         That is the command, unless a measurement (n_u,) of the input says that it was not
         reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences
         below `tracking_tolerance` count for nothing: a bias would come into the loop.
 
-        :return: (n_u,) in scaled deviations, and whether it follows the command.
+        :return: the state, and whether the applied input follows the command.
         """
-        if state.command is None:
-            return np.zeros(self.model.n_u), True
         u, tolerance = state.command, self.tuning.tracking_tolerance
-        if measured is None or not np.isfinite(measured).all():
-            return self.model.inputs.to_deviation(u), True
-        u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
-        return self.model.inputs.to_deviation(u), bool((u == state.command).all())
+        if u is None:
+            return state, True
+        if measured is not None and np.isfinite(measured).all():
+            u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
+        return (replace(state, applied=state.applied.corrected(u)),
+                bool((u == state.command).all()))
 
-    def observe(self, state: State, y: Array, time_ns: int, elapsed: float, u: Array
+    def observe(self, state: State, y: Array, time_ns: int, elapsed: float
                 ) -> tuple[State, Observation]:
         """
         Check a measurement (n_y,) and take it into account.
 
         :param elapsed: seconds since the last command.
-        :param u: (n_u,) what has acted since then, in scaled deviations.
-        :return: the state with measurement, time and estimate, and what became of the measurement.
+        :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
         before, last = state.estimate, state.accepted
-        predicted = self.predict(state, elapsed, u)
+        predicted = self.predict(state, time_ns, elapsed)
         x = self.position(predicted, y)
         outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
@@ -100,7 +116,8 @@ class StateEstimation:
                 return np.zeros_like(y)
             if before is None:
                 return np.zeros_like(y)
-            moved = self.predict(replace(state, estimate=replace(before, w=then.w)), elapsed, u)
+            moved = self.predict(replace(state, estimate=replace(before, w=then.w)), time_ns,
+                                 elapsed)
             assert moved is not None
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
 
@@ -110,7 +127,8 @@ class StateEstimation:
         if verdict.fault is None:
             far = outside > max(level.law.margin for level in self.levels.values())
             predicted = self._corrected(
-                state, predicted, verdict, x, elapsed, far or self._lost(state, time_ns))
+                state, predicted, verdict, x, time_ns, elapsed,
+                far or self._lost(state, time_ns))
             if not isinstance(predicted, Estimate):
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
@@ -130,7 +148,7 @@ class StateEstimation:
         """
         Return the state (n_x,), in state units, that goes with a measurement (n_y,).
 
-        What the measurement leaves open is as it is known, or where it may rest.
+        States that it does not determine are those of the estimate, or of a steady state.
         """
         outputs, states = self.outputs, self.model.states
         if outputs.determine_state:
@@ -149,7 +167,7 @@ class StateEstimation:
         return x
 
     def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   elapsed: float, lost: bool) -> Estimate:
+                   time_ns: int, elapsed: float, lost: bool) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
@@ -157,15 +175,15 @@ class StateEstimation:
         """
         xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
         if predicted is None:
-            # the last command, it is assumed, held the plant where it is
-            return estimator.restart(None, xi, None if state.command is None else (
-                self.model.inputs.to_deviation(state.command)))
+            # the input that acts, it is assumed, held the plant where it is
+            return estimator.restart(
+                None, xi, None if state.command is None else self.acting(state, time_ns))
         if verdict.moved or not elapsed > 0.0 or lost:
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
 
     def _lost(self, state: State, time_ns: int) -> bool:
-        """Tell whether no measurement was accepted for so long that the state is not known."""
+        """Whether the state is unknown, because no measurement was accepted for too long."""
         if state.accepted is None:
             return False
         seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS
@@ -173,17 +191,22 @@ class StateEstimation:
         return seconds * self.tuning.observer_bandwidth > _LOST and (
             seconds > _GAP * state.interval)
 
-    def predict(self, state: State, elapsed: float, u: Array) -> Estimate | None:
+    def predict(self, state: State, time_ns: int, elapsed: float) -> Estimate | None:
         """
-        Predict the estimate without a measurement; arguments as in :meth:`observe`.
+        Predict the estimate up to a time without a measurement; arguments as in :meth:`observe`.
 
         Where the model does not reach that far, the state is as uncertain as at first, and the
         disturbance is kept.
         """
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
+        estimator = self.level(state.supervisor).estimator
+        predicted: Estimate | None = state.estimate
         try:
-            predicted = self.level(state.supervisor).estimator.predict(state.estimate, u, elapsed)
+            for seconds, u in state.applied.pieces(
+                    time_ns - round(elapsed * NANOSECONDS), time_ns, self.dead_ns):
+                predicted = predicted and estimator.predict(
+                    predicted, self.model.inputs.to_deviation(u), seconds)
         except np.linalg.LinAlgError:
             predicted = None  # so far out that the model gives no rate
         return predicted if predicted is not None and predicted.finite else replace(
@@ -201,6 +224,7 @@ class StateEstimation:
         estimate, old, new = state.estimate, predecessor.model, self.model
         if estimate is None:
             return state
+        now_ns = state.commanded_ns or 0  # the time of the estimate
         estimator = self.level(state.supervisor).estimator
         if not estimator.remembers:
             estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
@@ -211,10 +235,10 @@ class StateEstimation:
             # of what is not measured the new model has a view of its own
             x = self.position(None, predecessor.outputs.of(x))
             return replace(state, accepted=None, recovery=None, estimate=estimator.restart(
-                None, new.states.to_deviation(x), _command(new, state)))
+                None, new.states.to_deviation(x), self.acting(state, now_ns)))
         # the rates that the old model estimated, per second, which all models share
         rate = estimate.w + predecessor.level(state.supervisor).model.drift(estimate.x) + (
-            old.forcing(estimate.x, _command(old, state)))
+            old.forcing(estimate.x, predecessor.acting(state, now_ns)))
         factor = (old.states.scale / old.seconds_per_time_unit
                   / (new.states.scale / new.seconds_per_time_unit))
         x_new = new.states.to_deviation(x)
@@ -223,14 +247,7 @@ class StateEstimation:
             change = np.concatenate((old.states.scale / new.states.scale, factor))
             covariance = covariance * change * change[:, None]
         moved = Estimate(
-            x_new, factor * rate - new.forcing(x_new, _command(new, state)), covariance)
+            x_new, factor * rate - new.forcing(x_new, self.acting(state, now_ns)), covariance)
         moved = estimator.transferred(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return replace(state, estimate=moved, accepted=None, recovery=None)
-
-
-def _command(model: LiftedModel, state: State) -> Array:
-    """Return the last command in a model's scaled deviations; the nominal one at first."""
-    if state.command is None:
-        return np.zeros(model.n_u)
-    return model.inputs.to_deviation(state.command)

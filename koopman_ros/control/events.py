@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What changes a controller's state: events, and the one function that applies them.
+Events, which change a controller's state, and the one function that applies them.
 
 The running controller, the simulated loop and the replay of records all call :func:`apply`, so
 that a command follows from the same numbers in each.
@@ -19,10 +19,10 @@ from koopman_ros.core.status import Reason, StatusCode
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A measurement that is answered."""
+    """A measurement, for which a command is calculated."""
 
     stamp_ns: int  #: its stamp
-    measured: Array  #: (n_y,) in the model's units; NaN for what cannot be
+    measured: Array  #: (n_y,) in the model's units; NaN for impossible values
     applied: Array | None = None  #: (n_u,) measured input that goes with it, or None
     #: how many of the seconds since the last stamp the rate limit may count, or None for all
     seconds: float | None = None
@@ -30,20 +30,20 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """No measurement came up to a time, which is answered, too."""
+    """No measurement was received up to a time, for which a command is calculated."""
 
     stamp_ns: int  #: that time, in the time of the measurements' stamps
-    #: why the command is held; None where it goes on from what is estimated
+    #: why the command is held; None where it continues from the estimate
     cause: StatusCode | None = StatusCode.NO_MEASUREMENT
 
 
 @dataclass(frozen=True, slots=True)
 class SetpointRequest:
-    """The operator asks for a set-point."""
+    """The operator requests a set-point."""
 
     stamp_ns: int  #: time at which it takes effect; 0: immediately
     value: Array  #: of the signals, in the model's units
-    #: which of the controlled ones are asked for, the others stay as they are; None for all
+    #: which of the controlled ones are requested, others are unchanged; None for all
     signals: tuple[str, ...] | None = None
 
 
@@ -74,7 +74,7 @@ Event: TypeAlias = (
 
 @dataclass(frozen=True, slots=True)
 class EventOutcome:
-    """What an event led to."""
+    """The outcome of an event."""
 
     state: State  #: the new state; the old one when the event was refused
     #: (n_u,) in the model's units, or None where the event is not answered

@@ -21,7 +21,7 @@ _COMES_NEARER = 1e-5  # likewise, less than any rate limit allows between two co
 
 
 class ExperimentPhase(Enum):
-    """What an experiment is doing; the value is the word an operator reads."""
+    """The phase of an experiment; the value is the word shown to an operator."""
 
     RUNNING = 'running'
     FINISHED = 'finished'
@@ -32,10 +32,10 @@ class ExperimentPhase(Enum):
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """
-    Steps of random height and length (paper, section on the reactor), and what ends them.
+    Random steps (paper, section on the reactor), and the conditions that end them.
 
-    What is stepped are inputs, or set-points of a controller in automatic mode, each by its own
-    steps: they coincide only where all last equally long.
+    Inputs, or set-points of a controller in automatic mode, are stepped independently: steps
+    coincide only if all have the same length.
 
     :raises ValueError: when a number is missing, not finite, or contradicts another.
     """
@@ -70,8 +70,8 @@ class Experiment:
             if not rate > 0.0:
                 raise ValueError(f'{name}: rate = {rate} must be above 0')
         if not 0.0 < self.hold_shortest <= self.hold_longest:
-            raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and not '
-                             f'above hold_longest = {self.hold_longest} s')
+            raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and at most '
+                             f'hold_longest = {self.hold_longest} s')
         if not 0.0 < self.duration < np.inf:
             raise ValueError(f'duration = {self.duration} s must be finite and above 0')
 

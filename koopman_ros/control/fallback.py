@@ -7,13 +7,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+import itertools
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.control.bumpless import limit
 from koopman_ros.control.laws import LAWS
 from koopman_ros.control.laws.base import (
+    LaterInputs,
     Law,
     LawResult,
     Plan,
@@ -26,9 +30,20 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.plugins import contained, plug_in
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import Reason, reason, StatusCode
-from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS, PendingInputs
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import InputLimits, Tuning
+
+# Between the shortest dead time and the longest one a law is evaluated so many times at most.
+_MOST_EVALUATIONS = 20
+# A prediction takes steps of at least this share of the fastest time constant, and an estimator at
+# most so many of them at once.
+_PREDICTION_STEP, _MOST_STEPS = 0.1, 10
+
+
+class _NotPredictedError(Exception):
+    """The model cannot predict the state over the dead time."""
 
 
 @dataclass(frozen=True)
@@ -100,10 +115,13 @@ class FallbackLevel:
             inputs.to_deviation(self.limits.upper), y)
 
     def compute(self, setpoint: Array, estimate: Estimate, memory: object, interval: float,
-                start: Array | None, previous: Array | None
+                start: Array | None, previous: Array | None, pending: PendingInputs | None = None
                 ) -> tuple[Target | None, LawResult]:
         """
         Evaluate the law towards a target, see :meth:`target`, for an estimate of its model.
+
+        With inputs under way it acts on the state that is predicted for the time at which its
+        command acts.
 
         This is the one place where an exception of a law, or a result that is none, becomes a
         failure with a reason.
@@ -114,10 +132,80 @@ class FallbackLevel:
             if target is None:
                 return None, LawResult(None, reason(StatusCode.NO_STEADY_STATE))
             target = self._within_reach(target, estimate.w)
+            if pending is not None and any(pending.dead_ns) and pending.applied.values:
+                return target, self._ahead(estimate, target, memory, interval, previous, pending)
             return target, self._checked(
                 self.law.compute(estimate, target, memory, interval, previous))
+        except _NotPredictedError as error:
+            return target, LawResult(None, reason(
+                StatusCode.NOT_PREDICTED, seconds=error.args[0]))
         except BaseException as error:
             return target, LawResult(None, reason(StatusCode.LAW_RAISED, error=contained(error)))
+
+    def _ahead(self, estimate: Estimate, target: Target, memory: object, interval: float,
+               previous: Array | None, pending: PendingInputs) -> LawResult:
+        """
+        Evaluate the law for each input at the state predicted for the time at which it acts.
+
+        Until a slower input acts the faster ones are assumed to follow the law. With a correct
+        model each input then equals, at the time it acts, the value of the law for the state of
+        that time: the loop is the one without dead time. Held at their last commands instead, the
+        faster inputs would enter the prediction with a gain that grows with the difference of the
+        dead times, and make the loop unstable.
+        """
+        dead_ns = np.array(pending.dead_ns)
+        shortest, longest = int(dead_ns.min()), int(dead_ns.max())
+        estimate = self._predicted(estimate, pending.between(0, shortest))
+        planned = None if shortest == longest else self.law.compute_later(
+            estimate, target, memory, interval, previous, LaterInputs(
+                (dead_ns - shortest) / NANOSECONDS, pending.between(shortest, longest)))
+        first = result = self._checked(planned or self.law.compute(
+            estimate, target, memory, interval, previous))
+        if first.plan is not None:
+            first = replace(first, plan=replace(
+                first.plan, times=first.plan.times + shortest / NANOSECONDS))
+        # a law without a model moves from its last command, not from the state
+        if first.u is None or shortest == longest or planned or self.law.model_free:
+            return first
+        u, held = first.u.copy(), first.u
+        count = min(_MOST_EVALUATIONS, math.ceil(
+            (longest - shortest) / NANOSECONDS / interval) if interval > 0.0 else 1)
+        edges = sorted({*np.linspace(shortest, longest, count + 1).round().astype(int).tolist(),
+                        *pending.dead_ns})
+        for begin, end in itertools.pairwise(edges):
+            acts = dead_ns <= begin
+            estimate = self._predicted(estimate, [
+                (seconds, np.where(acts, held, known))
+                for seconds, known in pending.between(begin, end)])
+            seconds = (end - begin) / NANOSECONDS
+            result = self._checked(
+                self.law.compute(estimate, target, result.memory, seconds, held))
+            if result.u is None:
+                return result
+            held = limit(self.limits, result.u, held, seconds)[0]
+            u[dead_ns == end] = result.u[dead_ns == end]
+        return replace(first, u=u)
+
+    def _predicted(self, estimate: Estimate, pieces: list[tuple[float, Array]]) -> Estimate:
+        """Predict an estimate under inputs (n_u,), each with the seconds for which it acts."""
+        model, ahead, gathered, impulse = self.model, 0.0, 0.0, np.zeros(self.model.n_u)
+        rate = model.linearised.fastest_rate / model.seconds_per_time_unit
+        step = _PREDICTION_STEP / rate if rate > 0.0 else math.inf
+        for k, (seconds, u) in enumerate(pieces, 1):
+            # of short pieces the mean acts as they do one by one
+            gathered, impulse = gathered + seconds, impulse + seconds * u
+            if gathered < step and k < len(pieces):
+                continue
+            count = max(1, math.ceil(gathered / (_MOST_STEPS * step)))
+            v = model.inputs.to_deviation(impulse / gathered)
+            for _ in range(count):
+                found = self.estimator.predict(estimate, v, gathered / count)
+                ahead += gathered / count
+                if found is None or not found.finite:
+                    raise _NotPredictedError(ahead)
+                estimate = found
+            gathered, impulse = 0.0, np.zeros(model.n_u)
+        return estimate
 
     def _checked(self, result: Any) -> LawResult:
         """Return a law's result within the range if its input, or its failure, can be used."""
@@ -136,7 +224,7 @@ class FallbackLevel:
         return replace(result, u=within, clipped=bool(result.clipped or np.any(within != u)))
 
     def _within_reach(self, target: Target, w: Array) -> Target:
-        """Return the target, or what is nearest to it where the inputs do not suffice."""
+        """Return the target, or the nearest one where the inputs do not suffice."""
         model, limits = self.model, self.limits
         # a single one at its end goes there by itself
         if self.law.model_free or model.n_u == 1 or len(self.controlled) > model.n_u:
@@ -153,8 +241,8 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
     """
     Build the levels that a tuning names, best first.
 
-    :raises ValueError: for a law or an estimator that there is not, or one that cannot do with
-        what is measured.
+    :raises ValueError: for an unknown law or estimator, or one for which the measured signals do
+        not suffice.
     """
     name = tuning.estimator or (
         'extended_kalman_filter' if not outputs.determine_state else

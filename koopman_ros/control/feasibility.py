@@ -46,11 +46,11 @@ class Feasibility:
         """
         Return why a set-point (n_c,), in state units, cannot be held, or None.
 
-        :param goal: NaN for what is left open.
+        :param goal: NaN for signals without a value.
         :param others: (n_c,) set-points from which on the nearest one that can be held is looked
             for, the first one that is held itself.
         :param command: (n_u,) input that holds another one, in input units, or None.
-        :param whole: whether every signal was asked for: else the others are to stay.
+        :param whole: whether every signal was requested; if not, the others are to stay.
         """
         given = np.isfinite(goal)
         if not given.all():
@@ -78,7 +78,7 @@ class Feasibility:
         return self.level.target(setpoint, self.w, self.start)
 
     def _under(self, command: Array | None) -> Array | None:
-        """Return what (n_c,) is held by a command (n_u,), or by the nominal input."""
+        """Return the set-point (n_c,) that a command (n_u,) holds, or the nominal input."""
         model = self.level.model
         u = self.level.limits.within(model.inputs.center if command is None else command)
         start = np.zeros(model.n_x) if self.start is None else (
@@ -106,7 +106,7 @@ class Feasibility:
         return held
 
     def _nearer(self, held: Array, goal: Array) -> Array:
-        """Move the inputs within their range for the least squares of what is left to a goal."""
+        """Move the inputs within their range to the least-squares distance from a goal."""
         # in here: it takes longer to import than the rest of the step
         from scipy.optimize import lsq_linear
 
@@ -143,7 +143,7 @@ class Feasibility:
         return self.box.violation(setpoint) == 0.0 and self._cause(self._target(setpoint)) is None
 
     def _cause(self, target: Target | None) -> Reason | None:
-        """Return what keeps a target from being held, or None."""
+        """Return the reason why a target cannot be held, or None."""
         if target is None:
             return reason(StatusCode.NO_STEADY_STATE)
         model, limits = self.level.model, self.level.limits

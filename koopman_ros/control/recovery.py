@@ -66,7 +66,7 @@ class SafeStateRecovery:
 
 def moves_toward_nominal(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> bool:
     """
-    Tell whether the nominal input pushes a state towards the nominal one, beside the safe input.
+    Whether the nominal input drives a state towards the nominal one, compared with the safe input.
 
     On the other side, as that of a runaway, it is the safe input that does. State (n_x,) and
     inputs (n_u,) are in their units.

@@ -24,9 +24,9 @@ class Setpoint:
     """The state of the set-point."""
 
     #: (n_c,) where the operator wants to be, or None before the first request; NaN, before the
-    #: first measurement, for what was not asked for
+    #: first measurement, for signals without a request
     requested: Array | None = None
-    #: (n_c,) what is tracked now, on its ramp to the requested value; None at first
+    #: (n_c,) active set-point, on its ramp to the requested value; None at first
     active: Array | None = None
     #: (time in ns, (n_c,) value) of requests that take effect later, in time order; NaN for what
     #: they do not ask for
@@ -45,10 +45,9 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
     """
     Take over an accepted request, at once or when its time has come.
 
-    A request that holds at once is the operator's last word: it ends every schedule of what it
-    asks for.
+    A request without a schedule cancels the scheduled ones of its signals.
 
-    :param value: (n_c,) accepted value, in state units; NaN for what is not asked for.
+    :param value: (n_c,) accepted value, in state units; NaN for signals that are not requested.
     :param effective_ns: time from which it holds; 0 or past means at once, and a time more than
         an hour ahead is taken for the stamp of another clock and means at once, too.
     :param now_ns: time of the last measurement, or None before the first.
@@ -66,7 +65,7 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
 
 
 def overlaid(earlier: Array | None, later: Array) -> Array:
-    """Return a request (n_c,) with what a later one (n_c,) asks for."""
+    """Return a request (n_c,) updated by a later one (n_c,)."""
     left_open = np.isnan(later)
     if earlier is None or not left_open.any():
         return later
@@ -74,7 +73,7 @@ def overlaid(earlier: Array | None, later: Array) -> Array:
 
 
 def at_its_time(setpoint: Setpoint, effective_ns: int, now_ns: int | None) -> Array:
-    """Return what (n_c,) is requested when a request takes effect; NaN for what nobody knows."""
+    """Return the set-point (n_c,) when a request takes effect; NaN for signals without one."""
     goal = setpoint.requested
     if lies_ahead(effective_ns, now_ns):
         for time_ns, value in setpoint.scheduled:
@@ -85,7 +84,7 @@ def at_its_time(setpoint: Setpoint, effective_ns: int, now_ns: int | None) -> Ar
 
 
 def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
-    """Tell whether a stamp is a schedule: later than the last measurement, by at most an hour."""
+    """Whether a stamp is a schedule: later than the last measurement, by at most an hour."""
     if now_ns is None:
         # nobody knows yet; the first measurement decides
         return effective_ns > 0
@@ -97,8 +96,8 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
     """
     Bring the set-point to the present time.
 
-    Before the first request the state that was first measured is held, so that a
-    controller which starts on a running plant asks for no change.
+    Before the first request the first measured state is held, so that a controller that starts on
+    a running plant does not move it.
 
     :param measured: (n_c,) measured of the controlled states, in their units.
     :param box: of the controlled states, which bounds the first set-point.

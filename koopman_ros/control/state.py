@@ -21,7 +21,7 @@ from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.status import Reason
-from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
+from koopman_ros.estimation import Accepted, AppliedInputs, Estimate, Estimator, Innovation
 
 
 class Mode(Enum):
@@ -38,23 +38,25 @@ class State:
     mode: Mode = Mode.AUTOMATIC  #: who commands
     #: requested, active and scheduled set-points
     setpoint: Setpoint = field(default_factory=Setpoint)
-    #: (n_u,) what the operator asked for in manual mode, or None
+    #: (n_u,) requested by the operator in manual mode, or None
     manual_input: Array | None = None
     time_ns: int | None = None  #: stamp of the last measurement, or None before the first
     former_ns: int | None = None  #: newest stamp before the stamps went back, or None
     command: Array | None = None  #: (n_u,) last command, or None before the first
     commanded_ns: int | None = None  #: when it was given, or None
+    #: applied inputs that act, or will act; empty before the first command
+    applied: AppliedInputs = field(default_factory=AppliedInputs)
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
-    accepted: Accepted | None = None  #: what is remembered of the measurements
+    accepted: Accepted | None = None  #: the last accepted measurement
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
     supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
     recovery: SafeStateRecovery | None = None
     law: str | None = None  #: the level whose law gave the last command; None when none did
-    law_input: Array | None = None  #: (n_u,) what that law asked for, within the range
-    law_memory: object = None  #: what that law remembers
-    transfer: BumplessTransfer | None = None  #: what is added to it for a while, or None
+    law_input: Array | None = None  #: (n_u,) input of that law, within the range
+    law_memory: object = None  #: memory of that law
+    transfer: BumplessTransfer | None = None  #: the offset that fades from it, or None
     #: (n_x + n_u,) steady state that was last aimed at and its input, in their units, where the
     #: next one is looked for; None at first, and where every state has a set-point
     target: Array | None = None
@@ -62,7 +64,7 @@ class State:
     __repr__ = short_repr
 
     def restarted(self, time_ns: int | None) -> State:
-        """Return the state without what may have made a calculation fail, after a measurement."""
+        """Return the state after a measurement, without the parts that may have made it fail."""
         return replace(self, **WITHOUT_LAW, estimate=None, recovery=None, target=None,
                        time_ns=time_ns)
 
@@ -74,13 +76,13 @@ class State:
         return self.command - self.transfer.offset
 
 
-#: what changes of a state in which no law acts
+#: changes of a state in which no law acts
 WITHOUT_LAW: Mapping[str, Any] = {
     'law': None, 'law_input': None, 'law_memory': None, 'transfer': None}
 
 
 class Arrival(Enum):
-    """What came of a measurement; after one late or repeated the last command is given again."""
+    """The outcome of a measurement; after one late or repeated the last command is given again."""
 
     ACCEPTED = 'accepted'
     REJECTED = 'rejected'
@@ -93,14 +95,14 @@ class Arrival(Enum):
 class MeasurementReport:
     """The measurement that was answered."""
 
-    arrival: Arrival = Arrival.MISSING  #: what came of it
+    arrival: Arrival = Arrival.MISSING  #: its outcome
     #: its distance from the training data, in half-ranges; NaN when there is none
     outside: float = math.nan
-    predicted: Array | None = None  #: (n_y,) what was expected of it, or None
+    predicted: Array | None = None  #: (n_y,) its prediction, or None
     missed: int = 0  #: measurements that should have come since the last one
-    #: whether its stamp was so much earlier than the one before that time starts afresh
+    #: whether its stamp was earlier than the last by more than 1 s, which resets time
     clock_went_back: bool = False
-    follows: bool = True  #: whether the measured input, where there is one, is what was commanded
+    follows: bool = True  #: whether the applied input, if measured, equals the command
 
 
 NOTHING_MEASURED = MeasurementReport()
@@ -120,7 +122,7 @@ class EstimateReport:
 
     @staticmethod
     def of(estimate: Estimate, estimator: Estimator) -> EstimateReport:
-        """Return what is reported of an estimate, whatever fails in an estimator."""
+        """Return the report of an estimate, even if the estimator fails."""
         states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
         try:
             disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
@@ -156,11 +158,11 @@ class CommandReport:
     """How the command came about."""
 
     law: SolutionInfo = NO_SOLUTION  #: about the solution of the law
-    transfer: Array | None = None  #: (n_u,) what a change of law or mode still adds to it, or None
+    transfer: Array | None = None  #: (n_u,) rest of a bumpless transfer, or None
     recovery: float = 0.0  #: share of the nominal input in it while recovering from the safe one
     at_range: bool = False  #: whether the range of an input was active
     at_rate: bool = False  #: whether the rate limit of an input was active
-    plan: Plan | None = None  #: what the law plans, where it has a horizon
+    plan: Plan | None = None  #: the plan of a law with a horizon
     #: its distance from the training box, in half-ranges; NaN where not looked at
     outside: float = math.nan
 
@@ -170,7 +172,7 @@ NO_COMMAND = CommandReport()
 
 @dataclass(frozen=True, slots=True)
 class StepReport:
-    """What a step did."""
+    """The report of a step."""
 
     mode: Mode  #: who commanded
     level: str  #: the control level that acted; 'manual' in manual mode

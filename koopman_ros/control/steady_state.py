@@ -33,9 +33,9 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
     linearised equation that is.
 
     :param w: (n_x,) disturbance of the state's rate.
-    :param start: (n_x + n_u,) scaled deviations; what is not free stays there.
-    :param free: (n_x + n_u,) what is solved for.
-    :param anchor: (n_x + n_u,) likewise.
+    :param start: (n_x + n_u,) scaled deviations; components that are not free stay there.
+    :param free: (n_x + n_u,) whether a component is solved for.
+    :param anchor: (n_x + n_u,) scaled deviations.
     :param reach: (n_x + n_u,) units in which the distance from it is measured.
     :return: (n_x + n_u,), or None where no solution was found.
     """

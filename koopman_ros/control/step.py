@@ -53,10 +53,10 @@ class ControlStep(Configuration):
         """
         Answer one measurement.
 
-        A repeated stamp and one out of order, earlier by at most a second, return the last
-        command again; a still earlier stamp starts time afresh. After a gap in the measurements
-        ramp and rate limit count twice the interval before it, not the gap. Stamps that return to
-        where they were before they went back count from the newest of those.
+        A repeated stamp and one out of order, earlier by at most a second, return the last command
+        again; a still earlier stamp resets the time. After a gap in the measurements ramp and rate
+        limit count twice the interval before it, not the gap. Stamps that return to where they
+        were before they went back count from the newest of those.
 
         :param y: (n_y,) measured, in the signals' units.
         :param applied: (n_u,) measured input at that time, or None; see
@@ -78,12 +78,12 @@ class ControlStep(Configuration):
                     arrival, self._outside(state.estimate, y)))
         back = ahead < 0
         if back:
-            state = afresh(state)
+            state = afresh(state, ahead)
         state, time, missed = time_of_measurement(state, time_ns, countable)
 
         def calculate() -> tuple[State, Array, StepReport]:
-            u, follows = self.estimation.applied(state, applied)
-            now, seen = self.estimation.observe(state, y, time_ns, time.elapsed, u)
+            known, follows = self.estimation.applied(state, applied)
+            now, seen = self.estimation.observe(known, y, time_ns, time.elapsed)
             accepted = seen.verdict.fault is None
             if accepted:
                 now = self._advanced(now, seen.x, time)
@@ -114,7 +114,7 @@ class ControlStep(Configuration):
 
         def calculate() -> tuple[State, Array, StepReport]:
             now = replace(state, estimate=self.estimation.predict(
-                state, time.elapsed, self.estimation.applied(state)[0]))
+                state, time.now_ns, time.elapsed))
             if cause is not None or state.mode is Mode.MANUAL:
                 fault = None if cause is None else reason(cause)
                 return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
@@ -156,7 +156,7 @@ class ControlStep(Configuration):
                 before.restarted(time_ns), Verdict(before.accepted, fault), measured, time)
 
     def _advanced(self, state: State, x: Array, time: StepTime) -> State:
-        """Return the state with the set-point of now; `x` (n_x,) is what it begins from."""
+        """Return the state with the set-point of now; it begins from `x` (n_x,)."""
         return replace(state, setpoint=setpoints.advance(
             state.setpoint, self.best.controlled_of(x), self.controlled,
             self.tuning.setpoint_ramp, time.now_ns, time.counted,
@@ -189,7 +189,8 @@ class ControlStep(Configuration):
         u, at_range, at_rate = limit(self.tuning.limits, wanted, state.command, time.counted)
         done = replace(done, at_range=done.at_range or at_range, at_rate=at_rate,
                        outside=self.model.inputs.violation(u))
-        state = replace(state, **changes, command=u, commanded_ns=time.command_ns)
+        applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)
+        state = replace(state, **changes, command=u, commanded_ns=time.command_ns, applied=applied)
         return state, u, self._report(state, why, measured, target, done)
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime
@@ -212,7 +213,7 @@ class ControlStep(Configuration):
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, memory, time.spacing, state.target,
-                state.own_command)
+                state.own_command, self.estimation.pending(state, time.command_ns))
             if result.failure is not None:
                 requested = self._failed(level, result.failure, result.passing)
                 continue
@@ -245,7 +246,7 @@ class ControlStep(Configuration):
     def _act(self, state: State, supervisor: Supervisor, recovery: SafeStateRecovery | None,
              result: LawResult | None, transfer: BumplessTransfer | None
              ) -> tuple[dict[str, Any], Array, CommandReport]:
-        """Return what changes of the state, the command before limits, and its report."""
+        """Return the changes of the state, the command before limits, and its report."""
         level, held = supervisor.level, self._last_command(state)
         if result is None or result.u is None:
             done = NO_COMMAND if result is None else CommandReport(

@@ -39,8 +39,8 @@ class FallbackOrder:
     def __post_init__(self) -> None:
         if list(self.margins) != sorted(self.margins):
             raise ValueError(f'fallback_order = {list(self.laws)}, learned_model_margin and '
-                             'linear_model_margin: the margin of a level must not be below '
-                             f'that of a better one, got {list(self.margins)}')
+                             'linear_model_margin: the margin of a level must be at least that of '
+                             f'the better ones, got {list(self.margins)}')
 
     @cached_property
     def levels(self) -> tuple[str, ...]:
@@ -95,7 +95,7 @@ class Supervisor:
     def allowed(self, order: FallbackOrder, outside: float,
                 ranges: tuple[tuple[str, float, float], ...]) -> LevelRequest:
         """
-        Return what the distance from the training data, in half-ranges, allows.
+        Return the level that the distance from the training data, in half-ranges, allows.
 
         :param ranges: (name, lower, upper) of the trained range, for the reason.
         """

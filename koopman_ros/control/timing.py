@@ -33,19 +33,23 @@ def usual_interval(state: State) -> float:
     return 0.0 if math.isinf(state.interval) else state.interval
 
 
-def afresh(state: State) -> State:
-    """Return the state after the clock was set back: what was timed by it has lost its meaning."""
+def afresh(state: State, by_ns: int) -> State:
+    """
+    Return the state after the clock was set: without times of the former clock.
+
+    :param by_ns: the change of the clock, by which inputs under way act at other times.
+    """
     supervisor = replace(state.supervisor, bad_since_ns=None, better_since_ns=None)
     newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
         state.time_ns, state.former_ns)
     return replace(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
-                   supervisor=supervisor, recovery=None,
+                   applied=state.applied.shifted(by_ns), supervisor=supervisor, recovery=None,
                    setpoint=replace(state.setpoint, scheduled=()))
 
 
 def time_of_measurement(state: State, time_ns: int, countable: float | None
                          ) -> tuple[State, StepTime, int]:
-    """Return the state with its usual interval, the times of the step, and what was missed."""
+    """Return the state with its usual interval, the times of the step, and the missed time."""
     since_ns = state.commanded_ns
     ahead_of_stamps = since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS
     if ahead_of_stamps:

@@ -14,21 +14,22 @@ def unusable(model: LiftedModel) -> str:
     """Say which name, nominal value or range keeps a controller from running, or nothing."""
     if wrong := [name for name in (*model.states.names, *model.inputs.names)
                  if not SIGNAL_NAME.fullmatch(name)]:
-        return (f'{wrong[0]!r} is a signal, which topics and parameters are named after: train '
-                'the model again with a name of letters, digits and _, beginning with a letter')
+        return (f'{wrong[0]!r} is the name of a signal, used in topics and parameters: train the '
+                'model again with a name of letters, digits and _, beginning with a letter')
     if taken := set(model.states.names) & set(model.inputs.names):
-        return (f'there is a state and an input of the name {min(taken)}: train the model again '
-                'with different names')
+        return (f'a state and an input are both named {min(taken)}: train the model again with '
+                'different names')
     for kind, signals in (('state', model.states), ('input', model.inputs)):
         for name, unit, low, center, high in zip(
                 signals.names, signals.units, signals.lower.tolist(), signals.center.tolist(),
                 signals.upper.tolist(), strict=True):
             text = Display(unit, display_unit(unit), '.4g').text
             if low <= (0.0 if unit == 'K' else -math.inf):
-                return (f'the trained range of {name} begins at {low:.4g} {unit}, which cannot '
-                        'be: train the model again from other data')
+                return (f'the trained range of {name} begins at {low:.4g} {unit}, which is '
+                        'impossible: train the model again from other data')
             if not low <= center <= high:
-                remedy = ('record around a state that the plant can hold' if kind == 'state' else
+                remedy = ('record data around a state that the plant can '
+                          'hold' if kind == 'state' else
                           f'record {name} {"down" if center < low else "up"} to {text(center)}')
                 return (f'the nominal {name}, {text(center)}, is outside its trained range, '
                         f'{text(low)} to {text(high)}: {remedy} and train the model again')

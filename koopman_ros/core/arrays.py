@@ -45,7 +45,7 @@ def _brief(value: object) -> str:
 
 
 def real(value: ArrayLike, name: str) -> Array:
-    """Return numbers as a float64 array; ValueError for complex ones and what is no number."""
+    """Return numbers as a float64 array; ValueError for complex or non-numeric ones."""
     array = np.asarray(value)
     if np.iscomplexobj(array):
         raise ValueError(f'{name} must be real, got complex numbers: pass their real part')
@@ -58,10 +58,10 @@ def real(value: ArrayLike, name: str) -> Array:
 def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite: bool = True
            ) -> Array:
     """
-    Return a read-only float64 copy of `value`, or say what is wrong with it.
+    Return a read-only float64 copy of `value`, or raise an error that describes its defect.
 
     :param shape: expected; None where any length will do, -1 for a size that never fits.
-    :param finite: whether infinity is refused as well as what is not a number.
+    :param finite: whether infinity is rejected as well as NaN.
     :raises ValueError: naming both shapes, or the first entry that is refused.
     """
     array = real(value, name).copy()
@@ -73,8 +73,8 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     refused = ~np.isfinite(array) if finite else np.isnan(array)
     if refused.any():
         position = tuple(map(int, np.argwhere(refused)[0]))
-        raise ValueError(f'{name} must be finite: entry {list(position)} is {array[position]}; '
-                         'check where that number was computed or measured')
+        raise ValueError(f'{name} must be finite, but entry {list(position)} is '
+                         f'{array[position]}: check its source')
     array.setflags(write=False)
     return array
 

@@ -25,7 +25,7 @@ class PlantDescription:
     """
     Names, units, nominal point and input matrix of a plant.
 
-    :raises ValueError: naming what does not fit the names, or a time unit that there is not.
+    :raises ValueError: naming the mismatch, or for an unknown unit.
     """
 
     name: str  #: name of the plant
@@ -36,7 +36,7 @@ class PlantDescription:
     time_unit: str  #: ``'s'`` or ``'min'``
     #: (n_x,) steady state under the nominal input; NaN where it is not known yet
     nominal_state: Array
-    nominal_input: Array  #: (n_u,) nominal input, likewise
+    nominal_input: Array  #: (n_u,) nominal input, or NaN
     #: (n_x, n_u) input matrix, in units; None to learn it; where it depends on the state, a
     #: function of states (..., n_x), in their units, to (..., n_x, n_u)
     B: Array | Callable[[Array], Array] | None
@@ -50,7 +50,7 @@ class PlantDescription:
         for kind in ('state', 'input'):
             for what in ('names', 'units'):
                 if isinstance(given := getattr(self, f'{kind}_{what}'), str):
-                    raise ValueError(f'{kind}_{what} is the text {given!r}: pass a sequence, '
+                    raise ValueError(f'{kind}_{what} is the string {given!r}: pass a sequence, '
                                      f'({given!r},) for one {kind}')
             names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
             for unit in units:
@@ -80,7 +80,7 @@ class PlantDescription:
         """
         shape = (*np.shape(x), len(self.input_names))
         if self.B is None:
-            raise ValueError('B is not known: give it to the plant')
+            raise ValueError('B is unknown: pass it to PlantDescription')
         if not callable(self.B):
             return np.broadcast_to(self.B, shape)
         found = np.asarray(self.B(x), dtype=np.float64)
@@ -98,12 +98,13 @@ class Episode:
     A command is held until the next one; an input that was measured behind a slow actuator is
     linear from sample to sample.
 
-    :raises ValueError: on unequal lengths, times that do not rise, values that are not finite,
-        or an input that is not known at the first measurement.
+    :raises ValueError: on unequal lengths, times that do not rise, values that are infinite,
+        times at which no state was measured, or an input that is not known at the first one.
     """
 
     time: Array  #: (N,) times of the measurements, rising, in time units
-    x: Array  #: (N, n_x) measured states, in state units, with their noise
+    #: (N, n_x) measured states, in state units, with their noise; NaN where one was not measured
+    x: Array
     #: (M,) times from which each input was held, or at which it was measured, rising, the first
     #: not later than the first measurement
     input_time: Array
@@ -118,22 +119,25 @@ class Episode:
             t = np.ascontiguousarray(real(getattr(self, times), times))
             v = np.ascontiguousarray(real(getattr(self, values), values))
             if (t.ndim, v.ndim) == (2, 1):
-                raise ValueError(f'{times} has shape {t.shape} and {values} {v.shape}: they are '
-                                 'exchanged; pass the times first')
+                raise ValueError(f'{times} has shape {t.shape} and {values} {v.shape}: the '
+                                 'arguments are swapped; pass the times first')
             if (t.ndim, v.ndim) == (1, 1):
-                raise ValueError(f'{values} has shape {v.shape}: pass one column for each signal, '
-                                 f'{values}[:, None] for one')
+                raise ValueError(f'{values} has shape {v.shape}: pass one column per signal, '
+                                 f'{values}[:, None] for a single one')
             if t.ndim != 1 or v.ndim != 2 or len(t) != len(v) or len(t) == 0:
                 raise ValueError(f'incompatible {times} and {values}: expected (n,) and (n, m) '
                                  f'with n > 0, got {t.shape} and {v.shape}')
-            if not (np.all(np.isfinite(t)) and np.all(np.isfinite(v))):
-                raise ValueError(f'{times} or {values} hold values that are not finite: drop them')
+            missing = np.all(np.isnan(v), axis=1) if values == 'x' else np.isnan(v)
+            if not np.all(np.isfinite(t)) or np.any(missing) or np.any(np.isinf(v)):
+                raise ValueError(f'{times} or {values} contain values that are not finite: remove '
+                                 'those samples')
             if not np.all(np.diff(t) > 0.0):
-                raise ValueError(f'{times} must rise: sort the samples and drop repeated ones')
+                raise ValueError(f'{times} must increase: sort the samples and remove repeated '
+                                 'ones')
             object.__setattr__(self, times, t)
             object.__setattr__(self, values, v)
         if self.input_time[0] > self.time[0]:
-            raise ValueError('the input at the first measurement is not known: begin the episode '
+            raise ValueError('the input at the first measurement is unknown: begin the episode '
                              'with the first measurement after an input')
         if self.linear and len(self.linear) != self.u.shape[1]:
             raise ValueError(f'linear = {self.linear} must have one entry for each of '
@@ -141,6 +145,14 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def interpolated(self) -> Array:
+        """Return the states (N, n_x), lines where one was not measured; 0 where it never was."""
+        x = self.x.copy()
+        for j in np.flatnonzero(np.isnan(x).any(axis=0)):
+            known = ~np.isnan(x[:, j])
+            x[:, j] = np.interp(self.time, self.time[known], x[known, j]) if known.any() else 0.0
+        return x
 
     def inputs_at(self, times: Array) -> Array:
         """Return the inputs (n, n_u) that act from `times` (n,) on."""
@@ -168,6 +180,26 @@ class Episode:
         """Return the inputs (n, n_u) at `times` (n,), before any other change."""
         return np.where(self.linear, self.inputs_at(times), u) if any(self.linear) else u
 
+    def delayed(self, dead_time: Array) -> Episode | None:
+        """
+        Return the episode with each input as it acts, later by its dead time (n_u,).
+
+        It begins where all inputs are known; None where nothing is left of it.
+        """
+        if not np.any(dead_time):
+            return self
+        shifted = self.input_time[:, None] + dead_time
+        first = np.searchsorted(self.time, shifted[0].max())
+        if len(self) - first < 2:
+            return None
+        knots = np.unique(shifted)
+        knots = knots[knots >= shifted[0].max()]
+        u = np.empty((len(knots), self.u.shape[1]))
+        for j, own in enumerate(shifted.T):
+            u[:, j] = np.interp(knots, own, self.u[:, j]) if any(self.linear[j:j + 1]) else (
+                self.u[np.searchsorted(own, knots, side='right') - 1, j])
+        return Episode(self.time[first:], self.x[first:], knots, u, self.linear)
+
     def part(self, start: int, stop: int) -> Episode:
         """Return the measurements `start` to `stop` with the inputs that acted on them."""
         time = self.time[start:stop]
@@ -194,8 +226,9 @@ def averaged(episode: Episode, count: int) -> Episode:
     """
     Return the means of `count` measurements in a row each, at the means of their times.
 
-    What the input came to from one to the next is kept: its changes, or where there are more of
-    them than means, as in a loop that answers each measurement, its own mean between two times.
+    The integral of the input from one to the next is kept: its changes, or where there are more of
+    them than means, as in a loop that commands at each measurement, its own mean between two
+    times.
 
     :raises ValueError: for an episode without two such groups.
     """
@@ -216,7 +249,8 @@ def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samp
     """
     Cut episodes where a state leaves a range, for a training box that ends there.
 
-    :param lower: lower corner of the range, a scalar or (n_x,), in state units; upper likewise.
+    :param lower: lower corner of the range, a scalar or (n_x,), in state units; upper: the upper
+        corner.
     :param samples: the least of a part; shorter ones are left out.
     :raises ValueError: when nothing is left.
     """
@@ -227,8 +261,8 @@ def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samp
         edges = np.flatnonzero(np.diff(inside, prepend=False, append=False)).reshape(-1, 2)
         parts += [episode.part(a, b) for a, b in edges.tolist() if b - a >= samples]
     if not parts:
-        raise ValueError(f'no {samples} samples in a row lie between {low} and {high}: choose '
-                         'a wider range, or record within this one')
+        raise ValueError(f'no {samples} consecutive samples lie between {low} and {high}: choose '
+                         'a wider range, or record more data in this one')
     return parts
 
 
@@ -254,8 +288,8 @@ class DriftSamples:
     def __post_init__(self) -> None:
         episode = np.ascontiguousarray(self.episode)
         if episode.ndim != 1 or not np.array_equal(episode, episode.astype(np.int64)):
-            raise ValueError('episode must hold one whole number a sample, that of its episode, '
-                             f'got an array {episode.shape} of {episode.dtype}')
+            raise ValueError('episode must hold one integer per sample, the number of its '
+                             f'episode, got an array {episode.shape} of {episode.dtype}')
         object.__setattr__(self, 'episode', episode)
         for name in ('x', 'dxdt', 'u'):
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
@@ -264,7 +298,7 @@ class DriftSamples:
                     f'incompatible {name}: expected ({len(self)}, n), got {array.shape}')
             if count := np.count_nonzero(~np.isfinite(array)):
                 raise ValueError(
-                    f'{name} holds {count} values that are not finite: drop those samples')
+                    f'{name} contains {count} values that are not finite: remove those samples')
             object.__setattr__(self, name, array)
         if self.x.shape != self.dxdt.shape:
             raise ValueError(f'incompatible dxdt: expected {self.x.shape}, got {self.dxdt.shape}')
@@ -276,8 +310,8 @@ class DriftSamples:
             order = np.argsort(self.episode, kind='stable')
             within = np.diff(np.asarray(self.episode)[order]) == 0
             if not (np.all(np.isfinite(time)) and np.all(np.diff(time[order])[within] > 0.0)):
-                raise ValueError('time must rise from sample to sample within an episode: '
-                                 'sort the samples and drop repeated ones')
+                raise ValueError('time must increase from sample to sample within an episode: '
+                                 'sort the samples and remove repeated ones')
             object.__setattr__(self, 'time', time)
 
     def __len__(self) -> int:
@@ -309,8 +343,8 @@ def split_by_episode(samples: DriftSamples, seed: int) -> tuple[DriftSamples, Dr
     """
     episodes = np.unique(samples.episode)
     if len(episodes) < 3:
-        raise ValueError(f'training needs at least 3 episodes to hold some out, got '
-                         f'{len(episodes)}: record more, or cut the record into episodes')
+        raise ValueError('training needs at least 3 episodes, because some are held out, got '
+                         f'{len(episodes)}: record more, or split the record into episodes')
     order = np.random.default_rng(seed).permutation(episodes)
     held = max(1, len(episodes) // 5)
     return (samples.take(order[2 * held:]), samples.take(order[:held]),

@@ -7,7 +7,7 @@ Declaration of parameters as fields of a frozen dataclass.
 One field gives name, type, default, unit, range and description: nodes declare it, check it and
 write it into YAML (:mod:`koopman_ros.parameters.table`), Python code sets it as a keyword.
 
-A control law of one's own declares its own parameters likewise::
+A custom control law declares its own parameters in the same way::
 
     @dataclass(frozen=True)
     class Gains:
@@ -43,7 +43,7 @@ class NoParameters:
 
 @dataclass(frozen=True)
 class Column:
-    """What a field declared by :func:`column` holds."""
+    """The metadata of a field declared by :func:`column` holds."""
 
     signals: str  #: of which signals
     name: str  #: in YAML; empty for that of the field
@@ -113,7 +113,7 @@ def group() -> Any:
 
 
 def nested(kind: type[Any]) -> Any:
-    """Declare a field with another parameter dataclass, whose rows stand beside the others."""
+    """Declare a field with another parameter dataclass, whose rows are added to the others."""
     return field(default_factory=kind, metadata={'nested': kind})
 
 

@@ -19,12 +19,12 @@ from koopman_ros.core.units import conversion, display_unit
 
 @dataclass(frozen=True)
 class FieldDefaults:
-    """How messages of a type carry a number where nothing else is said."""
+    """The default field and unit of a message type."""
 
     field: str  #: where in the message; '{name}' stands for the name of the signal
     unit: str = ''  #: of the number there; empty for that of the signal
-    lowest: float = -math.inf  #: that it can be, in this unit; what is below is no measurement
-    highest: float = math.inf  #: likewise
+    lowest: float = -math.inf  #: possible value, in this unit; lower ones are no measurements
+    highest: float = math.inf  #: possible value, in this unit
 
 
 # One row a message type; any other type can be named with the field. Units are those of REP 103.
@@ -115,7 +115,7 @@ class MessageField:
             message = getattr(message, name)
         if not isinstance(message, (int, float)) and not (
                 isinstance(message, bytes) and len(message) == 1):
-            raise LookupError(f'{self.field} of {self.type} is no number: name another field')
+            raise LookupError(f'{self.field} of {self.type} is not a number: name another field')
 
     def expect_decimals(self, message: Any) -> None:
         """Raise LookupError where a message of its kind, here an empty one, holds integers."""
@@ -127,8 +127,8 @@ class MessageField:
         kind = getattr(message, 'typecode', '') or getattr(message, 'dtype', np.dtype('d')).char
         if isinstance(message, (int, bytes)) or kind not in 'df' or (
                 isinstance(message, list) and key and (name, key) == path[-1]):
-            raise LookupError(f'{self.field} of {self.type} holds integers, a value would be '
-                              'rounded: name a field of float64 or float32')
+            raise LookupError(f'{self.field} of {self.type} holds integers, which would round the '
+                              'value: name a field of type float64 or float32')
 
     def put(self, message: Any, value: float) -> None:
         """Write a number into a message, whose arrays grow where they are too short."""
@@ -154,8 +154,8 @@ def _steps(field: str) -> tuple[tuple[str, str], ...]:
         if not match[3]:
             break
     if not steps or end != len(field) or field.endswith('.'):
-        raise ValueError(f'field = {field!r} is no path in a message: write it like temperature, '
-                         'twist.linear.x, data[2] or position[shaft]')
+        raise ValueError(f'field = {field!r} is not the path of a message field: use e.g. '
+                         'temperature, twist.linear.x, data[2] or position[shaft]')
     return tuple(steps)
 
 
@@ -185,7 +185,7 @@ def _index_of(message: Any, key: str) -> int:
 def place(topic: str, name: str, unit: str,
           given: Mapping[str, str] | None = None) -> MessageField:
     """
-    Return where a signal is, with what is given of ``topic``, ``type``, ``field`` and ``unit``.
+    Return where a signal is, from the given ones of ``topic``, ``type``, ``field`` and ``unit``.
 
     The rest follows: the type from the unit of the signal, field and unit from the type.
 
@@ -199,7 +199,7 @@ def place(topic: str, name: str, unit: str,
     carrier = KNOWN_TYPES.get(kind, _ANY)
     field = said.get('field') or (array if kind == JOINT_STATE and array else carrier.field)
     if not field:
-        raise ValueError(f'where the number is in a {kind} is not known: name its field, e.g. '
+        raise ValueError(f'the field of a {kind} that holds the value is unknown: name it, e.g. '
                          'twist.linear.x or data[2]')
     return MessageField(said.get('topic', topic), kind, field.replace('{name}', name),
                         said.get('unit') or carrier.unit or display_unit(unit))

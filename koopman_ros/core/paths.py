@@ -25,8 +25,8 @@ def config_directory() -> Path:
     for candidate in candidates:
         if (candidate / 'models').is_dir():
             return candidate
-    raise FileNotFoundError(f'the folder share/{_PACKAGE}/config is missing: install the package '
-                            'again, or source the workspace it was built in')
+    raise FileNotFoundError(f'the folder share/{_PACKAGE}/config is missing: reinstall the '
+                            'package, or source the workspace that provides it')
 
 
 def backup_path(path: Path) -> Path:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reports: pages in Markdown, figures in JSON, pictures in PNG, and what they were made on.
+Reports: pages in Markdown, figures in JSON, plots in PNG, and the machine they were made on.
 
 Matplotlib is imported when a picture is drawn.
 """
@@ -37,7 +37,7 @@ class Picture:
     """A picture of a page."""
 
     file: str  #: its name, in the folder of the page
-    caption: str  #: what it shows, with its numbers
+    caption: str  #: with its numbers
 
     def __str__(self) -> str:
         """Return the picture with its caption, in Markdown."""
@@ -88,7 +88,7 @@ def write_figures(path: Path, figures: Mapping[str, Any]) -> Path:
 
 
 def finite(value: Any) -> Any:
-    """Replace what JSON does not know by None, however deep it is nested."""
+    """Replace values that JSON does not know by None, at any depth."""
     if isinstance(value, Mapping):
         return {name: finite(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -118,13 +118,13 @@ def drawing(path: Path, rows: int = 1, columns: int = 1, *, size: tuple[float, f
 
 
 def draw_limits(axes: Axes, bounds: Iterable[float], label: str) -> None:
-    """Draw limits of what an axis shows as dotted lines with one label."""
+    """Draw limits of the plotted signals as dotted lines with one label."""
     for number, bound in enumerate(bounds):
         axes.axhline(bound, label=label if number == 0 else None, **LIMIT)
 
 
 def legend(figure: Figure, panels: Iterable[Axes], columns: int) -> None:
-    """Put what some panels show, each thing once, below all of them."""
+    """Put one legend for all panels below them."""
     shown = {label: handle for panel in panels
              for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     figure.legend(shown.values(), shown.keys(), loc='outside lower center', ncols=columns,

@@ -19,8 +19,7 @@ def load_plugin(name: str, kind: str, known: Mapping[str, Callable[..., Any] | s
     Return a class or function by its name: a known one, or ``module:name`` of any module.
 
     :param kind: of plug-in, for the error, e.g. ``'law'``.
-    :param known: by name, itself or as ``module:name``, which is imported only when it is asked
-        for.
+    :param known: by name, itself or as ``module:name``, which is imported on first use.
     :raises ValueError: for a name without something that can be called.
     """
     found = known.get(name, name)
@@ -29,15 +28,15 @@ def load_plugin(name: str, kind: str, known: Mapping[str, Callable[..., Any] | s
     module, _, attribute = found.partition(':')
     if not attribute:
         raise ValueError(f'there is no {kind} {name!r}: choose one of {", ".join(known)}, or '
-                         'module:name of one of your own')
+                         'module:name for your own')
     try:
         found = getattr(importlib.import_module(module), attribute)
     except BaseException as error:
-        raise ValueError(f'the {kind} {name!r} cannot be loaded ({contained(error)}): check '
-                         'module and name, and that Python finds the module') from error
+        raise ValueError(f'the {kind} {name!r} cannot be loaded ({contained(error)}): check the '
+                         'name, and that Python can import the module') from error
     if not callable(found):
-        raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which cannot be '
-                         'called: name a class or a function')
+        raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which is not '
+                         'callable: name a class or a function')
     return found
 
 
@@ -50,8 +49,8 @@ def plugin_class(name: str, kind: str, known: Mapping[str, type[Any] | str], bas
     """
     found = load_plugin(name, kind, known)
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f'the {kind} {name!r} is no subclass of {base.__module__}.'
-                         f'{base.__name__}: derive its class from that')
+        raise ValueError(f'the {kind} {name!r} is no subclass of '
+                         f'{base.__module__}.{base.__name__}: derive the class from it')
     if missing := sorted(getattr(found, '__abstractmethods__', ())):
         raise ValueError(f'the {kind} {name!r} lacks {", ".join(missing)}: define '
                          f'{"them" if len(missing) > 1 else "it"} in its class')
@@ -75,7 +74,7 @@ def plug_in(name: str, kind: str, known: Mapping[str, type[Any] | str], base: ty
         raise
     except BaseException as error:
         raise ValueError(f'the {kind} {name!r} cannot be constructed ({contained(error)}): '
-                         'correct its class') from error
+                         'correct the class') from error
 
 
 def short_name(name: str) -> str:
@@ -96,13 +95,13 @@ def loaded_class(name: str) -> type[Any]:
     for part in path.split('.'):
         found = getattr(found, part, None)
     if not isinstance(found, type):
-        raise ValueError(f'the class {name!r} is not known here')
+        raise ValueError(f'unknown class {name!r}')
     return found
 
 
 def contained(error: BaseException) -> str:
     """
-    Return in one line what a plug-in raised, whatever it is, also SystemExit.
+    Return the exception of a plug-in in one line, whatever it is, also SystemExit.
 
     :raises KeyboardInterrupt: where that is the error: it is meant for the process.
     """

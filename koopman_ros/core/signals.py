@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals: one number for each by name, and what is measured of the state."""
+"""Signals: one number for each by name, and the measured outputs of the state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ def _wrong_size(name: str, value: ArrayLike, signals: Sequence[str]) -> ValueErr
 
 @dataclass(frozen=True)
 class Outputs:
-    """What is measured of the state: y = C x, in the units of the signals."""
+    """The measured outputs: y = C x, in the units of the signals."""
 
     names: tuple[str, ...]  #: (n_y,) of the measured signals
     units: tuple[str, ...]  #: (n_y,) their units
@@ -77,7 +77,7 @@ class Outputs:
         """
         Return the state, (n_x,), of outputs (n_y,).
 
-        :param guess: (n_x,) what they leave open is as there.
+        :param guess: (n_x,) state for the components that they do not determine.
         """
         if self.all_states:
             return y

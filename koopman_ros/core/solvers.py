@@ -49,7 +49,7 @@ class RiccatiSolution:
     """
 
     P: Array  #: (n, n) symmetric; zeros when there is no stable subspace to take it from
-    K: Array  #: (m, n); zeros likewise
+    K: Array  #: (m, n); zeros without a solution
     residual: float  #: Frobenius norm of the equation's left side over the sum of its terms' norms
     gain: float  #: spectral norm of K
     status: RiccatiStatus  #: whether K may be used
@@ -228,7 +228,7 @@ def _stable_graph(H: Array, least: float = 0.0) -> Array:
     # as scipy.linalg.schur, which takes three times as long for so few numbers
     _, stable, real, _, vectors, _, info = dgees(_decays, H, sort_t=1)
     if info != 0 or stable != n or not (real[:n] < -max(least, _AXIS_MARGIN * size)).all():
-        raise np.linalg.LinAlgError('there is no stable subspace of full size')
+        raise np.linalg.LinAlgError('no stable subspace of full dimension exists')
     P = np.asarray(np.linalg.solve(vectors[:n, :n].T, vectors[n:, :n].T), dtype=np.float64)
     return 0.5 * (P + P.T)
 

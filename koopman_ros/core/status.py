@@ -20,12 +20,12 @@ Value: TypeAlias = (
 
 class StatusCode(Enum):
     """
-    What is the matter: its identifier in records, and the sentence that people read.
+    The reason of a condition: its identifier in records, and its sentence for people.
 
     Of numbers in a sentence, 'value' is one of the signal, 'change' a difference of two, with its
     unit; 'rate' is a change per second. 'ranges' are (name, lower, upper) of several signals,
-    'values' (name, value); 'level' is the name of a control level. What has no such format is
-    written as it is.
+    'values' (name, value); 'level' is the name of a control level. Values without a format are
+    written unchanged.
     """
 
     template: str
@@ -40,29 +40,30 @@ class StatusCode(Enum):
     NOT_FINITE = 'measurement_not_finite', (
         'the measured {signal} is {value}, not finite: check the sensor')
     OUTSIDE_SENSOR = 'measurement_outside_sensor', (
-        'the measured {signal} {value:value} is outside the range of the sensor, {lower:value} '
-        'to {upper:value}: check it')
+        'the measured {signal} {value:value} is outside the range of the sensor, {lower:value} to '
+        '{upper:value}: check the sensor')
     JUMPED = 'measurement_jumped', (
         'the measured {signal} jumped from {before:value} to {value:value} in {seconds:.3g} s, '
         'at most {jump:change} and {rate:rate} are possible: check the sensor')
     FROZEN = 'sensor_frozen', (
-        'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s '
-        'while the model moved by more than {change:change}: the sensor is frozen; check it')
-    NO_MEASUREMENT = 'no_measurement', 'no measurement arrives: check sensor and plant'
+        'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s while '
+        'the model moved by more than {change:change}: the sensor may be stuck; check it')
+    NO_MEASUREMENT = 'no_measurement', 'no measurement received: check sensor and plant'
     STAMPS_STAND = 'stamps_do_not_advance', (
-        'measurements arrive, but their stamps do not advance: check the clock of the sensor')
+        'measurements are received, but their stamps do not advance: check the clock of the '
+        'sensor')
     TWO_SOURCES = 'two_sources', (
-        'two sources publish the measurement in turn, or its stamps go back again and again: end '
-        'one of the publishers, and check the clock of the sensor')
+        'two nodes publish the measurement, or its stamps keep going back: stop one of the '
+        'publishers, and check the clock of the sensor')
     OUTSIDE_TRAINING = 'outside_training', (
-        'the state is further from the training data than the {margin:g} half-ranges that the '
-        '{level:level} is allowed (the data span {ranges:ranges})')
-    LAW_FAILED = 'law_failed', 'the {level:level} fails: {cause}'
+        'the state is further from the training data than the {margin:g} half-ranges allowed for '
+        'the {level:level} (the data span {ranges:ranges})')
+    LAW_FAILED = 'law_failed', 'the {level:level} failed: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
-    RECOVERING = 'recovering', '{cause} (over, waiting for it to stay so)'
+    RECOVERING = 'recovering', '{cause} (cleared; waiting for recovery_time)'
     LOST_HERE = 'lost_here', (
-        'the {level:level} did not arrive when it was tried between such a state and set-point, '
-        'but a linear law did')
+        'in the acceptance test the {level:level} did not reach the set-point from a state like '
+        'this one, but a linear law did')
     NOT_STABILISABLE = 'riccati_not_stabilisable', (
         'no feedback gain: the Hamiltonian has no stable subspace of full size: the pair (A, B) '
         'is not stabilisable, or a mode on the imaginary axis is not weighted')
@@ -78,66 +79,68 @@ class StatusCode(Enum):
         'input weight, or measure more often')
     PACKAGE_MISSING = 'package_missing', (
         'it needs {package}, which is not installed: pip install {package}')
-    NO_PI_GAIN = 'no_pi_gain', 'no signal has a pi_gain: set it for those that are controlled'
+    NO_PI_GAIN = 'no_pi_gain', 'no signal has a pi_gain: set it for the controlled signals'
     PLAN_NOT_SOLVED = 'plan_not_solved', (
-        'it finds no plan within the limits of the inputs ({flag})')
-    PLAN_MOVES = 'plan_moves', 'its plan still changes after {iterations} iterations'
+        'no plan within the input limits was found ({flag})')
+    PLAN_MOVES = 'plan_moves', 'the plan did not converge in {iterations} iterations'
     PLAN_OUTSIDE = 'plan_outside', (
-        'its plan leaves the training data by {outside:.2g} half-ranges, {margin:g} are allowed')
+        'the plan leaves the training data by {outside:.2g} half-ranges; {margin:g} are allowed')
     TOO_LATE = 'too_late', (
-        'its plan took {seconds:.3g} s, {deadline:.3g} s are allowed')
-    COMMAND_NOT_FINITE = 'command_not_finite', 'its command is not finite'
+        'the plan took {seconds:.3g} s; {deadline:.3g} s are allowed')
+    COMMAND_NOT_FINITE = 'command_not_finite', 'the command is not finite'
     CALCULATION_FAILED = 'calculation_failed', (
         'the calculation failed ({error}): the estimate restarts from the next measurement')
-    LAW_RAISED = 'law_raised', 'its calculation failed ({error})'
+    LAW_RAISED = 'law_raised', 'calculation failed ({error})'
     SETPOINT_NOT_FINITE = 'setpoint_not_finite', (
-        '{signal} set-point {value:value} is not finite: the old one is kept')
+        '{signal} set-point {value:value} is not finite: the previous one is kept')
     SETPOINT_UNMEASURED = 'setpoint_unmeasured', (
-        '{signal} set-point {value:value} cannot be tracked, since {cause}: the old one is kept; '
-        'send it again then, or command the input in manual mode')
+        '{signal} set-point {value:value} cannot be tracked, because {cause}: the previous one is '
+        'kept; send it again when measurements return, or command the input in manual mode')
     SETPOINT_OUTSIDE = 'setpoint_outside', (
         '{signal} set-point {value:value} is outside the trained range {lower:value} to '
-        '{upper:value}: the old one is kept; choose one inside, or load a model trained over a '
-        'wider range')
+        '{upper:value}: the previous one is kept; choose one inside, or load a model trained over '
+        'a wider range')
     SETPOINT_NOT_TRIED = 'setpoint_not_tried', (
-        'whether the set-point can be held cannot be calculated ({error}): the old one is kept')
+        'the check whether the set-point can be held failed ({error}): the previous one is kept')
     SETPOINT_NOT_HELD = 'setpoint_not_held', (
-        '{signal} set-point {value:value} cannot be held, since {cause}: the old one is kept; '
-        'the nearest that can be held is {held:values}')
+        '{signal} set-point {value:value} cannot be held, because {cause}: the previous one is '
+        'kept; the nearest that can be held is {held:values}')
     NO_SETPOINT_HELD = 'no_setpoint_held', (
-        '{signal} set-point {value:value} cannot be held, since {cause}, and no other one is '
-        'found that can: the old one is kept; check the range of the inputs')
+        '{signal} set-point {value:value} cannot be held, because {cause}, and no nearby one can: '
+        'the previous one is kept; check the range of the inputs')
     INPUT_NEEDED = 'input_needed', (
-        '{signal} would have to be {value:value}, its range is {lower:value} to {upper:value}')
+        '{signal} would have to be {value:value}, but its range is {lower:value} to {upper:value}')
     STATE_LEAVES = 'state_leaves', (
         '{signal} would go to {value:value}, outside the trained range {lower:value} to '
         '{upper:value}')
+    NOT_PREDICTED = 'not_predicted', (
+        'the model diverges {seconds:.3g} s ahead, before the command acts: check dead_time')
     NO_STEADY_STATE = 'no_steady_state', 'the model has no steady state there'
     SCHEDULE_FULL = 'schedule_full', (
-        '{most} set-points are scheduled already: wait until some have taken effect, or send '
-        'this one with stamp 0')
+        '{most} set-points are already scheduled, the maximum: wait until some have taken effect, '
+        'or send this one with stamp 0')
     NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
         'manual command refused in automatic mode: switch to manual mode first')
     MANUAL_NOT_FINITE = 'manual_not_finite', (
-        'manual {signal} {value:value} is not finite: the old one is kept')
+        'manual {signal} {value:value} is not finite: the previous one is kept')
     EXPERIMENT_BOUNDS = 'experiment_bounds', (
         'the {signal} {value:value} is outside the bounds of the experiment, {lower:value} to '
         '{upper:value}')
     CLOCK_WENT_BACK = 'clock_went_back', 'the stamps of the measurements went back'
     SILENCE = 'silence', 'no newer measurement for more than {timeout:g} s: check sensor and plant'
-    OTHER_PUBLISHER = 'other_publisher', '{nodes} publishes on {topic}, too'
-    ENDED_EARLY = 'ended_early', 'it was ended before the first measurement'
-    CONTROLLER_GONE = 'controller_gone', 'the controller is gone'
+    OTHER_PUBLISHER = 'other_publisher', '{nodes} also publishes on {topic}'
+    ENDED_EARLY = 'ended_early', 'it was stopped before the first measurement'
+    CONTROLLER_GONE = 'controller_gone', 'the controller no longer runs'
     NOT_FOLLOWED = 'not_followed', (
-        'the controller commands {value:value} where {requested:value} is requested: switch it '
-        'to manual mode, and choose levels within its limits')
+        'the controller commands {value:value} instead of the requested {requested:value}: switch '
+        'it to manual mode, and choose levels within its limits')
     NOT_TRACKED = 'not_tracked', (
-        'the controller tracks {value:value} where {requested:value} is requested: choose '
+        'the controller tracks {value:value} instead of the requested {requested:value}: choose '
         'set-points that it can hold')
     IN_MANUAL_MODE = 'in_manual_mode', (
         'the controller is in manual mode: switch it to automatic mode')
     NOTHING_TRACKED = 'nothing_tracked', (
-        'for {timeout:g} s it is not known which set-points are tracked: switch the controller to '
+        'the active set-points have been unknown for {timeout:g} s: switch the controller to '
         'automatic mode, and check sensor and plant')
 
 
@@ -149,7 +152,7 @@ UNMEASURED = (StatusCode.NO_MEASUREMENT, StatusCode.STAMPS_STAND, StatusCode.TWO
 class Reason:
     """A code with its values."""
 
-    code: StatusCode  #: what is the matter
+    code: StatusCode
     #: numbers in the signal's own unit, names, and the reason behind this one as `cause`; `signal`
     #: names the signal whose unit they have
     values: Mapping[str, Value] = field(default_factory=dict)
@@ -171,7 +174,7 @@ LEVELS = {'mpc': 'predictive law', 'sdre': 'learned law', 'linear': 'linear law'
 
 
 def level_words(name: str) -> str:
-    """Return what an operator calls a control level."""
+    """Return the name of a control level for operators."""
     return LEVELS.get(name, name)
 
 

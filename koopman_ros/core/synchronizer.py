@@ -18,7 +18,7 @@ _LONGEST_WAIT = 10  # samples that are completed meanwhile
 
 @dataclass
 class SampleSynchronizer:
-    """What waits to be put together, and what went wrong on the way, by name of the signal."""
+    """The parts that wait for others, and the counts of lost ones, by name of the signal."""
 
     names: Sequence[str]  #: (n,) of the signals, in the order of a sample
     tolerance_ns: int = 0  #: how far stamps of one sample may be apart
@@ -32,7 +32,7 @@ class SampleSynchronizer:
 
     def take(self, stamp_ns: int, values: Mapping[str, float]) -> tuple[int, Array] | None:
         """
-        Take what a message carries; return stamp and sample (n,) when that completes one.
+        Add the values of a message; return stamp and sample (n,) when it completes one.
 
         The stamp of a sample is that of its last part. A part whose stamp is ahead waits for at
         most ten other samples, so that it is never put together with parts of a later time.

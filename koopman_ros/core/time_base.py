@@ -14,11 +14,11 @@ _ROUNDS, _PAUSE = 3.0, 0.2  # times the last round, and s
 
 
 class Advance(Enum):
-    """What a number is in relation to the numbers before it."""
+    """The relation of a number to those before it."""
 
     NEW = 'new'  #: larger than all before it
     OLD = 'old'  #: repeated, or late by less than is tolerated
-    RESTARTED = 'restarted'  #: so much smaller that the count starts again from it
+    RESTARTED = 'restarted'  #: smaller by so far that the count restarts from it
     TWO_SOURCES = 'two sources'  #: one of a count that starts again and again
 
 

@@ -81,38 +81,39 @@ def conversion(unit: str, wanted: str) -> Conversion:
             factor = float((source / target).to('dimensionless').magnitude)
     # its parser fails in many ways, also by assertions
     except Exception as error:
-        why = ' '.join(str(error).split()) or 'one of them is no unit'
+        why = ' '.join(str(error).split()) or 'one of them is not a unit'
         raise ValueError(f'{unit!r} cannot be converted to {wanted!r}: {why}') from error
     return Conversion(factor, offset)
 
 
+@cache
 def check_unit(unit: str) -> None:
-    """Raise ValueError for a unit that there is not."""
+    """Raise ValueError for an unknown unit."""
     if unit in _USUAL:
         return
     if unit == 'pH':
         # the registry takes it for picohenries
-        raise ValueError("'pH' is a number without unit: write 1, and name the signal pH")
+        raise ValueError("'pH' is dimensionless: use the unit 1, and name the signal pH")
     try:
         _check_form(unit)
         _registry().Quantity(1.0, unit)
     # as above
     except Exception as error:
         shown = unit if len(unit) <= _LONGEST else f'{unit[:_LONGEST]}...'
-        raise ValueError(f'there is no unit {shown!r}: write one like K, m/s, L/min or N m, or 1 '
-                         'for none') from error
+        raise ValueError(f'there is no unit {shown!r}: use e.g. K, m/s, L/min or N m, or 1 for '
+                         'dimensionless') from error
 
 
 def _check_form(unit: str) -> None:
     if unit and (len(unit) > _LONGEST or not _UNIT.fullmatch(unit)):
-        raise ValueError(f'{unit[:_LONGEST]!r} is not written as a unit')
+        raise ValueError(f'{unit[:_LONGEST]!r} is not a valid unit expression')
 
 
 def check_time_unit(unit: str) -> None:
-    """Raise ValueError for a time unit that rates are not given in."""
+    """Raise ValueError for an unknown time unit."""
     if unit not in SECONDS_PER_TIME_UNIT:
-        raise ValueError(f"time_unit must be 's' or 'min', got {unit!r}: give times and rates in "
-                         'one of them')
+        raise ValueError(f"time_unit must be 's' or 'min', got {unit!r}: convert times and rates "
+                         'to one of them')
 
 
 def display_unit(unit: str) -> str:

@@ -25,20 +25,21 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
     parser = argparse.ArgumentParser(description=description)
     of = f', of another plant {output}-PLANT' if plant else ''
     parser.add_argument('--output', type=Path,
-                        help=f'folder for the results (default: {output}{of})')
+                        help=f'output folder (default: {output}{of})')
     if plant:
-        parser.add_argument('--plant', default=plant, help='plant that is shipped, by the name '
-                            'of its file in config/plants (default: %(default)s)')
-        parser.add_argument('--panel', action='store_true', help='run until Ctrl-C, with the '
-                            'panel, whose address is printed')
-        parser.add_argument('--port', type=int, default=8080, help='of the panel, 0 for any free '
-                            'one (default: %(default)s)')
+        parser.add_argument('--plant', default=plant,
+                            help='bundled plant: the name of a file in config/plants (default: '
+                                 '%(default)s)')
+        parser.add_argument('--panel', action='store_true',
+                            help='run with the panel until Ctrl-C; the address is printed')
+        parser.add_argument('--port', type=int, default=8080,
+                            help='port of the panel; 0: any free one (default: %(default)s)')
     parser.add_argument('--speed', type=float, default=speed,
-                        help='simulated seconds per second, 0 for as fast as the machine can '
-                        '(default: %(default)s)')
+                        help='simulated seconds per second; 0: as fast as possible (default: '
+                             '%(default)s)')
     if seeds:
         parser.add_argument('--seeds', type=int, default=seeds,
-                            help='runs, each with noise of its own (default: %(default)s)')
+                            help='number of runs with different noise (default: %(default)s)')
     options = parser.parse_args(args)
     if seeds and options.seeds < 1:
         parser.error(f'--seeds is {options.seeds}, must be at least 1')
@@ -54,7 +55,7 @@ def run_demo(demo: Callable[[Path, float], Mapping[str, object]], options: argpa
     try:
         with reserved_output(options.output) as output:
             if output != options.output:
-                print(f'another run writes to {options.output}: this one writes to {output}',
+                print(f'another run is writing to {options.output}: writing to {output}',
                       flush=True)
             result = demo(output, options.speed)
     except (HarnessError, OSError, ValueError) as error:

@@ -37,9 +37,9 @@ _TIMEOUT = 30.0  # s for the processes to find each other, and from one command 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What a closed loop does."""
+    """The setup of a closed loop."""
 
-    #: new set-points, by signal and in its unit; none where somebody else gives them
+    #: new set-points, by signal and in its unit; none if another node publishes them
     setpoints: Mapping[str, float]
     system: str = 'reactor'  #: plant that is shipped
     step_time: float = 60.0  #: when they take effect, in s after the first measurement
@@ -60,7 +60,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Row:
-    """What the operator sees at one command, by signal and in their units."""
+    """The values at one command, by signal and in their units."""
 
     seconds: float  #: plant time since the first measurement
     measured: Mapping[str, float]
@@ -72,7 +72,7 @@ class Operator:
     """
     Operate the loop that `harness` runs: set-points, services and parameters, phase by phase.
 
-    Raises HarnessError where the loop refuses a step, or stands still.
+    Raises HarnessError if the loop rejects a step, or stops.
     """
 
     def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None]
@@ -108,7 +108,7 @@ class Operator:
 
     @property
     def found_loop(self) -> bool:
-        """Whether controller and trainer are there and hear the set-points."""
+        """Whether controller and trainer are running and subscribe to the set-points."""
         return self._commands.published() and self._setpoints is not None and all(
             publisher.get_subscription_count() >= 2 for publisher in self._setpoints.publishers)
 
@@ -118,11 +118,11 @@ class Operator:
         return max(0.0, (self.last_stamp_ns - FIRST_STAMP_NS) / NANOSECONDS)
 
     def run_until(self, seconds: float) -> None:
-        """Let the loop go on until so many seconds of plant time after its first measurement."""
+        """Let the loop run until a plant time in s after its first measurement."""
         end = FIRST_STAMP_NS + seconds * NANOSECONDS
         while self.last_stamp_ns < end:
             self.harness.wait_until(partial(self._answered_after, self.last_stamp_ns),
-                                    'the loop stands still: no command')
+                                    'the loop has stopped: no command was received')
 
     def _answered_after(self, stamp_ns: int) -> bool:
         return self.last_stamp_ns > stamp_ns
@@ -132,13 +132,14 @@ class Operator:
         if self._setpoints is None:
             self._setpoints = SignalPublisher(
                 self._wiring.setpoints, self._wiring.signals.states, self._publisher)
-            self.harness.wait_until(lambda: self.found_loop, 'nobody hears the set-points')
+            self.harness.wait_until(lambda: self.found_loop,
+                                    'no node subscribes to the set-points')
         stamp = FIRST_STAMP_NS + round(seconds * NANOSECONDS)
         wanted = [setpoints[name] for name in self._wiring.setpoints]
         self._setpoints.send(np.array(wanted), stamp_message(stamp), 'operator')
 
     def leave_setpoints(self) -> None:
-        """Leave the set-points to somebody else, until they are requested again."""
+        """Stop publishing the set-points, until they are requested again."""
         for publisher in [] if self._setpoints is None else self._setpoints.publishers:
             self.harness.node.destroy_publisher(publisher)
         self._setpoints = None
@@ -177,7 +178,7 @@ class Operator:
                 raise HarnessError(f'{task}: {status.message}')
             return status if status is not None and status.message.startswith(words) else None
 
-        status = self.harness.wait_until(found, f'the {task} did not end', timeout)
+        status = self.harness.wait_until(found, f'the {task} did not finish', timeout)
         assert status is not None
         return status
 
@@ -207,10 +208,10 @@ def _check(service: str, response: SetBool.Response | Trigger.Response) -> None:
 
 def foreign(harness: Harness, wiring: SignalTopics) -> str:
     """
-    Say which other nodes of the domain are in the way of a loop that has not started, or ''.
+    Return which other nodes of the domain conflict with a loop that has not started, or ''.
 
     These are nodes of the names that the loop uses, publishers of its topics, and subscribers of
-    its commands but for `ros2 topic echo` and the like.
+    its commands except tools such as `ros2 topic echo`.
     """
     node, deadline = harness.node, time.monotonic() + _DISCOVERY
     while time.monotonic() < deadline:
@@ -242,12 +243,12 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     The ROS domain is that of ROS_DOMAIN_ID, where it is set, or else one that no other run uses.
     To be called from the main thread: it takes over Ctrl-C, so that the processes end.
 
-    :param logs: folder for what the processes print.
+    :param logs: folder for the output of the processes.
     :param trainer: parameters of the trainer, which records from its start.
     :param on_row: called at every command.
     :param panel: parameters of a panel, None for no panel.
     :raises HarnessError: when other nodes of the domain use the loop's topics or names, before
-        anything is commanded; when a process ends early or the loop stands still.
+        anything is commanded; when a process ends early or the loop stops.
     """
     with (deferred_interrupt() as check_interrupt,
           Harness(logs, name='operator', timeout=_TIMEOUT, lasting=True,
@@ -258,13 +259,13 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
         if found := foreign(harness, scenario.wiring):
             raise HarnessError(
                 f'ROS domain {domain} has other nodes with the names or topics of the demo: '
-                f'{found}; end them, or start in another domain: '
+                f'{found}; stop them, or use another domain: '
                 f'ROS_DOMAIN_ID={(int(domain) + 1) % 102} make demo')
         operator = Operator(scenario, harness, on_row)
         harness.start('controller', {'system': scenario.system, **scenario.controller})
         harness.start('trainer', {'system': scenario.system, **trainer})
         harness.wait_until(lambda: operator.found_loop,
-                           'controller and trainer did not find each other')
+                           'controller and trainer did not discover each other')
         if panel is not None:
             shown = harness.start('panel', {'system': scenario.system, **panel})
             address = harness.wait_until(lambda: re.search(r'the panel is at (\S+)',

@@ -67,7 +67,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
                                 speed=speed, plant={'temperature.measurement_noise': NOISE})
     bags = [output / 'before.mcap', output / 'after.mcap']
     new_model = output / 'retrained.safetensors'
-    table = LiveTable('retraining of a controller without observer',
+    table = LiveTable('retraining with the disturbance observer off',
                       scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
     with running_loop(scenario, logs, trainer, table.show) as operator:
@@ -114,11 +114,11 @@ def rollout_rmse(model: LiftedModel) -> float:
 
 def _operate(operator: Operator, second_bag: Path, new_model: Path) -> list[tuple[str, float]]:
     """Run all phases; return name and start, in s of plant time, of each phase."""
-    operator.begin('shipped lift', 'set-point step of -10 K with the shipped lift')
+    operator.begin('shipped lift', 'set-point step of -10 K with the bundled model')
     operator.run_until(_DRIFT_TIME)
     operator.set('plant', **{'constants.heat_transfer_coefficient': (
         FOULING * reactor.constant('heat_transfer_coefficient'))})
-    operator.begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
+    operator.begin('fouling', 'the cooling jacket fouls: heat transfer falls by a fifth')
     # a new bag, so that the plant as it was is not among the data
     operator.record_again(second_bag)
     operator.run_until(_EXPERIMENT_TIME)
@@ -128,10 +128,10 @@ def _operate(operator: Operator, second_bag: Path, new_model: Path) -> list[tupl
     operator.wait_for('experiment', 'finished', _EXPERIMENT_TIMEOUT)
     operator.switch('trainer/experiment', False)
     operator.switch('controller/set_automatic', True)
-    operator.begin('training', 'automatic mode again; a lift is learned from the recording')
+    operator.begin('training', 'automatic mode; training a model on the recording')
     operator.train(new_model, _TRAINING_TIMEOUT)
     operator.set('controller', model=str(new_model.resolve()))
-    operator.begin('new lift', 'the controller has taken the new lift over')
+    operator.begin('new lift', 'the new model is active')
     operator.run_until(operator.phases[-1][1] + _AFTER)
     return operator.phases
 
@@ -153,8 +153,9 @@ def _draw(path: Path, history: DemoRun, phases: list[tuple[str, float]], setpoin
                 upper.axhline(to_celsius(float(bound)), **{**LIMIT, 'linestyle': style},
                               label=f'training range of the {name}' if i == 0 else None)
         draw_phases((upper, middle, lower), phases)
-        upper.set(ylabel='reactor temperature [°C]', title='The plant drifts and is recorded, and '
-                  'its controller is retrained (disturbance observer off)')
+        upper.set(ylabel='reactor temperature [°C]', title=(
+            'The plant changes, and the model is retrained on recorded data (disturbance observer '
+            'off)'))
         upper.legend(loc='lower right', ncols=2, fontsize=8)
         draw_limits(middle, reactor.coolant_limits(), 'coolant limits')
         middle.step(history.command_seconds / 60.0,
@@ -163,8 +164,8 @@ def _draw(path: Path, history: DemoRun, phases: list[tuple[str, float]], setpoin
         middle.set_ylabel('coolant [°C]')
         middle.legend(loc='upper right', fontsize=8)
         lower.semilogy(minutes[30:30 + len(smooth)], np.maximum(np.abs(smooth), 1e-4),
-                       color='tab:red', linewidth=1.0, label='mean over a minute')
-        lower.set(ylabel='size of the error [K]', xlabel='plant time [min]',
+                       color='tab:red', linewidth=1.0, label='mean over one minute')
+        lower.set(ylabel='absolute error [K]', xlabel='plant time [min]',
                   xlim=(0.0, float(minutes[-1])))
         lower.legend(loc='lower left', fontsize=8)
 

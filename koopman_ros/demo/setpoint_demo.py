@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The demo: a learned controller moves a plant to a set-point, beside the linear law and the optimum.
+The demo: a learned controller moves a plant to a set-point; linear law and optimum compared.
 
-The section `demo` of the plant's parameter file says what happens. The controller runs as a
+The section `demo` of the plant's parameter file defines the scenario. The controller runs as a
 process in the loop; the linear law and the optimum are computed on the plant's equations.
 """
 
@@ -55,7 +55,7 @@ class _StateParameters:
 
     initial_offset: float = parameter(0.0, 'initial distance from the steady state', '{unit}')
     setpoint: float = parameter(0.0, 'new set-point of a controlled state', '{shown}')
-    tolerance: float = parameter(0.0, 'error within which it has settled', '{unit}')
+    tolerance: float = parameter(0.0, 'error below which the state has settled', '{unit}')
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class _Parameters:
     """The course of a demo."""
 
     step_time: float = parameter(0.0, 'time of the set-point step', 's')
-    duration: float = parameter(600.0, 'length of the run', 's')
+    duration: float = parameter(600.0, 'duration of the run', 's')
     observer: bool = parameter(True, 'whether the controller estimates disturbances')
     states: Mapping[str, _StateParameters] = per_signal(_StateParameters)
 
@@ -73,7 +73,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     begin = time.monotonic()
     wiring = preset_wiring(name)
     if wiring is None or 'duration' not in (own := plant_defaults(name, 'demo')):
-        raise ValueError(f'there is no demo of {name!r}: choose one of '
+        raise ValueError(f'no demo for the plant {name!r}: choose one of '
                          f'{", ".join(bundled_plants())}')
     signals = wiring.signals
     plan = ParameterTable(_Parameters, signals={'states': signals.states}, defaults=own
@@ -188,7 +188,7 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
 def run_with_panel(plant: str, port: int, output: Path, speed: float) -> dict[str, object]:
     """Run the loop of a plant until Ctrl-C, with the panel."""
     if preset_wiring(plant) is None:
-        raise ValueError(f'there is no demo of {plant!r}: choose one of '
+        raise ValueError(f'no demo for the plant {plant!r}: choose one of '
                          f'{", ".join(bundled_plants())}')
     logs = output / 'logs'
     logs.mkdir(parents=True, exist_ok=True)

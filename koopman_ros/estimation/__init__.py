@@ -4,6 +4,7 @@
 """Estimation of state and disturbance from measurements."""
 
 from koopman_ros.estimation.base import Estimate, Estimator, Innovation
+from koopman_ros.estimation.dead_time import AppliedInputs, largest_bandwidth, PendingInputs
 from koopman_ros.estimation.disturbance_observer import (
     DisturbanceObserver,
     equivalent_bias,
@@ -20,6 +21,7 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
     'unscented_kalman_filter': UnscentedKalmanFilter,
 }
 
-__all__ = ['ESTIMATORS', 'Accepted', 'DisturbanceObserver', 'Estimate', 'Estimator',
-           'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'Standstill',
-           'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias']
+__all__ = ['ESTIMATORS', 'Accepted', 'AppliedInputs', 'DisturbanceObserver', 'Estimate',
+           'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'PendingInputs',
+           'Standstill', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias',
+           'largest_bandwidth']

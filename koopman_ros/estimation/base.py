@@ -69,7 +69,7 @@ class Estimate:
     w: Array  #: (n_x,) disturbance of its rate, taken as constant
     #: (2 n_x, 2 n_x) of the errors of both, or None where it is not known, or as at first
     covariance: Array | None = None
-    innovation: Innovation | None = None  #: of the last measurement, or None likewise
+    innovation: Innovation | None = None  #: of the last measurement, or None
 
     @property
     def finite(self) -> bool:
@@ -78,12 +78,12 @@ class Estimate:
             self.covariance is None or np.isfinite(self.covariance).all()))
 
     def check(self, n_x: int) -> None:
-        """Raise a TypeError or ValueError unless it is one of so many states, and finite."""
+        """Raise a TypeError or ValueError unless it has n_x states and is finite."""
         P = self.covariance
         shapes = (np.shape(self.x), np.shape(self.w), None if P is None else np.shape(P))
         if shapes not in (((n_x,), (n_x,), None), ((n_x,), (n_x,), (2 * n_x, 2 * n_x))):
-            raise ValueError(f'the estimator returned x, w and covariance of shapes {shapes} for '
-                             f'{n_x} states')
+            raise ValueError(f'the estimator returned x, w and covariance with shapes {shapes} '
+                             f'for {n_x} states')
         if not isinstance(self.innovation, Innovation | None):
             raise TypeError(f'the estimator returned {type(self.innovation).__name__} as the '
                             'innovation')
@@ -111,7 +111,7 @@ class Estimator(ABC):
         Prepare the estimator; a ValueError refuses the configuration.
 
         :param model: whose drift predicts.
-        :param outputs: what is measured of the state.
+        :param outputs: the measured outputs.
         :param tuning: with one number for each signal of the model.
         :param parameters: its own, of the class :attr:`Parameters`.
         """

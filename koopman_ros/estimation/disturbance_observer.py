@@ -40,9 +40,9 @@ class DisturbanceObserver(Estimator):
     """
     Two equal poles for each state, set by `observer_bandwidth`; every state is measured.
 
-    With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
-    prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
-    p where the model's own motion within a sample is small.
+    With p = exp(-bandwidth dt) the state takes 1 - p^2 of the difference between a measurement and
+    its prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error
+    at p where the model's own motion within a sample is small.
 
     :raises ValueError: where the outputs leave a state open.
     """
@@ -51,9 +51,9 @@ class DisturbanceObserver(Estimator):
                  ) -> None:
         super().__init__(model, outputs, tuning, parameters)
         if not outputs.determine_state:
-            raise ValueError(f'{", ".join(outputs.names)}, measured, do not determine all '
-                             f'{model.n_x} states: measure as many, or take a Kalman filter as '
-                             'the estimator')
+            raise ValueError(f'{", ".join(outputs.names)} are measured, which does not determine '
+                             f'all {model.n_x} states: measure as many, or set estimator to a '
+                             'Kalman filter')
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model under input and disturbance."""
@@ -98,8 +98,8 @@ def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
     """
     Return the error of the measurement that would explain a disturbance just as well.
 
-    One measured state cannot tell a biased sensor from a changed plant. Solves
-    f(x - bias) = f(x) + w; what comes out is NaN where the drift does not reach that far.
+    With one measured state, a biased sensor and a changed plant cannot be distinguished. Solves
+    f(x - bias) = f(x) + w; the result is NaN where the equation has no solution.
 
     :return: (n_x,) in scaled deviations.
     """

@@ -15,6 +15,7 @@ from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import SECONDS_PER_MINUTE
 from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW, LOST
+from koopman_ros.estimation.dead_time import largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -54,10 +55,20 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
     disturbance_noise = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
         max(slowest, 1.0 / _LONGEST))
-    noise, disturbance_noise, error = (
+    noise = np.where(tuning.measurement_noise > 0.0, tuning.measurement_noise, np.where(
+        recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half))
+    dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
+    if dead_time > 0.0:
+        # at one sample a second the bandwidth of a filter is the root of the ratio between the
+        # rate of an output that a disturbance causes and the output's noise
+        rates = np.abs(outputs.C * model.states.scale @ model.B) / (
+            model.inputs.scale * model.seconds_per_time_unit)
+        with np.errstate(divide='ignore'):
+            disturbance_noise = np.minimum(
+                disturbance_noise, largest_bandwidth(dead_time, slowest) ** 2 * np.min(
+                    noise[:, None] / rates, axis=0))
+    disturbance_noise, error = (
         np.where(own > 0.0, own, default) for own, default in (
-            (tuning.measurement_noise, np.where(
-                recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half)),
             (tuning.disturbance_noise / math.sqrt(SECONDS_PER_MINUTE), disturbance_noise),
             (tuning.initial_error, _GUESS * half)))
     return noise, disturbance_noise / model.inputs.scale, error / model.states.scale
@@ -68,10 +79,10 @@ class ExtendedKalmanFilter(Estimator):
     The extended Kalman filter of state and disturbance: dx/dt = f(x) + B u + w, y = C x + noise.
 
     There is one disturbance for each output, a random walk: where there are as many inputs, it
-    acts like a change of them, otherwise on the outputs' own rates. It is what leaves no offset
-    (G. Pannocchia, J. B. Rawlings, AIChE J. 49 (2003)). Prediction is by Runge-Kutta steps with
-    their variational equations, correction in the form of Joseph. See A. H. Jazwinski,
-    *Stochastic Processes and Filtering Theory* (1970), section 8.3.
+    acts like a change of them, otherwise on the outputs' own rates. It removes the offset (G.
+    Pannocchia, J. B. Rawlings, AIChE J. 49 (2003)). Prediction is by Runge-Kutta steps with their
+    variational equations, correction in the form of Joseph. See A. H. Jazwinski, *Stochastic
+    Processes and Filtering Theory* (1970), section 8.3.
 
     :raises ValueError: where the outputs leave states or disturbances open.
     """
@@ -108,12 +119,12 @@ class ExtendedKalmanFilter(Estimator):
             if self._determined(found):
                 return found
         names = ', '.join(self.outputs.names)
-        raise ValueError(f'{names}, measured, do not determine the states '
+        raise ValueError(f'the measurements of {names} do not determine the states '
                          f'{", ".join(model.states.names)} and a disturbance for each: measure '
                          'another signal')
 
     def _determined(self, directions: Array) -> bool:
-        """Tell whether outputs show all modes that do not decay, and each disturbance."""
+        """Whether the outputs determine all modes that do not decay, and each disturbance."""
         n, H = self.model.n_x, self._H
         n_d = directions.shape[1]
         A = np.zeros((n + n_d, n + n_d))
@@ -166,7 +177,7 @@ class ExtendedKalmanFilter(Estimator):
 
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:
-        """Return state and covariance after so many steps of h, in time units."""
+        """Return state and covariance after a number of steps of h, in time units."""
         model = self.model
         n = model.n_x
         forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
@@ -232,7 +243,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
 
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:
-        """Return mean and covariance of points that are moved so many steps of h."""
+        """Return mean and covariance of points after a number of steps of h."""
         model, n = self.model, self.model.n_x
         values, vectors = np.linalg.eigh(P)
         size = int(np.count_nonzero(values > _NO_VARIANCE * values[-1]))

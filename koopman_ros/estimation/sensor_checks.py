@@ -53,7 +53,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     """
     Accept or reject a measurement (n_y,), in the signals' units.
 
-    :param last: what is remembered, or None before the first.
+    :param last: the last accepted measurement, or None before the first.
     :param time_ns: its stamp, later than those before.
     :param w: (n_x,) disturbance that is estimated now.
     :param travel: predicts how far (n_y,) the signals have moved since the last measurement,

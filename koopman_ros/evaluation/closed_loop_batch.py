@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Closed loops of several laws side by side on a drift, and what each of them costs."""
+"""Closed loops of several laws side by side on a drift, and the cost of each."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Rate = Callable[[Array, Array], Array]
 # inputs (M, n_u) of states (M, n_x), as far as these are active; NaN where there is none
 _Feedback = Callable[[Array, NDArray[np.bool_]], Array]
 
-#: A law fails where it costs more than so many times as much as with a perfect model.
+#: A law fails if its cost exceeds that with a perfect model by more than this factor.
 MOST_EXCESS = 1.05
 
 # A loop has arrived when it ends this close to the set-point, in units of the scale.
@@ -43,7 +43,7 @@ _DIFFERENCE = 1e-5  # step of a difference quotient, in scaled deviations
 
 @dataclass(frozen=True)
 class LoopBatch:
-    """What all loops have in common."""
+    """The common settings of all loops."""
 
     plant: DriftPlant
     tuning: Tuning
@@ -63,7 +63,7 @@ class LoopBatch:
         return replace(self, tuning=replace(self.tuning, limits=limits))
 
     def laws(self, targets: Array, inputs: Array) -> tuple[_Feedback, ...]:
-        """Return the law, the averaged one that knows the plant, and two linear ones."""
+        """Return the law, the averaged one for the true plant, and two linear ones."""
         model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
         own = self.law(model, self.tuning, self.law.Parameters())
         return (_called(own, targets, inputs, seconds), _informed(self, targets, inputs),
@@ -76,8 +76,9 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
     """
     Run some of the loops; None where `tell` ended them.
 
-    :return: of each the cost of the law, that beside the better of two linear laws, whether it had
-        no gain, its cost beside that of a perfect model, and whether no law arrives.
+    :return: for each loop the cost of the law, its ratio to that of the better of two linear laws,
+        whether the law had no gain, its ratio to that of a perfect model, and whether no law
+        reaches the set-point.
     """
     starts, targets, inputs = cases
     limits, m = given.tuning.limits, given.plant.model.n_u
@@ -178,7 +179,7 @@ def _called(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Feedb
 
 
 def _constant(law: Linear, setpoints: Array, inputs: Array, seconds: float) -> _Feedback:
-    """Return the inputs of a law with one gain, which is read off what it does without limits."""
+    """Return the inputs of a law with one gain, identified from its inputs without limits."""
     model, limits, n = law.model, law.tuning.limits, setpoints.shape[1]
     endless = np.full(model.n_u, np.inf)
     free = Linear(model, replace(law.tuning, limits=InputLimits(-endless, endless, endless)), None)
@@ -193,7 +194,7 @@ def _constant(law: Linear, setpoints: Array, inputs: Array, seconds: float) -> _
 
 
 def _narrowed(limits: InputLimits) -> InputLimits:
-    """Leave out what a perfect model makes of the last of the range: others cannot be as sure."""
+    """Reduce the range for a perfect model: others cannot be as certain."""
     bounded = np.isfinite(limits.lower) & np.isfinite(limits.upper)
     margin = np.zeros(len(bounded))
     margin[bounded] = _KEPT * (limits.upper - limits.lower)[bounded]
@@ -201,7 +202,7 @@ def _narrowed(limits: InputLimits) -> InputLimits:
 
 
 def _informed(given: LoopBatch, setpoints: Array, inputs: Array) -> _Feedback:
-    """Return the averaged law that knows the plant: no better model of it has a better one."""
+    """Return the averaged law for the true plant: no better model gives a better law."""
     plant, tuning, weights = given.plant, given.tuning, given.weights
 
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
@@ -229,8 +230,8 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
     """
     Run M loops under each of F laws; None where `watch` ended it.
 
-    :return: costs (F, M), infinite where a loop does not arrive, and whether (M,) the first law
-        had no gain on the way.
+    :return: costs (F, M), infinite where a loop does not reach the set-point, and whether (M,) the
+        first law had no gain on the way.
     """
     plant, weights, samples = given.plant, given.weights, given.samples
     starts, setpoints, inputs = cases

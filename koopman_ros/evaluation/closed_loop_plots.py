@@ -35,23 +35,24 @@ def plot_law_check(check: ClosedLoopTest, path: Path) -> Path:
         for i, axes in enumerate(panels):
             draw_loops(axes, check, i)
         legend(figure, panels, min(n, 2))
-        figure.suptitle(f'{check.loops} closed loops over the box:\nthe model is '
+        figure.suptitle(f'{check.loops} closed loops:\nthe model is '
                         f'{"accepted" if check.accepted else "refused"} as a controller')
     return path
 
 
 def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
-    """Draw where each loop began and was to end in state i, and what became of it there."""
+    """Draw start and set-point of each loop in state i, with its outcome."""
     states, failed = check.states, check.failed
     name, unit = states.names[i].replace('_', ' '), states.units[i]
     low, high = shown(states.lower[i], unit), shown(states.upper[i], unit)
     axes.axvspan(low, high, **DRAWN_RANGE)
     kinds: tuple[tuple[NDArray[np.bool_], str, dict[str, Any]], ...] = (
-        (~check.poor & ~failed, f'arrives at up to {MOST_COST:g} times the cost of a linear law',
+        (~check.poor & ~failed, f'reaches the set-point at up to {MOST_COST:g} times the cost of '
+                                'a linear law',
          {'color': '0.45', 'marker': '.'}),
-        (check.poor & ~failed, 'does not, nor would it with a perfect model',
+        (check.poor & ~failed, 'does not; a perfect model would not either',
          {'facecolors': 'none', 'edgecolors': 'tab:blue', 'marker': 'o'}),
-        (failed, 'would cost clearly less, or arrive, with a perfect model',
+        (failed, 'would cost clearly less, or reach the set-point, with a perfect model',
          {'color': 'tab:red', 'marker': 'x'}))
     for chosen, label, style in kinds:
         if chosen.any():

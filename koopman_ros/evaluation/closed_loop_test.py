@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Closed loops all over a model's training box, by which its law is judged beside others."""
+"""Closed loops where a model's data are, in which its law is compared with others."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from koopman_ros.tuning import InputLimits, Tuning
 
 #: Closed loops that a law is judged by.
 LOOPS = 128
-#: A law is poor that costs more than so many times as much as a linear one.
+#: A law is poor if its cost exceeds that of a linear one by more than this factor.
 MOST_COST = 1.1
 #: Share of the closed loops that may fail.
 MOST_FAILURES = 0.01
@@ -48,6 +48,8 @@ _MOST_CALLS = 150 * LOOPS
 _FEWEST_LOOPS = 16
 # Loops that are run side by side, the same ones wherever that is: sums depend on how many.
 _PART = 32
+# Share of the steady states that are set-points although none is where the data are.
+_NEAREST = 0.1
 # Attempts for each set-point.
 _ATTEMPTS = 4
 _NEWTON_STEPS = 30
@@ -60,7 +62,7 @@ _RESOLUTION = 1e-9  # what is left of a step, in scaled deviations
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopTest:
-    """N closed loops under a model's law from states to set-points within its training box."""
+    """N closed loops under a model's law from states to set-points where its data are."""
 
     states: Coordinates  #: names and units
     starts: Array  #: (N, n_x) where they began, in state units
@@ -79,17 +81,17 @@ class ClosedLoopTest:
 
     @property
     def poor(self) -> NDArray[np.bool_]:
-        """Tell which (N,) had no gain, did not arrive, or cost over 1.1 times a linear law."""
+        """Whether each loop (N,) had no gain, no arrival, or over 1.1 times a linear cost."""
         return np.asarray(~(self.ratios <= MOST_COST))
 
     @property
     def failed(self) -> NDArray[np.bool_]:
-        """Tell in which (N,) a perfect model would do clearly better, by 1.05 in the cost."""
+        """Whether in each loop (N,) a perfect model would cost clearly less, by 1.05."""
         return np.asarray(~(self.excess <= MOST_EXCESS))
 
     @property
     def lost(self) -> NDArray[np.bool_]:
-        """Tell which (N,) had no gain or did not arrive, where a linear law does."""
+        """Whether each loop (N,) had no gain or failed to reach it, where a linear law does."""
         return np.isinf(self.ratios)
 
     @property
@@ -134,10 +136,10 @@ class ClosedLoopTest:
 
     @property
     def region(self) -> str:
-        """Say in which ranges the failed loops began and were to end; empty where none failed."""
+        """Return the ranges of starts and set-points of failed loops; empty where none failed."""
         failed = self.failed
         return '' if not failed.any() else (
-            f'begun at {self._ranges(self.starts[failed])} and bound for '
+            f'from {self._ranges(self.starts[failed])} to set-points '
             f'{self._ranges(self.setpoints[failed])}')
 
     def _ranges(self, x: Array) -> str:
@@ -150,22 +152,26 @@ class ClosedLoopTest:
                                         strict=True))
 
     def __str__(self) -> str:
-        """Say in one clause how many loops failed, how, and where."""
+        """Return in one clause how many loops failed, how, and where."""
         if not self.loops:
-            return (f'no law arrives in any of {self.hopeless} closed loops over the box, linear '
-                    'ones included')
-        text = f'the law fails in {np.sum(self.failed)} of {self.loops} closed loops over the box'
+            return ('no law, not even a linear one, reaches the set-point in any of '
+                    f'{self.hopeless} closed loops' if self.hopeless else
+                    'no closed loop could be tried: no steady state within the limits of the '
+                    'inputs is far enough from the starts; record several steady states, or '
+                    'widen the limits')
+        text = f'the law fails in {np.sum(self.failed)} of {self.loops} closed loops'
         if not self.failed.any():
             sound = self.ratios[~self.poor]
             worst = float(np.max(sound)) if len(sound) else math.nan
             rest = '' if not self.poor.any() else (
-                f', but for {np.sum(self.poor)} in which it would with a perfect model, too')
-            return f'{text}, costing at most {worst:.3g} times as much as a linear one{rest}'
+                f', except in {np.sum(self.poor)} loops that are costly with a perfect model as '
+                'well')
+            return f'{text}; its cost is at most {worst:.3g} times that of a linear law{rest}'
         failed, lost = self.failed, np.isinf(self.excess)
         counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
-                  (int(np.sum(failed & lost & ~self.no_gain)), 'not arriving'),
+                  (int(np.sum(failed & lost & ~self.no_gain)), 'without reaching the set-point'),
                   (int(np.sum(failed & ~lost)),
-                   f'costing over {MOST_EXCESS:g} times as much as with a perfect model'))
+                   f'at over {MOST_EXCESS:g} times the cost with a perfect model'))
         return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
 
     def __repr__(self) -> str:
@@ -179,7 +185,7 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
                           loops: int = LOOPS, watch: Callable[[float], bool] = lambda _: False,
                           backend: Backend | None = None) -> ClosedLoopTest | None:
     """
-    Let a model's law control a drift that the model was not learned from, all over its box.
+    Let a model's law control a drift that the model was not learned from, where the data are.
 
     It fails where it costs more than 1.05 times as much as the averaged law that knows that drift,
     or does not arrive though that one does, with four fifths of the inputs' range, too: then a
@@ -187,11 +193,13 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     times the better of two linear laws without failing so, it is poor by itself, and no model
     would help.
 
-    Starts fill the box evenly, and set-points that part of it where the data are (a scrambled
-    Sobol sequence of fixed seed); the latter are steady states of that drift, which an input
-    within its limits holds. All laws get the input that does: what a disturbance observer finds at
-    rest. Inputs are held from sample to sample. Where no law arrives
-    within the limits, they run again without: what is far from the data the limits must not hide.
+    Starts and set-points are where the data are, within the distance that training states have
+    from each other (a scrambled Sobol sequence of fixed seed); if these are not known, they fill
+    the box. Set-points are steady states of that drift, held by an input within its limits; if
+    none is among the data, the nearest ones are taken. All laws get that input, as from a
+    disturbance observer at rest. Inputs are held from sample to sample. Where no law reaches the
+    set-point within the limits, they run again without: the limits must not hide a model that is
+    wrong far from the data.
 
     :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
         and per time unit of the model; affine in the input.
@@ -206,7 +214,7 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     :raises ValueError: for a model without inputs.
     """
     if model.n_u == 0:
-        raise ValueError('a plant without inputs has no closed loop')
+        raise ValueError('a plant without inputs cannot be controlled')
     tuning = tuning or Tuning.for_model(model, max_gain=_LARGEST_GAIN)
     limits = limits or tuning.limits
     plant = DriftPlant(model, rate)
@@ -264,19 +272,24 @@ def _cases(plant: DriftPlant, limits: InputLimits, loops: int) -> tuple[Array, A
     model = plant.model
     n, m = model.n_x, model.n_u
     points = qmc.Sobol(2 * n + m, seed=0).random_base2(math.ceil(math.log2(_ATTEMPTS * loops)))
-    starts = _between(model.states, points[:loops, :n])
-    numbers = np.random.default_rng(0).permutation(len(points))
-    anchors = _within_data(model, points[:, n:2 * n], numbers)
+    rng = np.random.default_rng(0)
+    anchors, starts = (_within_data(model, part, rng.permutation(len(points)))
+                       for part in (points[:, n:2 * n], points[:, :n]))
     # the nominal point, too, lest there be none
     x, v = _steady(plant, np.vstack([np.zeros(n), anchors]),
                    np.vstack([np.zeros(m), _between(model.inputs, points[:, 2 * n:])]))
-    u, physical = model.inputs.to_physical(v), model.states.to_physical(x)
+    u = model.inputs.to_physical(v)
     slack = _RESOLUTION * model.inputs.scale
     held = ((u >= limits.lower - slack) & (u <= limits.upper + slack)).all(axis=1)
-    held &= np.array([model.distance(row) <= _RESOLUTION for row in physical])
     x, v = x[held], v[held]
+    distance = model.distances(x)
+    near = distance <= _RESOLUTION
+    if len(x) and not near.any():
+        # a plant that never rested in the record: at the steady states nearest to it
+        near = distance <= np.quantile(distance, _NEAREST)
+    x, v = x[near], v[near]
     chosen: list[tuple[int, int]] = []
-    for k, start in enumerate(starts):
+    for k, start in enumerate(starts[:loops]):
         apart = np.flatnonzero(np.max(np.abs(x - start), axis=1, initial=0.0) >= _APART)
         if len(apart):
             # each set-point in its turn

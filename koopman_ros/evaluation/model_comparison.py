@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What was measured lately, and how well models predict it: a check before one takes over."""
+"""Recent measurements, and how well models predict them: a check before a model is activated."""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import itertools
 
 import numpy as np
@@ -35,8 +35,8 @@ class MeasurementBuffer:
     """
     The last measurements of all states and the inputs that acted between them.
 
-    It costs the same for each sample, and no more memory however many there are: of rows closer
-    than a hundredth of what is to be remembered some are left out, their inputs averaged.
+    It costs the same for each sample, and no more memory however many there are: rows closer than
+    a hundredth of the history are thinned, their inputs averaged.
     """
 
     def __init__(self) -> None:
@@ -47,9 +47,9 @@ class MeasurementBuffer:
     def add(self, event: Measurement, report: MeasurementReport, command: Array | None,
             seconds: float) -> None:
         """
-        Take a measurement of all states into account; one that is older begins anew.
+        Take a measurement of all states into account; one that is older restarts the history.
 
-        :param report: what became of it.
+        :param report: its outcome.
         :param command: (n_u,) in force before it, or None; where the input is measured, that
             counts.
         :param seconds: how much is to be remembered.
@@ -73,7 +73,7 @@ class MeasurementBuffer:
         self._row_ns, self._impulse = event.stamp_ns, 0.0
 
     def windows(self, seconds: float) -> PredictionWindows | None:
-        """Cut what is younger into windows, or return None where it is too little for one."""
+        """Cut the younger part into windows, or return None where it is too short for one."""
         oldest = self._time_ns - round(seconds * NANOSECONDS)
         # where measurements are that rare, they are all there is
         count = max(_LEAST_STEPS + 1, sum(row[0] >= oldest for row in self._rows))
@@ -97,7 +97,7 @@ class PredictionWindows:
     """N measurements in M windows of K steps each."""
 
     x: Array  #: (N, n_y) measured, in units
-    u: Array  #: (N - 1, n_u) inputs held between them, in units
+    u: Array  #: (N - 1, n_u) inputs applied between them, in units
     steps: Array  #: (N - 1,) time between them, in s
     places: NDArray[np.intp]  #: (M, K) which steps are in a window
 
@@ -112,15 +112,32 @@ class PredictionWindows:
         x = self.x[self.places]
         return rms(np.mean(np.square(x - x.mean(axis=1, keepdims=True)), axis=1))
 
+    def delayed(self, dead_time: Array) -> PredictionWindows:
+        """
+        Return the windows with the inputs that acted, each (n_u,) seconds after its application.
+
+        The first one is taken to have been applied before, too.
+        """
+        if not dead_time.any():
+            return self
+        times = np.concatenate(([0.0], np.cumsum(self.steps)))
+        impulse = np.vstack((np.zeros_like(self.u[:1]), np.cumsum(
+            self.u * self.steps[:, None], axis=0)))
+        acted = np.column_stack([
+            np.diff(np.interp(times - dead, np.append(-dead, times),
+                              np.append(-dead * first, column))) / self.steps
+            for dead, first, column in zip(dead_time.tolist(), self.u[0], impulse.T, strict=True)])
+        return replace(self, u=acted)
+
     def squares(self, model: LiftedModel, size: Array) -> Array:
         """
         Return the mean squared errors (M, n_x) with which a model predicts, in units squared.
 
         Start and a constant disturbance of each window are those that suit the model best: a
         measured start would bring its noise into the prediction, and whatever is constant an
-        observer makes up for. The drift is linearised at what was measured, which makes that one
-        linear fit and holds near it; far from it the error is large either way. What is not
-        finite has an infinite error.
+        observer makes up for. The drift is linearised at the measurements, which makes that one
+        linear fit and is valid near them; far from it the error is large either way. A prediction
+        that is not finite has an infinite error.
 
         :param size: (n_x,) in which errors of the states are weighed, in units.
         """
@@ -161,7 +178,7 @@ class PredictionWindows:
 
 def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
     """
-    Return the mean squared errors (., n_y) of predicting windows from what is known before them.
+    Return the mean squared errors (., n_y) of predicting windows from the data before them.
 
     Those of the later half, and the last one: before that, states that are not measured are not
     known yet. Infinite where the model is lost.
@@ -201,7 +218,7 @@ def rms(squares: Array) -> Array:
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """How well two models predict what was measured lately."""
+    """How well two models predict recent measurements."""
 
     seconds: float  #: how long that was
     present: Array  #: (n_x,) root mean square error of the model in force, in units
@@ -211,7 +228,7 @@ class ModelComparison:
 
     @property
     def allowance(self) -> Array:
-        """What the candidate's errors (n_x,) are measured by, in units."""
+        """The scale of the candidate's errors (n_x,), in units."""
         return np.asarray(np.maximum(self.present, self.negligible))
 
     @property
@@ -221,7 +238,7 @@ class ModelComparison:
 
     @property
     def tells(self) -> bool:
-        """Whether something moved, and as the present model says."""
+        """Whether a signal moved, and as the current model predicts."""
         return bool(np.any((self.motion > self.negligible) & (self.present < 0.5 * self.motion)))
 
 
@@ -230,15 +247,16 @@ def compare(present: Controller, candidate: Controller,
     """
     Let the models of two controllers predict; None where the present one never can.
 
-    Where not every state is measured they go on from what their filters know.
+    Where not every state is measured they start from the estimates of their filters.
     """
     box, motion = present.model.states, windows.motion
     negligible = np.maximum(_SHARE_OF_MOTION * motion, _SHARE_OF_BOX * (
         np.abs(present.measured.C) @ (box.upper - box.lower)))
     whole = present.measured.all_states and candidate.measured.all_states
     with np.errstate(all='ignore'):
-        own, new = (windows.squares(one.model, negligible) if whole else _predicted(one, windows)
-                    for one in (present, candidate))
+        own, new = (acted.squares(one.model, negligible) if whole else _predicted(one, acted)
+                    for one in (present, candidate)
+                    for acted in (windows.delayed(one.tuning.dead_times(one.model)),))
     known = np.isfinite(own).all(axis=1)
     if not known.any():
         return None

@@ -35,7 +35,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class OptimalTrajectory:
-    """What a plant did in a task."""
+    """The trajectory of a plant in a task."""
 
     states: Array  #: (samples + 1, n_x)
     inputs: Array  #: (samples, n_u), each held for a period
@@ -44,7 +44,7 @@ class OptimalTrajectory:
 
 def cost_along(task: Task, states: Array, inputs: Array) -> float:
     """
-    Return the cost of what a controller did: states (N + 1 or N, n_x) and inputs (N, n_u) held.
+    Return the cost of a trajectory: states (N + 1 or N, n_x) and inputs (N, n_u) held.
 
     Each sample is integrated from its own state, so that nothing adds up on an unstable plant.
     """
@@ -87,7 +87,7 @@ def optimum(task: Task) -> OptimalTrajectory:
     K = riccati.K if riccati.status is RiccatiStatus.SOLVED else np.zeros_like(riccati.K)
     course = _constant_law(task, task.u_ref, K, task.x_ref)
     if not math.isfinite(course.cost):
-        raise ValueError(f'{system.name}: the linear law does not hold the plant from '
+        raise ValueError(f'{system.name}: the linear law does not stabilise the plant from '
                          f'{system.describe_state(task.x0)}: start nearer to the set-point')
     for _ in range(_MAX_ITERATIONS):
         change, gains, gain = _improvement(task, course)
@@ -100,8 +100,8 @@ def optimum(task: Task) -> OptimalTrajectory:
         if better.cost >= course.cost:
             break
         course = better
-    raise ValueError(f'{system.name}: no optimum found, the cost is still {course.cost:.6g} and '
-                     f'would fall by {gain:.3g}: shorten the horizon or the period')
+    raise ValueError(f'{system.name}: no optimum found: the cost is {course.cost:.6g} and could '
+                     f'still fall by {gain:.3g}; shorten the horizon or the period')
 
 
 def _constant_law(task: Task, u: Array, K: Array, x: Array) -> OptimalTrajectory:

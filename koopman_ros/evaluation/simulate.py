@@ -27,7 +27,7 @@ Sensor: TypeAlias = Callable[[Array, float], Array | None]
 
 
 class Plant(Protocol):
-    """What runs under the controller, such as ``plants.Process``."""
+    """The plant in the loop, e.g. ``plants.Process``."""
 
     @property
     def time_ns(self) -> int:
@@ -41,6 +41,10 @@ class Plant(Protocol):
     def u(self) -> Array:
         """Input (n_u,) that acts."""
 
+    @property
+    def applied(self) -> Array:
+        """Input (n_u,) as it is measured, which acts after its dead time."""
+
     def commanded(self, command: Array, time_ns: int) -> Self:
         """Return the plant with a command (n_u,) given at its present time."""
 
@@ -53,7 +57,7 @@ class Loop:
     """A closed loop at one time."""
 
     controller: Controller  #: that acts
-    state: State  #: what it remembers
+    state: State  #: of the controller
     plant: Plant  #: under it
 
     __repr__ = short_repr
@@ -64,14 +68,14 @@ Change: TypeAlias = Callable[[Loop], Loop]
 
 @dataclass(frozen=True)
 class ScheduledChange:
-    """What happens at a time."""
+    """An event at a time."""
 
     seconds: float  #: from the start of the simulation
     what: Event | Change  #: an event of the controller, or a function of the loop
 
 
 def at(seconds: float, what: Event | Change) -> ScheduledChange:
-    """Say what happens at a time in s, before the measurement of that time."""
+    """Declare an event at a time in s, before the measurement of that time."""
     return ScheduledChange(seconds, what)
 
 
@@ -82,8 +86,8 @@ def exchange(controller: Controller) -> Change:
 
 
 def restart(loop: Loop) -> Loop:
-    """Start the controller anew; it finds the input that acts."""
-    return replace(loop, state=loop.controller.initialise(State(), loop.plant.u))
+    """Restart the controller, which begins from the applied input."""
+    return replace(loop, state=loop.controller.initialise(State(), loop.plant.applied))
 
 
 def perfect(value: Array, _: float) -> Array:
@@ -98,11 +102,11 @@ def after_a_second(time_ns: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """What a loop did, one row a sample."""
+    """The trajectories of a loop, one row per sample."""
 
     times: Array  #: (N,) in s from the start
     states: Array  #: (N, n) of the plant
-    measured: Array  #: (N, n_y) what the controller received; NaN where nothing
+    measured: Array  #: (N, n_y) received measurements; NaN for none
     inputs: Array  #: (N, n_u) that acted when it was measured
     commands: Array  #: (N, n_u) answered; NaN before the first
     setpoints: Array  #: (N, n_c) active; NaN before the first
@@ -131,14 +135,14 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     arguments give the same numbers.
 
     :param plant: at the start; its present time is that of the first sample.
-    :param events: what happens when; of the same time, in the order given.
+    :param events: events with their times; those of the same time in the given order.
     :param duration: in s, as the period between samples.
-    :param C: (n_y, n) what is measured of the plant's state, y = C x; by default that of the
+    :param C: (n_y, n) measurement matrix of the plant's state, y = C x; by default that of the
         controller, whose model then has the plant's states.
-    :param noise: (n_y,) standard deviations of what is added to y; none by default.
+    :param noise: (n_y,) standard deviations of the measurement noise; none by default.
     :param seed: of the noise.
-    :param sensor: what it makes of that, by value and time: a bias, a fault, silence.
-    :param input_sensor: the same of the input that acts; None where it is not measured.
+    :param sensor: sensor model, a function of value and time: a bias, a fault, silence.
+    :param input_sensor: the same of the applied input; None where it is not measured.
     :param state: of the controller at the start; knowing nothing by default.
     :param stamp: the stamp of a measurement at a time of the plant, both in ns.
     :param stop: ends the simulation when it is true of state, command and report.
@@ -173,7 +177,8 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
             y = y + noise * np.random.default_rng((seed, number)).standard_normal(len(noise))
         received = sensor(y, seconds)
         event = Silence(stamp(time_ns)) if received is None else Measurement(
-            stamp(time_ns), received, None if input_sensor is None else input_sensor(u, seconds))
+            stamp(time_ns), received, None if input_sensor is None else input_sensor(
+                loop.plant.applied, seconds))
         loop, command, report = _answered(loop, event)
         assert report is not None  # of a measurement as of silence
         reports.append(report)
@@ -236,7 +241,7 @@ class ClosedLoop:
 
 
 class _Failed(Exception):  # noqa: N818
-    """The loop cannot go on; the message says why."""
+    """The loop cannot continue; the message says why."""
 
 
 # A set-point for all states is held where a steady state is so near, in half-ranges of the box.
@@ -253,7 +258,7 @@ def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) ->
         if not lower <= value <= upper:
             raise ValueError(f'{name} = {value:.6g} {unit} is outside the trained range '
                              f'{lower:.6g} {unit} to {upper:.6g} {unit}: choose a set-point '
-                             'inside, or a model trained over a wider range')
+                             'inside it, or a model trained over a wider range')
     if not controlled:
         target = steady_state_target(model, states.to_deviation(setpoint))
         nearest = target.x if model.n_u >= model.n_x else (
@@ -263,7 +268,7 @@ def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) ->
             where = '' if nearest is None else (
                 f'; the nearest steady state is {states.to_physical(nearest).tolist()}')
             raise ValueError(f'no input of the model holds {", ".join(states.names)} at '
-                             f'{setpoint.tolist()}{where}: choose another set-point, or name in '
+                             f'{setpoint.tolist()}{where}: choose another set-point, or list in '
                              'controlled the states that have one')
         return target
     endless = np.full(model.n_u, np.inf)
@@ -343,7 +348,7 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
                 inputs.append(model.inputs.to_physical(act(x)[1]))
                 states.append(x)
             if np.max(np.abs(model.states.to_deviation(solver.y[:-1]))) > escape:
-                raise _Failed('the state escaped')
+                raise _Failed('the state diverged')
             if solver.nfev > max_evaluations:
                 raise _Failed(f'the law was evaluated {max_evaluations} times before the end')
         cost = float(solver.y[-1])

@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records of what changed a controller, and a loop over them that gives its commands; no ROS."""
+"""Records of events that changed a controller, and their replay as commands; no ROS."""

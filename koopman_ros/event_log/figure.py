@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The replay's picture: what was measured, what was commanded, and where commands differ."""
+"""The plot of a replay: measurements, commands, and where commands differ."""
 
 from pathlib import Path
 import textwrap
@@ -45,7 +45,7 @@ def _time(bag: ReplayedBag) -> tuple[np.ndarray, str]:
         return np.zeros(0), ''
     seconds = bag.seconds
     if np.any(np.diff(seconds) < 0.0):
-        return np.arange(1.0, len(seconds) + 1.0), 'command (the stamps go back in this bag)'
+        return np.arange(1.0, len(seconds) + 1.0), 'command (the stamps of this bag go back)'
     if seconds[-1] > 300.0:
         return seconds / 60.0, 'time since the first command [min]'
     return seconds, 'time since the first command [s]'
@@ -68,7 +68,7 @@ def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
     if setpoint.size:
         axes.step(time, setpoint, 'k--', where='post', linewidth=1.2, label='set-point tracked')
     axes.plot(time, measured, color='tab:green', label='measured' + (
-        f' ({hidden} of {len(finite)} outside the picture)' if hidden else ''))
+        f' ({hidden} of {len(finite)} outside the plot)' if hidden else ''))
     both = np.concatenate([typical, setpoint[np.isfinite(setpoint)]])
     if both.size:
         margin = 0.5 + 0.05 * float(np.ptp(both))
@@ -77,7 +77,7 @@ def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
 
 
 def _typical(finite: np.ndarray) -> np.ndarray:
-    """Return what a picture should show: a broken sensor's values would flatten all others."""
+    """Return the values to plot: those of a broken sensor would flatten all others."""
     if not finite.size:
         return finite
     low, high = np.percentile(finite, (2.0, 98.0))

@@ -97,7 +97,7 @@ def replay(recorded: Iterable[records.EventRecord], find_model: FindModel, build
 
 
 class _ReplayRun:
-    """A run of a controller, and the alternative beside it."""
+    """A run of a controller, and the alternative."""
 
     def __init__(self, result: Replay, find_model: FindModel, build: Build,
                  alternative: Alternative | None) -> None:
@@ -129,8 +129,8 @@ class _ReplayRun:
         """Forget the state behind a lost record."""
         if self._next is not None and record.number < self._next:
             raise records.RecordError(
-                f'record {record.number} of run {record.run} comes again, or after record '
-                f'{self._next - 1}: the bag is not in order')
+                f'record {record.number} of run {record.run} is repeated, or follows record '
+                f'{self._next - 1}: the bag is out of order')
         if self._next is not None and record.number > self._next:
             self._result.lost.append(Lost(record.run, self._next, record.number - 1))
             self._state = None
@@ -143,8 +143,8 @@ class _ReplayRun:
         command, n_u = self._state.command, controller.model.n_u
         if command is not None and command.shape != (n_u,):
             raise records.RecordError(
-                f'record {record.number} of run {record.run} cannot be replayed: it has a command '
-                f'of shape {command.shape} for {n_u} inputs')
+                f'record {record.number} of run {record.run} cannot be replayed: its command has '
+                f'shape {command.shape} for {n_u} inputs')
         if self._other is not None:
             same = self._other.digest == record.fields['model']['digest']
             self._other_controller = self._tuned(controller.model if same else self._other.model)

@@ -7,8 +7,9 @@ Records: numbered lines of JSON, one for each event that changed a controller.
 They are described in docs/reference/event_log.md.
 
 Numbers are in the model's units, times in nanoseconds. JSON has numbers, texts, lists and objects.
-What it lacks is an object with the key ``@``, which says what it is: ``float`` for one that is not
-finite, ``array``, or the class of a dataclass or an enum as ``module:name``. Lists become tuples.
+Other values are an object with the key ``@``, which names their kind: ``float`` for one that is
+not finite, ``array``, or the class of a dataclass or an enum as ``module:name``. Lists become
+tuples.
 """
 
 from collections.abc import Mapping
@@ -44,7 +45,7 @@ _TAG = '@'
 
 
 class RecordError(ValueError):
-    """A text is no record that can be read; the message says why."""
+    """A text is not a readable record; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class EventRecord:
     run: str  #: of the controller, another one each time it is started
     number: int  #: counts within a run, from 0 without a gap
     event: str  #: name of the event
-    fields: Mapping[str, Any]  #: what else is written
+    fields: Mapping[str, Any]  #: further fields
 
     def text(self) -> str:
         """Return the record as a line of JSON."""
@@ -63,7 +64,7 @@ class EventRecord:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of what was answered or asked for; 0 where there is none."""
+        """Stamp of the measurement or request; 0 where there is none."""
         return int(self.fields.get('stamp_ns', 0))
 
 
@@ -74,7 +75,7 @@ def parse(text: str) -> EventRecord:
         version = fields.pop('version')
         if version != VERSION:
             raise RecordError(
-                f'its records are of version {version!r}, this package reads {VERSION}: take the '
+                f'its records have version {version!r}, this package reads {VERSION}: use the '
                 'package that recorded it')
         record = EventRecord(str(fields.pop('run')), int(fields.pop('number')),
                              str(fields.pop('event')), fields)
@@ -82,12 +83,12 @@ def parse(text: str) -> EventRecord:
     except RecordError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise RecordError(f'{text[:60]!r} is no record of a controller') from error
+        raise RecordError(f'{text[:60]!r} is not a record of a controller') from error
     return record
 
 
 def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, dict[str, Any]]:
-    """Return the name of an event, and what is written of it and of what it led to."""
+    """Return the name of an event, and its fields and outcome as they are written."""
     name, report = _NAMES[type(event)], outcome.report
     written = {of: _written(getattr(event, of)) for of in _FIELDS[type(event)]}
     if report is not None:
@@ -105,7 +106,7 @@ def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, d
 def event_of(record: EventRecord) -> events.Event:
     """Return the event of a record; raise KeyError, TypeError or ValueError where it has none."""
     if record.event not in EVENTS:
-        raise ValueError(f'the event {record.event!r} is not known')
+        raise ValueError(f'unknown event {record.event!r}')
     kind = EVENTS[record.event]
     return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]})
 
@@ -121,12 +122,12 @@ def state_of(record: EventRecord) -> State:
     """Return the state in a snapshot; raise KeyError, TypeError or ValueError for another."""
     state = decoded(record.fields['state'])
     if not isinstance(state, State):
-        raise TypeError(f'a {type(state).__name__} is no state of a controller')
+        raise TypeError(f'a {type(state).__name__} is not a state of a controller')
     return state
 
 
 def _written(value: Any) -> Any:
-    """Return an array, an enum, a number or None as it stands in the fields of an event."""
+    """Return an array, an enum, a number or None as it is written in the fields of an event."""
     if isinstance(value, StatusCode):
         return value.value
     if isinstance(value, Enum):
@@ -135,7 +136,7 @@ def _written(value: Any) -> Any:
 
 
 def _read(name: str, value: Any) -> Any:
-    """Return what was written of a field of an event."""
+    """Return a field of an event from its written form."""
     if name == 'mode':
         return Mode[value.upper()]
     if name == 'cause':
@@ -151,7 +152,7 @@ def _codes(reason: Reason | None) -> list[str]:
 
 
 def encoded(value: Any) -> Any:
-    """Return a value as what :func:`json.dumps` writes without loss, or raise TypeError."""
+    """Return a value in a form that :func:`json.dumps` writes without loss, or raise TypeError."""
     if isinstance(value, Enum):
         return {_TAG: _name(type(value)), 'name': value.name}
     if isinstance(value, np.generic):
@@ -214,9 +215,9 @@ def numbers(values: NDArray[Any]) -> list[Any]:
 
 
 def float_array(values: Any) -> NDArray[np.float64]:
-    """Return what :func:`numbers` was given; raise TypeError or ValueError for no numbers."""
+    """Return the argument of :func:`numbers`; raise TypeError or ValueError for no numbers."""
     if not isinstance(values, list):
-        raise TypeError(f'{values!r} is no list of numbers')
+        raise TypeError(f'{values!r} is not a list of numbers')
     array = np.array([float(item) for item in values], dtype=np.float64)
     array.setflags(write=False)
     return array

@@ -59,8 +59,8 @@ class ReplayedBag:
     recorded: Array  #: (n, n_u) recorded commands
     commands: Array  #: (n, n_u) commands of the replay; NaN where it has no state
     new_commands: Array  #: (n, n_u) commands of the new model; NaN where it has no state
-    check: CommandComparison  #: the replay beside the record
-    new: CommandComparison | None  #: the new model beside the record, or None without one
+    check: CommandComparison  #: of the replay with the record
+    new: CommandComparison | None  #: of the new model with the record, or None
 
     @property
     def seconds(self) -> Array:
@@ -126,20 +126,20 @@ def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new
 
 
 def reproduced(bag: ReplayedBag) -> bool:
-    """Tell whether the recorded commands are those of the replay, within the tolerance."""
+    """Whether the recorded commands are those of the replay, within the tolerance."""
     return bag.check.compared > 0 and not bag.check.beyond.any()
 
 
 def verdict(bag: ReplayedBag) -> str:
-    """Say in one sentence how the replay did."""
+    """Return the result of the replay in one sentence."""
     check = bag.check
     if not check.compared:
-        return ('nothing is compared: the records hold no command' if not bag.found.samples else
-                'nothing is compared: no snapshot of the controller comes before a command')
+        return ('nothing to compare: the records contain no command' if not bag.found.samples else
+                'nothing to compare: no snapshot of the controller precedes a command')
     if check.identical == check.compared:
-        return f'all {check.compared} recorded commands are reproduced bit for bit'
+        return f'all {check.compared} recorded commands are reproduced exactly'
     beyond = int(np.count_nonzero(check.beyond))
-    return (f'{check.identical} of {check.compared} recorded commands are reproduced bit for bit, '
+    return (f'{check.identical} of {check.compared} recorded commands are reproduced exactly, '
             f'{beyond} differ by more than {check.tolerance:g}; {_worst(bag, check)}')
 
 
@@ -156,14 +156,13 @@ def _largest(difference: np.ndarray) -> float:
 
 
 def _about(new_model: str) -> str:
-    text = ('What the controller recorded of itself went through the control step again, with the '
-            'models and the parameters that the records name. Times count from the first command '
-            'of a bag.')
+    text = ('The control step was re-run on the events that the controller recorded, with the '
+            'recorded models and parameters. Times are relative to the first command of a bag.')
     if new_model:
-        text += (f'\n\nThe commands of `{new_model}` answer the same recorded measurements under '
-                 'the set-points that were tracked, with the recorded parameters but for those '
-                 'given. They are compared with what was commanded then, one by one: not a closed '
-                 'loop, in which the measurements themselves would have become others.')
+        text += (f'\n\nThe commands of `{new_model}` are computed for the same recorded '
+                 'measurements and active set-points, with the recorded parameters except those '
+                 'given. They are compared with the recorded commands one by one. This is not a '
+                 'closed loop: with the new model the measurements would have been different.')
     return text
 
 
@@ -179,19 +178,18 @@ def _section(bag: ReplayedBag) -> list[str]:
                      f'recorded ones by more than {bag.tolerance:g}; {_worst(bag, bag.new)}.')
     for count, words in (
             (bag.outside, 'times the tracked set-point is outside the range that the new model '
-                          'was trained for, which would have refused it'),
+                          'was trained for, which would have rejected it'),
             (len(found.samples) - bag.check.compared, 'commands are not compared, because no '
                                                       'snapshot of the controller precedes them'),
-            (found.runs - 1, 'times the controller was started again, or another one recorded'),
-            (found.refused, 'requests are refused'),
-            (len(found.samples) - bag.measurements, 'commands were given because no measurement '
-                                                    'came')):
+            (found.runs - 1, 'restarts of the controller, or other controllers in the bag'),
+            (found.refused, 'requests were rejected'),
+            (len(found.samples) - bag.measurements, 'commands were given without a measurement')):
         if count > 0:
             lines.append(f'- {count} {words}.')
     lines += [f'- Records {lost.first} to {lost.last} of run {lost.run} are missing.'
               for lost in found.lost]
     if not bag.complete:
-        lines.append('- The bag was not closed or is damaged: this is the part that is whole.')
+        lines.append('- The bag was not closed or is damaged: only the intact part was replayed.')
     return lines
 
 

@@ -56,7 +56,7 @@ def replay_bags(parameters: ReplayParameters, topic: str = RECORDS,
         from koopman_ros.event_log.figure import draw
     except ImportError as error:
         raise ConfigurationError(
-            'the picture needs matplotlib, which is missing: pip install matplotlib, or '
+            'the plot needs matplotlib, which is not installed: pip install matplotlib, or '
             'apt-get install python3-matplotlib') from error
 
     bags = [replayed_bag(path, parameters, topic, given) for path in parameters.bags]
@@ -102,7 +102,7 @@ def replay_records(records: Iterable[EventRecord], models: Sequence[Path] = (),
     """
     Replay records of this package's controller node, in the order of receipt.
 
-    :param models: files or folders in which models are looked for beside the shipped ones.
+    :param models: files or folders to search for models, in addition to the bundled ones.
     :raises RecordError: for records that cannot be replayed.
     """
     places = [*models, config_directory() / 'models']
@@ -134,10 +134,10 @@ def _controller(values: Mapping[str, Any], model: LiftedModel) -> Controller:
     if unknown := ', '.join(sorted(
             name for name in set(values) - set(table.rows)
             if '.' not in name or name.partition('.')[0] in signals.units)):
-        raise RecordError(f'its controller had the parameters {unknown}, which this version has '
-                          'not: take the package that recorded it')
+        raise RecordError(f'its controller had the parameters {unknown}, which this version does '
+                          'not have: use the package that recorded it')
     snapshot = table.snapshot(values)
     if reason := table.check(snapshot):
-        raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
-                          'take the package that recorded it')
+        raise RecordError(f'its controller had parameters that this version rejects ({reason}): '
+                          'use the package that recorded it')
     return built(snapshot, model)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a replay reads: a controller's records and commands in a bag, and the models they name."""
+"""The input of a replay: records and commands of a controller in a bag, and their models."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,8 +31,8 @@ def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = Fa
     if not content.counts.get(topic):
         known = ', '.join(name for name, count in sorted(content.counts.items()) if count)
         raise BagReadError(
-            f'bag {os.fspath(path)!r} has no records of a controller on {topic!r}, it has '
-            f'{known or "none"}: record that topic, too, or name it, e.g. -r {topic[1:]}:=NAME')
+            f'bag {os.fspath(path)!r} has no records of a controller on {topic!r}; its topics are '
+            f'{known or "none"}: record that topic, or remap it, e.g. -r {topic[1:]}:=NAME')
     if content.types[topic] != RECORD_TYPE:
         raise BagReadError(
             f'topic {topic!r} of bag {os.fspath(path)!r} is {content.types[topic]} and not '
@@ -69,7 +69,7 @@ def find_model(places: Sequence[Path], name: str, digest: str) -> LiftedModel:
 
     :param places: files and folders that are searched.
     :param name: of the model, as recorded; first the file of that name, if it is one.
-    :raises RecordError: where no file has it.
+    :raises RecordError: if there is no such file.
     """
     files = [Path(name).expanduser()] if name.endswith('.safetensors') else []
     for place in places:
@@ -80,5 +80,5 @@ def find_model(places: Sequence[Path], name: str, digest: str) -> LiftedModel:
             if found == digest:
                 return model
     raise RecordError(
-        f'the controller ran with the model {name} (SHA-256 {digest[:12]}...), which is '
-        'neither shipped nor found: give its file, or the folder it is in, as model')
+        f'the controller ran with the model {name} (SHA-256 {digest[:12]}...), which is neither '
+        'bundled nor found: set the parameter model to its file or folder')

@@ -128,6 +128,5 @@ def executor_refusal(text: str) -> str:
     kind, _, count = text.partition(':')
     if kind == 'joblib' and count.isascii() and count.isdigit() and int(count):
         return ''
-    return (f'executor is {text!r}, must be empty for this process, process, joblib, joblib:N '
-            'with N processes of at least 1, or the address of a Dask scheduler, like '
-            'tcp://127.0.0.1:8786')
+    return (f'executor is {text!r}, must be empty (this process), process, joblib, joblib:N with '
+            'N of at least 1, or the address of a Dask scheduler, e.g. tcp://127.0.0.1:8786')

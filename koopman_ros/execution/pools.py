@@ -241,8 +241,8 @@ class Cluster(_Pool):
             future.cancel()
 
     def _lost(self) -> SchedulerLost:
-        return SchedulerLost(f'the scheduler at {self._address} is lost: start it and its workers '
-                             'again, and repeat the work')
+        return SchedulerLost(f'lost the connection to the scheduler at {self._address}: restart '
+                             'it and its workers, and try again')
 
     @contextlib.contextmanager
     def _messages(self, call: bytes) -> Generator[_Messages]:
@@ -286,7 +286,7 @@ def _unpacked(source: Path | bytes) -> Any:
 
 
 def _call(send: _Send, source: Path | bytes, number: int, item: bytes) -> Any:
-    """Run a task on a worker, which tells its progress at most once a period."""
+    """Run a task on a worker, which reports its progress at most once a period."""
     if send(number, None):
         return _NotBegun()
     function, shared = _unpacked(source)
@@ -304,4 +304,4 @@ def _call(send: _Send, source: Path | bytes, number: int, item: bytes) -> Any:
 
 def _worker_lost(name: str) -> WorkerLost:
     return WorkerLost(f'{name}: {_ATTEMPTS} workers that ran it died, one after the other: check '
-                      'whether the memory suffices for it, and run it again')
+                      'whether they have enough memory, and run it again')

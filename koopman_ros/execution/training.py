@@ -5,16 +5,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 import json
 import queue
 import signal
+import sys
+import time
 from typing import Any
 
+from koopman_ros.core.progress import show_bar
 from koopman_ros.execution.job import Job
 
-_CANCELLED = 'cancelled, nothing was written'
+_CANCELLED = 'cancelled; nothing was written'
+_LINE_PERIOD = 5.0  # s between plain lines of progress
 
 
 @dataclass(frozen=True)
@@ -22,7 +26,7 @@ class JobState:
     """Where a retraining stands, with the figures of a lift that was judged."""
 
     share: float = 0.0  #: done, in [0, 1]
-    text: str = 'starting'  #: what is done now, or how it ended
+    text: str = 'starting'  #: the present stage, or the result
     ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
     #: those of a fleet that have ended, by name
@@ -44,6 +48,26 @@ class JobState:
         return bool(self.summary and not self.summary['accepted'])
 
 
+class TrainingProgress:
+    """
+    How far a training is: a bar on a terminal, else a line every five seconds.
+
+    :param say: prints such a line.
+    """
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._last_line = time.monotonic()
+
+    def show(self, state: JobState) -> None:
+        """Show a state of the training."""
+        if sys.stderr.isatty():
+            show_bar(state.share, *(('', '\n') if state.ended else (state.text,)))
+        elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
+            self._last_line = time.monotonic()
+            self._say(f'{100.0 * state.share:.0f} %: {state.text}')
+
+
 class TrainingJob(Job):
     """
     A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`.
@@ -54,7 +78,7 @@ class TrainingJob(Job):
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()
         self._cancelled = False
-        super().__init__('koopman_ros.learning.__main__', task=json.dumps(dict(task)))
+        super().__init__('koopman_ros.learning.training_process', task=json.dumps(dict(task)))
 
     def poll(self) -> JobState:
         """Read the output of the process since the last call, and return its state."""
@@ -92,7 +116,7 @@ class TrainingJob(Job):
     def _conclusion(self, said: Mapping[str, Any]) -> JobState:
         """Return the state by the last line of a training."""
         if 'summary' in said:
-            return JobState(1.0, _in_words(said['summary']), True, said['summary'])
+            return JobState(1.0, outcome_text(said['summary']), True, said['summary'])
         if 'stopped' in said:
             return JobState(self.state.share, _CANCELLED, True)
         return JobState(self.state.share, f'training failed: {said["error"]}', True)
@@ -104,12 +128,12 @@ class TrainingJob(Job):
             text = _CANCELLED
         elif code < 0:
             name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
-            remedy = ('a day of processor time is its limit: train on fewer bags'
+            remedy = ('the limit is one day of processor time; train on fewer bags'
                       if name == 'SIGXCPU' else
-                      'see whether the memory suffices, and train again')
+                      'check the free memory, and train again')
             text = f'the training process was killed by {name}: {remedy}'
         else:
-            last = self.errors[-1] if self.errors else 'it said nothing'
+            last = self.errors[-1] if self.errors else 'no error message'
             text = f'the training process ended with code {code}: {last}'
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): '
@@ -117,18 +141,19 @@ class TrainingJob(Job):
         return replace(self.state, text=text, ended=True)
 
 
-def _in_words(summary: Mapping[str, Any]) -> str:
+def outcome_text(summary: Mapping[str, Any]) -> str:
+    """Return the result of a training in a sentence."""
     if not summary['accepted']:
         reasons = '; '.join(summary['reasons'])
-        kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
-        return f'the new model ({summary["model_class"]}) is refused: {reasons}{kept}'
+        kept = f'; saved as {summary["model_file"]}' if summary['model_file'] else ''
+        return f'the new model ({summary["model_class"]}) is rejected: {reasons}{kept}'
     present = summary['heldout_error_of_present_lift']
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
         'heldout_error_of_present_lift', 'present one'))
     units = summary['units']
-    return (f'the new model ({summary["model_class"]}) is accepted: error on held-out records '
+    return (f'the new model ({summary["model_class"]}) is accepted: its error on held-out data is '
             f'{_errors(summary["heldout_error"], units)}, that of the {name} '
-            + ('infinite, as it diverges' if None in summary[other].values()
+            + ('infinite (diverges)' if None in summary[other].values()
                else _errors(summary[other], units))
             + f'; written to {summary["model_file"]}')
 

@@ -4,12 +4,13 @@
 """
 From records of a plant to an accepted model; in torch, never in a node.
 
-Nodes start ``python -m koopman_ros.learning``.
+``python -m koopman_ros.learning`` learns from files; nodes start :mod:`.training_process`.
 """
 
 from koopman_ros.learning.acceptance import AcceptanceResult, evaluate_model, Thresholds
 from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
 from koopman_ros.learning.fleet import retrain_fleet, TrainingOutcome
+from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.edmd import Edmd, Linearisation
 from koopman_ros.learning.lift.incremental import IncrementalTraining
@@ -34,6 +35,7 @@ __all__ = [
     'ClassComparison',
     'Edmd',
     'Fit',
+    'FreeRun',
     'IncrementalTraining',
     'Judge',
     'LiftMetrics',
@@ -57,6 +59,7 @@ __all__ = [
     'retrain',
     'retrain_fleet',
     'rollout_rmse',
+    'simulate',
     'train',
     'write_report',
 ]

@@ -93,8 +93,8 @@ class HeldOut:
         own, margin = _size(rmse, self.scale), self._thresholds.margin
         if np.isfinite(own) and own <= (1.0 - margin) * _size(other, self.scale):
             return ''
-        return (f'its error on held-out records, {_text(rmse, model)}, is not '
-                f'{100.0 * margin:.0f} % below that of {name}, {_text(other, model)}')
+        return (f'its error on held-out data, {_text(rmse, model)}, is not {100.0 * margin:.0f} % '
+                f'below that of {name}, {_text(other, model)}')
 
     def reasons(self, model: LiftedModel, rmse: Array, figures: LiftMetrics,
                 law_check: ClosedLoopTest, linear: bool) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ class HeldOut:
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
                            f'{most:.3g}: use fewer coordinates')
         if not law_check.accepted:
-            reasons.append(f'it is no controller of the estimated drift: {law_check}')
+            reasons.append(f'its law does not control the estimated drift: {law_check}')
         return tuple(filter(None, reasons))
 
 
@@ -142,8 +142,8 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
-    :param learned: what was trained, or compared by :func:`compare_classes`, of which the chosen
-        model is judged, and whose closed loops are not run again.
+    :param learned: the trained model, or the comparison by :func:`compare_classes`, of which the
+        chosen model is judged, and whose closed loops are not run again.
     :param loops: see :func:`evaluate_closed_loops`.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)
@@ -156,7 +156,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
-        beside = held_out.exceeded(model, 'the present model', rmse, current_rmse)
+        beside = held_out.exceeded(model, 'the current model', rmse, current_rmse)
         reasons = (*filter(None, [beside]), *reasons)
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
@@ -189,7 +189,7 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
             warnings.append(
                 f'the noise of {name} is coloured (autocorrelation {r:.2f} from sample to sample '
                 'in the residuals of the best drift), because of a filter before the recording or '
-                'an unmeasured quantity. The record is worth '
+                'an unmeasured quantity. The record is equivalent to '
                 f'{100.0 * (1.0 - r) / (1.0 + r):.0f} % of its samples with white noise: record '
                 'longer, or without the filter')
         noise = found.noise[i]
@@ -198,9 +198,10 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
         chance = noise * (_SIGMAS * np.sqrt(2.0 / count)) ** 0.5
         if excess > max(chance, noticeable):
             warnings.append(
-                f'the best drift errs by {error[i]:.3g} {unit} in {name}, of which {excess:.3g} '
-                f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): an unmeasured '
-                'state or disturbance acts as well; measure it, or set unmeasured_states')
+                f'the best drift predicts {name} with an error of {error[i]:.3g} {unit}, of which '
+                f'{excess:.3g} {unit} is not noise ({noise:.3g} {unit} from sample to sample): '
+                'there is an unmeasured state or disturbance; measure it, or set '
+                'unmeasured_states')
     return tuple(warnings)
 
 
@@ -220,7 +221,7 @@ def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float
             found.append(
                 f'{name} was trained from {unit.text(lower)} to {unit.text(upper)}, set-points '
                 f'range from {unit.text(low)} to {unit.text(high)}: those outside will be '
-                'refused; record the missing range, or narrow setpoint_min and setpoint_max')
+                'rejected; record the missing range, or narrow setpoint_min and setpoint_max')
     return tuple(found)
 
 

@@ -49,7 +49,7 @@ class RecordStatistics:
     def add(self, episode: Episode) -> None:
         """Take an episode in."""
         low, high = extremes(episode)
-        self.lower, self.upper = np.minimum(self.lower, low), np.maximum(self.upper, high)
+        self.lower, self.upper = np.fmin(self.lower, low), np.fmax(self.upper, high)
         self.count += len(episode)
         x = episode.x - episode.x.mean(axis=0)
         noise = _line_errors(x, _NOISE_GROUP)[0]
@@ -80,8 +80,9 @@ class RecordStatistics:
 
 def extremes(episode: Episode) -> tuple[Array, Array]:
     """Return the lowest and the highest value (n,) of each state and input."""
-    return (np.concatenate((episode.x.min(axis=0), episode.u.min(axis=0))),
-            np.concatenate((episode.x.max(axis=0), episode.u.max(axis=0))))
+    # of the states that were measured
+    return (np.concatenate((np.fmin.reduce(episode.x), episode.u.min(axis=0))),
+            np.concatenate((np.fmax.reduce(episode.x), episode.u.max(axis=0))))
 
 
 def _line_errors(x: Array, size: int) -> tuple[Array, Array]:
@@ -169,7 +170,8 @@ class Selection:
 
     def _cells(self, part: Episode) -> NDArray[np.int64]:
         """Return the cells of all pairs of signals that a segment visits, numbered."""
-        cells = cells_of(np.hstack([part.x, part.inputs_at(part.time)]), self.lower, self.upper)
+        cells = cells_of(np.hstack([part.interpolated(), part.inputs_at(part.time)]), self.lower,
+                         self.upper)
         pairs = itertools.combinations(range(cells.shape[1]), 2)
         return np.unique(np.concatenate([
             CELLS ** 2 * number + CELLS * cells[:, i] + cells[:, j]
@@ -193,7 +195,8 @@ def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
     found = []
     for episode in episodes:
         u = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
+        xi = box.states.to_deviation(episode.interpolated())
+        found.append(cells_of(np.hstack([xi, u]), -1.0, 1.0))
     return np.unique(np.concatenate(found), axis=0)
 
 

@@ -50,8 +50,8 @@ def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> DriftSamples:
     x0, squares = fitted_starts(drift.rate, segments, drift.box.states.scale)
     followed = np.all(squares < drift.box.states.scale ** 2, axis=1)
     if not np.any(followed):
-        raise ValueError('the estimated drift follows none of the episodes: record longer, with '
-                         'steps of the input')
+        raise ValueError('the estimated drift reproduces none of the episodes: record longer, '
+                         'with steps of the input')
     path = segments.path(drift.rate, x0)[:-1]
     inside = (segments.steps > 0.0) & followed
     # segment by segment, each in the order of its times
@@ -65,8 +65,8 @@ def _spread(xi: Array) -> NDArray[np.int64]:
     """
     Choose samples (N, n_x) that fill the range as evenly as they can; return rising numbers.
 
-    A plant dwells around some states; a lift learned from all samples would know those best and
-    tell its coordinates apart by the few others.
+    A plant dwells around some states; a lift trained on all samples would fit those best, and
+    distinguish its coordinates by the few others.
     """
     low, high = xi.min(axis=0), xi.max(axis=0)
     share = (xi - low) / (high - low)
@@ -102,8 +102,9 @@ def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: in
     """
     Learn a lift of an estimated drift; the arguments are those of :func:`learning.train`.
 
-    :param plant: names, units and the nominal point. Where it is not known, or the episodes do not
-        surround it, a steady state in the middle of their range is taken.
+    :param plant: names, units and the nominal point, as given to the identification: unmeasured
+        states are added. Where the nominal point is not known, or the episodes do not surround
+        it, a steady state in the middle of their range is taken.
     :raises TrainingFailed: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
@@ -116,14 +117,17 @@ def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescrip
                                                                     DriftSamples]:
     """Return the plant with its estimated nominal point and B, and samples of the drift."""
     samples = drift_samples(found.drift, found.fitted)
+    states = found.drift.box.states
     lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
-    within = (plant.nominal_state > lower) & (plant.nominal_state < upper)
-    x, u = steady_point(found.drift,
-                        np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
+    # a plant of the measured states has nothing to say of the others
+    nominal = np.append(plant.nominal_state, np.full(len(states) - len(plant.state_names), np.nan))
+    within = (nominal > lower) & (nominal < upper)
+    x, u = steady_point(found.drift, np.where(within, nominal, 0.5 * (lower + upper)),
                         np.where(np.isfinite(plant.nominal_input), plant.nominal_input,
                                  found.drift.box.inputs.center))
     drift = found.drift
-    return replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
+    return replace(plant, state_names=states.names, state_units=states.units,
+                   nominal_state=x, nominal_input=u, input_matrix_degree=0,
                    B=drift.input_matrix_at if drift.varying_input_matrix else (
                        drift.input_matrix)), samples
 
@@ -138,8 +142,8 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
 
     The rule is the same, its error another: the mean square by which predictions of the
-    measurements that were held out err beyond their noise. What chance makes of the noise is the
-    same for all and counts as equal. Refused are classes that the gate would refuse for their law,
+    measurements that were held out err beyond their noise. Differences within the chance variation
+    of the noise count as equal. Refused are classes that the gate would refuse for their law,
     their coordinates or for a linear model that is as good.
 
     :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
@@ -149,7 +153,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
         run, too.
     :raises TrainingFailed: when no model of the requested class was learned, or none at all.
-    :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
+    :raises ValueError: when the episodes hold no steady state, and for an unknown class.
     :raises Stopped: when `judging` ended it.
     """
     held_out = HeldOut(found, thresholds)

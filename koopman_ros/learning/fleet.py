@@ -47,8 +47,8 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
     """
     Retrain plants side by side, and yield each with its outcome.
 
-    Each is worked as a job of its own, as :func:`retrain` works one here, and judged, written and
-    reported likewise; a failure of one is its outcome and does not touch the others. Those
+    Each is worked as a job of its own, as :func:`retrain` trains one here, and judged, written and
+    reported in the same way; a failure of one is its outcome and does not touch the others. Those
     whose sibling is ``'first'`` begin from the lift of the first plant of their kind that is
     accepted: of the same signals, class and number of coordinates. They wait for that; where one
     is refused or fails, the next one of the kind is learned from nothing.
@@ -123,7 +123,7 @@ def failed(error: BaseException) -> TrainingOutcome:
 def _error_text(error: BaseException) -> str:
     """Return the text of an error in a line; of an unexpected one with its class."""
     if isinstance(error, MemoryError):
-        return 'the memory does not suffice: free some, or train on fewer bags'
+        return 'out of memory: free memory, or train on fewer bags'
     said = ' '.join(str(error).split())
     expected = isinstance(error, EXPECTED)
     return said if said and expected else ': '.join(filter(None, [type(error).__name__, said]))
@@ -131,10 +131,10 @@ def _error_text(error: BaseException) -> str:
 
 def _check(tasks: Mapping[str, TrainingTask]) -> None:
     if not tasks:
-        raise ValueError('there is no plant to retrain: name at least one')
+        raise ValueError('no plant to retrain: name at least one')
     by_file: dict[Path, str] = {}
     for name, task in tasks.items():
         file = Path(task.output).resolve()
         if (other := by_file.setdefault(file, name)) != name:
             raise ValueError(f'{other} and {name} would both write {task.output}: give each plant '
-                             'an output of its own')
+                             'its own output')

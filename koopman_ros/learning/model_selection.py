@@ -148,8 +148,8 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     :param judge: of the models, in place of validation episodes and `loops`.
     :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
     :raises TrainingFailed: when no model of the requested class was learned, or none at all.
-    :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
-        was asked for or all samples are to blame.
+    :raises ValueError: for an unknown name; otherwise as :func:`train`, where the class was
+        requested or the cause is in the samples.
     """
     n_x = samples.x.shape[1]
     recipes = usual_recipes(n_x) if recipes is None else recipes
@@ -162,9 +162,9 @@ def compare(plant: PlantDescription, samples: DriftSamples,
         raise ValueError(f'starts must be at least 1, got {starts}')
     continuing = [name for name in names if begin is not None and _of_kind(recipes, name, begin)]
     if begin is not None and not continuing:
-        raise ValueError(f'no class of {", ".join(names)} begins from a lift '
-                         f'{"with" if begin.identity else "without"} identity coordinates: learn '
-                         'a lift of its kind, or begin from nothing')
+        raise ValueError(f'no class of {", ".join(names)} can start from a lift '
+                         f'{"with" if begin.identity else "without"} identity coordinates: train '
+                         'a lift of its kind, or pass no initial lift')
     prepared = PreparedSamples.of(plant, samples)
     judge = judge or _judge(prepared, loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
@@ -214,7 +214,7 @@ def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING)
     if not able:
         tried = [one for one in contenders if one.model is not None]
         if not tried:
-            raise TrainingFailed('no class has a model: ' + '; '.join(
+            raise TrainingFailed('no class gave a model: ' + '; '.join(
                 f'{one.name}: {one.refusal}' for one in contenders))
         return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
     limit = _FACTOR * max(min(one.error for one in able), resolution)
@@ -293,6 +293,6 @@ def _judge(prepared: PreparedSamples, loops: int, backend: Backend | None) -> Ju
                                           backend=backend)
         refused = law_check is not None and not law_check.accepted
         return replace(one, law_check=law_check,
-                       refusal=f'no controller: {law_check}' if refused else '')
+                       refusal=f'does not control the plant: {law_check}' if refused else '')
 
     return Judge(judged, ROUNDING)

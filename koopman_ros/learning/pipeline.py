@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Retraining from bags to the model file."""
+"""Retraining from bags, or from a record that was read, to the model file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import os
 from pathlib import Path
@@ -18,6 +18,7 @@ from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.plots import finite
+from koopman_ros.core.progress import progress_line
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import (
@@ -28,9 +29,11 @@ from koopman_ros.learning.acceptance import (
 )
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import compare_classes
+from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
+    find_dead_times,
     IdentificationMethod,
     Identified,
     identify,
@@ -42,12 +45,18 @@ from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
-from koopman_ros.learning.record import read_record, RecordSource, Reduction
+from koopman_ros.learning.record import (
+    read_record,
+    RecordSource,
+    reduced,
+    Reduction,
+    TrainingRecord,
+)
 from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plants import plant_class
-from koopman_ros.records import ImportReport
+from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
 
 # A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
@@ -78,6 +87,8 @@ class Retrained:
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
     reduction: Reduction | None = None  #: the part of a long record that is used
+    #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
+    free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -85,6 +96,13 @@ class Retrained:
     def accepted(self) -> bool:
         """Whether the lift may be used."""
         return not self.reasons
+
+    @property
+    def dead_time(self) -> Array:
+        """Dead times (n_u,) of the inputs, in s."""
+        found = self.found
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * (
+            found.dead_time if len(found.dead_time) else np.zeros(len(found.drift.box.inputs)))
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""
@@ -129,6 +147,7 @@ class Retrained:
             'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
+            'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
             'constants': {one.name: {
                 'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
@@ -156,11 +175,16 @@ class Retrained:
                 'closed_loop_cost_beside_linear': check.median_ratio,
                 'worst_closed_loop_cost_beside_linear': check.worst_ratio,
             }
+        figures['free_runs'] = {name: {
+            'error': dict(zip(run.names, map(float, run.rmse), strict=True)),
+            'fit_percent': dict(zip(run.names, map(float, run.fit), strict=True))}
+            for name, run in self.free_runs.items()}
         finite_figures: dict[str, object] = finite(figures)
         return finite_figures
 
 
-def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> Retrained:
+def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
+            record: Record | None = None, test: Record | None = None) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -169,19 +193,26 @@ def retrain(task: TrainingTask, on_progress: OnProgress = lambda *_: False) -> R
     training makes of a sibling's would be refused, training starts again without the sibling.
     The result does not depend on the executor of the task.
 
+    :param on_progress: called with the share done and a text; True stops the training. By default
+        a terminal shows both on one line.
+    :param record: to learn from, in place of the bags of the task.
+    :param test: a record that takes no part in the training. The new model is rejected if its free
+        run errs more there than that of the best linear model.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` returned True; nothing is written.
     :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
-    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
+    :raises SchedulerLost: when a scheduler is not reached, or lost; nothing is written then.
     """
     checked_device(task.device)
-    with backend_of(task.executor) as backend:
-        return _retrain(backend, task, on_progress)
+    with backend_of(task.executor) as backend, progress_line() as report:
+        return _retrain(backend, task, on_progress or (lambda *now: bool(report(*now))), record,
+                        test)
 
 
-def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> Retrained:
+def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
+             given: Record | None, test: Record | None) -> Retrained:
     progress, thresholds = _Progress(on_progress), _checked(task)
     current, sibling = (load(path) if path else None
                         for path in (task.model, task.warm_start_model))
@@ -189,21 +220,24 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
-    source = RecordSource(
-        task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
-        least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    progress('read', 0.0, 'reading bags')
-    record = read_record(source, task.most_samples, task.seed,
-                         hidden=bool(task.unmeasured_states or task.physical_model),
-                         tick=progress.reading(2 * source.size()), backend=backend)
+    units = [{one.name: one.unit for one in some} for some in (states, inputs)]
+    test = None if test is None else test.of(*units)
+    record = (_read(backend, task, states, inputs, current, progress) if given is None else
+              reduced(given.of(*units), task.most_samples, task.seed, hidden=_hidden(task)))
     if not record.episodes:
-        raise ValueError('the bags hold no usable segment of measurements: '
+        raise ValueError('the bags contain no usable segment of measurements: '
                          + '; '.join(record.account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
-    found = _estimate(task, plant, episodes, methods, progress, backend)
+    dead_time = _dead_time(task, plant, episodes, progress)
+    episodes = [late for episode in episodes
+                if (late := episode.delayed(dead_time / seconds)) is not None]
+    found = replace(_estimate(task, plant, episodes, methods, progress, backend),
+                    dead_time=dead_time / seconds)
+    recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
+                      tuple(record.episodes), record.account, task.bags)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
     box = found.drift.box
@@ -221,10 +255,14 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
-    decision = replace(decision, warnings=(
+    learned = learned.with_model(replace(learned.model, dead_time=dead_time))
+    runs = {name: simulate(learned, one) for name, one in (
+        ('record', recorded), ('test', test)) if one is not None}
+    decision = replace(decision, reasons=(
+        *decision.reasons, *_failed_test(runs, found, test)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
-        *[f'it is not compared with the present model {task.model}, which has other states'
+        *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     progress('decide', 0.9, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
@@ -232,7 +270,55 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress) -> R
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
-                   reasons=decision.reasons, model_file=str(path))
+                   reasons=decision.reasons, model_file=str(path), free_runs=runs)
+
+
+def _hidden(task: TrainingTask) -> bool:
+    return bool(task.unmeasured_states or task.physical_model)
+
+
+def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
+          inputs: Sequence[RecordedInput], current: LiftedModel | None, progress: _Progress
+          ) -> TrainingRecord:
+    """Read the bags of a task."""
+    source = RecordSource(
+        task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
+        least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
+    progress('read', 0.0, 'reading bags')
+    return read_record(source, task.most_samples, task.seed, hidden=_hidden(task),
+                       tick=progress.reading(2 * source.size()), backend=backend)
+
+
+def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode],
+               progress: _Progress) -> Array:
+    """Return the dead times (n_u,) as the task has them, or as the record tells them, in s."""
+    names, seconds = plant.input_names, SECONDS_PER_TIME_UNIT[plant.time_unit]
+    if unknown := ', '.join(name for name in task.dead_time if name not in names):
+        raise ValueError(f'dead_time names {unknown}: the inputs are {", ".join(names)}')
+    given = np.array([task.dead_time.get(name, 0.0) for name in names])
+    if not (np.all(np.isfinite(given)) and np.all(given >= 0.0)):
+        raise ValueError(f'dead_time is {dict(task.dead_time)}, must be 0 s or more')
+    known = [name in task.dead_time for name in names]
+    late = [one for episode in episodes if (one := episode.delayed(given / seconds)) is not None]
+    if not late:
+        raise ValueError(f'no episode is longer than dead_time = {max(given):g} s: record longer')
+    if task.physical_model or all(known):
+        return given
+    return given + seconds * find_dead_times(
+        late, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
+
+
+def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | None
+                 ) -> tuple[str, ...]:
+    """Say that the free run over the test record errs more than the best linear model's."""
+    if test is None:
+        return ()
+    own, linear = runs['test'], simulate(found.linear, test)
+    scale = found.drift.box.states.only(own.names).scale
+    if not np.sum((own.rmse / scale) ** 2) > np.sum((linear.rmse / scale) ** 2):
+        return ()
+    return (f'on {", ".join(test.sources) or "the test record"} the error of its free run, '
+            f'{own.error_text()}, is above that of the best linear model, {linear.error_text()}',)
 
 
 def _checked(task: TrainingTask) -> Thresholds:
@@ -243,8 +329,8 @@ def _checked(task: TrainingTask) -> Thresholds:
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     if task.warm_start_model == FIRST:
-        raise ValueError(f'warm_start_model = {FIRST!r} is the first of a fleet: retrain several '
-                         'plants in one call, or name a model file')
+        raise ValueError(f'warm_start_model = {FIRST!r} means the first model of a fleet: retrain '
+                         'several plants in one call, or name a model file')
     return Thresholds(task.margin, task.condition)
 
 
@@ -260,7 +346,7 @@ class _Progress:
             raise Stopped
 
     def reading(self, total: int) -> Callable[[int], None]:
-        """Return a tick that is given the samples that were read, of so many in all."""
+        """Return a tick that is given the samples that were read, of a total."""
         def tick(samples: int) -> None:
             self._read += samples
             self('read', min(1.0, self._read / total), 'reading bags')
@@ -273,9 +359,7 @@ class _Progress:
 
     def learning(self, now: MultistartProgress) -> bool:
         self.learned = now.finished / now.total
-        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
-        self('learn', self.learned, f'learning: {now.name}, n_z {now.n_z}, start '
-             f'{min(now.finished + 1, now.total)} of {now.total}{rw}')
+        self('learn', self.learned, f'learning: {now.name}, {now.text}')
         return False
 
     def judging(self, name: str, share: float) -> bool:
@@ -324,8 +408,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
             reasons = decision.reasons
         if not reasons:
             break
-        warnings = ('it was learned from nothing, as what training made of '
-                    f'{task.warm_start_model} would be refused: {"; ".join(reasons)}',)
+        warnings = (f'trained without warm start, because the model from {task.warm_start_model} '
+                    f'would be rejected: {"; ".join(reasons)}',)
     return learned, decision, reasons
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading of bags for a retraining, of a long record in memory that does not grow with it."""
+"""Reading of a record for a retraining; of long bags in memory that does not grow with them."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selecti
 from koopman_ros.records import (
     ImportReport,
     loop_episodes,
+    Record,
     RecordedInput,
     RecordedState,
     stream_episodes,
@@ -65,11 +66,10 @@ class Reduction:
 
     def text(self) -> str:
         """Say it in words."""
-        means = (f'means of {self.group} samples each, over which the motion is straight but for '
-                 'the noise, ' if self.group > 1 else '')
-        return (f'a long record: {means}{self.chosen} of {self.segments} segments are learned '
-                f'from and judged by ({self.used} of {self.samples} samples), drawn so that they '
-                'visit the cells of the range evenly')
+        means = (f'means of {self.group} samples each, over which the motion is linear except for '
+                 'noise, ' if self.group > 1 else '')
+        return (f'a long record: {means}{self.chosen} of {self.segments} segments are used '
+                f'({self.used} of {self.samples} samples), selected to cover the range evenly')
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,9 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
     """
     Read the episodes of some bags: all of them, or a selection where they are many.
 
-    A record of more than `most` samples is read twice. The first reading tells its range, and
-    over how many samples the motion is a straight line but for the noise: so many are averaged,
-    which loses nothing. The second one chooses segments, see :class:`Selection`.
+    A record of more than `most` samples is read twice. The first reading tells its range, and over
+    how many samples the motion is linear except for noise: these are averaged, which loses
+    nothing. The second one chooses segments, see :class:`Selection`.
 
     :param hidden: whether states are to be found that are not measured.
     :param tick: told of the samples of a long record as they are read.
@@ -127,18 +127,41 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
         account.add(own)
     if not survey.count:
         return TrainingRecord([], account)
-    start = Selection(survey.lower, survey.upper, survey.group(most), most,
-                      SEGMENT * (_LONGER if hidden else 1))
-    found = reduce(Selection.merged, each(_selected, (source, start, seed)))
+    found = reduce(Selection.merged, each(_selected, (
+        source, _selection(survey, most, hidden), seed)))
+    return _chosen(survey, found, account)
+
+
+def reduced(record: Record, most: int, seed: int, *, hidden: bool = False) -> TrainingRecord:
+    """Return the episodes of a record in memory, selected as by :func:`read_record`."""
+    episodes, about = list(record.episodes), record.plant
+    if sum(map(len, episodes)) <= most:
+        return TrainingRecord(episodes, record.report)
+    survey = RecordStatistics.empty(len(about.state_names), len(about.input_names))
+    for episode in episodes:
+        survey.add(episode)
+    selection = _selection(survey, most, hidden)
+    rng = np.random.default_rng([seed, 0])
+    for episode in episodes:
+        selection.offer(0, episode, rng)
+    return _chosen(survey, selection, record.report)
+
+
+def _selection(survey: RecordStatistics, most: int, hidden: bool) -> Selection:
+    return Selection(survey.lower, survey.upper, survey.group(most), most,
+                     SEGMENT * (_LONGER if hidden else 1))
+
+
+def _chosen(survey: RecordStatistics, found: Selection, account: ImportReport) -> TrainingRecord:
     episodes = found.episodes()
     return TrainingRecord(episodes, account, Reduction(
-        survey.count, start.group, found.offered, len(episodes),
-        start.group * sum(map(len, episodes))))
+        survey.count, found.group, found.offered, len(episodes),
+        found.group * sum(map(len, episodes))))
 
 
 def _streamed(source: RecordSource, bag: str, account: ImportReport, tell: Tell
               ) -> Iterator[Episode]:
-    """Yield the episodes of a bag, and tell of the samples so far."""
+    """Yield the episodes of a bag, and report the samples so far."""
     read = 0
     for episode in stream_episodes([bag], source.states, source.inputs, account,
                                    tolerance_ns=source.tolerance_ns,

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Report of a retraining beside the model: figures as JSON, a page, a picture."""
+"""Report of a retraining, written next to the model: figures as JSON, a page, a plot."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,16 +22,25 @@ from koopman_ros.model_classes import BEST
 
 
 def write_report(retrained: Retrained) -> list[Path]:
-    """Write ``<output>.json``, ``.md`` and, with matplotlib, ``.png``; return the files."""
+    """
+    Write ``<output>.json``, ``.md`` and, with matplotlib, pictures; return the files.
+
+    The pictures are ``.png``, and ``.free_run.png`` and ``.test.png`` of free runs.
+    """
     base = Path(retrained.task.output)
-    picture = base.with_suffix('.png')
-    drawn = _draw(picture, retrained)
+    pictures = {'Data, drift and prediction': base.with_suffix('.png')}
+    drawn = _draw(pictures['Data, drift and prediction'], retrained)
+    for name, run in retrained.free_runs.items() if drawn else ():
+        path = base.with_suffix('.free_run.png' if name == 'record' else f'.{name}.png')
+        run.draw(path)
+        pictures[f'Free run on the {name}'.replace('test', 'test record')] = path
     written = [write_figures(base.with_suffix('.json'), retrained.summary()),
                write_page(base.with_suffix('.md'), 'Retraining',
                           [*_sections(retrained),
-                           f'![Data, drift and prediction]({picture.name})' if drawn else ''],
+                           *(f'![{title}]({path.name})' for title, path in pictures.items()
+                             if drawn)],
                           ('numpy', 'scipy', 'torch'))]
-    return [*written, *([picture] if drawn else [])]
+    return [*written, *(pictures.values() if drawn else [])]
 
 
 def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -66,10 +75,11 @@ def _sections(retrained: Retrained) -> Iterator[str]:
           'each)' for (first, second), share in retrained.coverage.items()),
         *(f'noise of {name} from sample to sample: {noise:.3g} {unit}' for name, noise, unit in
           zip(states.names, found.noise, states.units, strict=True)),
-        f'{len(found.fitted)} segments to estimate and learn from, '
-        f'{len(found.held_out)} held out to judge by'])
+        *(f'dead time of {name}: {seconds:.4g} s'
+          for name, seconds in zip(inputs.names, retrained.dead_time.tolist(), strict=True)),
+        f'{len(found.fitted)} segments for training, {len(found.held_out)} held out for testing'])
     yield '## Estimates of the drift'
-    yield (f'Taken: {found.method}, {found.drift.form}, with the input matrix B'
+    yield (f'Selected: {found.method}, {found.drift.form}, with the input matrix B'
            + ', which depends on the states, in the middle of the range'
            * found.drift.varying_input_matrix)
     yield table(('per second by', *(f'{name} [1/({unit})]' for name, unit in
@@ -80,12 +90,13 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                     strict=True)), range(1, 1 + len(inputs)))
     if found.constants:
         yield 'Constants, with the standard errors of their estimates:'
-        yield table(('constant', 'unit', 'estimate', 'standard error', 'looked for in', ''),
+        yield table(('constant', 'unit', 'estimate', 'standard error', 'searched in', ''),
                     ((one.name, one.unit, f'{one.value:.6g}', f'{one.standard_error:.2g}',
                       f'{one.lower:.6g} to {one.upper:.6g}', one.standing.value)
                      for one in found.constants), (2, 3))
-    yield 'Errors on the segments to choose by' + (
-        ', of the next measurement foreseen:' if found.hidden or found.constants else ':')
+    yield ('Errors on the selection segments, of the predicted next measurement:'
+           if found.constants else 'Errors of simulations, at samples left out of the fit:'
+           if found.hidden else 'Errors on the selection segments:')
     yield table(('degree', 'method', *errors),
                 (('' if score.degree is None else score.degree, score.method,
                   *(f'{error:.5g}' for error in score.rmse),
@@ -97,7 +108,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     by_rule = retrained.task.model_class == BEST
     yield ('Selected: the simplest accepted class whose error beyond the noise is at most twice '
            'the smallest; differences within chance count as equal.' if by_rule
-           else 'The class that model_class names.')
+           else 'The class given by model_class.')
     yield str(learned)
     yield ('rx is the relative mean-square difference from the estimated drift; roll-outs are '
            'simulations of the held-out measurements, including their noise; errors beyond the '
@@ -107,11 +118,18 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield table(('prediction by', *errors),
                 ((name, *(f'{error:.5g}' for error in rmse)) for name, rmse in (
                     ('the new model', decision.rmse),
-                    ('the drift that it was learned from', decision.drift_rmse),
-                    ('the present model', decision.current_rmse),
+                    ('the drift that it was trained on', decision.drift_rmse),
+                    ('the current model', decision.current_rmse),
                     ('the best linear model', decision.linear_rmse)) if rmse is not None),
                 range(1, 1 + len(states)))
-    yield 'The noise of the measurements is part of each.'
+    yield 'Each includes the measurement noise.'
+    yield '## Free run'
+    yield ('Simulations by the inputs alone, from starts fitted to the first samples of each '
+           'episode. The fit is the explained share of the motion.')
+    yield table(('record', 'state', 'error', 'fit [%]'), (
+        (name, state, f'{rmse:.5g} {unit}', f'{fit:.1f}')
+        for name, run in retrained.free_runs.items() for state, unit, rmse, fit in zip(
+            run.names, run.units, run.rmse, run.fit, strict=True)), (2, 3))
     eigenvalues = ', '.join(f'{value:.3g}' for value in learned.model.eigenvalues)
     own = learned.model.states
     yield 'Set-points can be given within ' + ', '.join(
@@ -127,7 +145,7 @@ def _label(signals: Coordinates, k: int) -> str:
 
 
 def _draw(path: Path, retrained: Retrained) -> bool:
-    """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
+    """Draw range of the data, learned model and predictions; False without matplotlib."""
     n_x = len(retrained.found.drift.box.states)
     try:
         decision = retrained.decision
@@ -168,7 +186,7 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
                   markersize=1.0, color='tab:blue')
     axes.grid(False)  # the cells are one
     axes.set(xlabel=_label(box.states, i), ylabel=_label(box.inputs, j),
-             title='where the measurements lie (visited cells in green)')
+             title='measurements (visited cells in green)')
 
 
 def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
@@ -194,7 +212,7 @@ def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
                  label='estimated from the data')
     axes.set(xlabel=_label(box.states, i),
              ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
-             title='rate in the middle of the range, less the estimate')
+             title='rate in the middle of the range minus the estimate')
     axes.legend()
 
 

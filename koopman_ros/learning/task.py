@@ -49,6 +49,8 @@ class TrainingTask:
     input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
     input_matrix_degree: int = 0
+    #: dead time of inputs by name, in s; of those not named it is found from the record
+    dead_time: Mapping[str, float] = field(default_factory=dict)
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
     #: not compared with the present one, which has other states
     unmeasured_states: int = 0
@@ -95,11 +97,11 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     :raises ValueError: for a task whose parts do not fit each other or the present lift.
     """
     if task.physical_model and (task.unmeasured_states or task.input_gain):
-        raise ValueError(f'physical_model = {task.physical_model!r} says which states there are '
-                         'and what inputs do: set unmeasured_states to 0 and give no input_gain')
+        raise ValueError(f'physical_model = {task.physical_model!r} defines the states and the '
+                         'effect of the inputs: set unmeasured_states to 0 and give no input_gain')
     if task.constants and not task.physical_model:
-        raise ValueError(f'constants name {", ".join(task.constants)}, but there is no '
-                         'physical_model that has them')
+        raise ValueError(f'constants name {", ".join(task.constants)}, but no physical_model is '
+                         'given')
     states: Sequence[RecordedState] = task.states
     inputs: Sequence[RecordedInput] = task.inputs
     if current is None:
@@ -132,7 +134,7 @@ def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: st
             ', '.join(f'{name} [{unit}]' for name, unit in pairs) or 'none'
             for pairs in (((s.name, s.unit) for s in given),
                           zip(wanted.names, wanted.units, strict=True)))
-        raise ValueError(f'the present model {path} has the {kind}s {needed}, the task has '
+        raise ValueError(f'the current model {path} has the {kind}s {needed}, but the task has '
                          f'{said}: give the same names and units, each once')
     return [by_name[name] for name in wanted.names]
 

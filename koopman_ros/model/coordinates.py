@@ -58,11 +58,11 @@ class Coordinates:
         """
         lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
         if not len(names) == len(lower) == len(upper):
-            raise ValueError(f'there are values of {len(lower)} signals for {len(names)} names: '
+            raise ValueError(f'got values of {len(lower)} signals for {len(names)} names: '
                              f'{", ".join(names)}')
         for name, unit, low, high in zip(names, units, lower, upper, strict=True):
             if not low < high:
-                raise ValueError(f'{name} never moves from {low} {unit}: excite the plant')
+                raise ValueError(f'{name} is constant at {low} {unit}: excite the plant')
         if center is None:
             center = 0.5 * (lower + upper)
         return cls(names, units, center, 0.5 * (upper - lower), lower, upper)
@@ -79,11 +79,11 @@ class Coordinates:
         return array
 
     def only(self, names: Sequence[str]) -> Coordinates:
-        """Return these coordinates alone; raise ValueError for one that there is not."""
+        """Return these coordinates alone; raise ValueError for an unknown one."""
         if tuple(names) == self.names:
             return self
         if unknown := [name for name in names if name not in self.names]:
-            raise ValueError(f'there is no {", ".join(unknown)}: choose some of '
+            raise ValueError(f'unknown names {", ".join(unknown)}: choose from '
                              f'{", ".join(self.names)}')
         chosen = [self.names.index(name) for name in names]
         return Coordinates(tuple(names), tuple(self.units[i] for i in chosen), *(
@@ -126,7 +126,7 @@ class Box:
     """The range of states and inputs that a model is learned over, and its scaled coordinates."""
 
     states: Coordinates  #: the states' names, units, scaling and range
-    inputs: Coordinates  #: the inputs' likewise
+    inputs: Coordinates  #: coordinates of the inputs
     time_unit: str  #: ``'s'`` or ``'min'``
 
     __repr__ = short_repr
@@ -136,16 +136,16 @@ class Box:
         """
         Return the range of some values.
 
-        :param x: (N, n_x) states, and u (N, n_u) inputs, in their units.
+        :param x: (N, n_x) states, NaN for a missing one, and u (N, n_u) inputs, in their units.
         :param nominal: whether deviations are from the nominal point or from the middle.
         :raises ValueError: when a state or an input never moves, or the sizes do not fit.
         """
         for what, given in (('x', x), ('u', u)):
             if np.ndim(given) != 2:
-                raise ValueError(f'incompatible {what}: expected one row a sample, got an array '
+                raise ValueError(f'incompatible {what}: expected one row per sample, got an array '
                                  f'{np.shape(given)}')
         states, inputs = (
-            Coordinates.spanning(names, units, np.min(values, axis=0), np.max(values, axis=0),
+            Coordinates.spanning(names, units, np.fmin.reduce(values), np.fmax.reduce(values),
                                  center if nominal else None)
             for names, units, center, values in (
                 (plant.state_names, plant.state_units, plant.nominal_state, x),

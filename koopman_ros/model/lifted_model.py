@@ -29,6 +29,8 @@ from koopman_ros.model_classes import (
     POLYNOMIAL,
 )
 
+LONGEST_DEAD_TIME = 3600.0  #: s
+
 _SAMPLES = 256  # random states of a box whose training states are not known
 # Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
 _MAX_DRIFTS = 10_000
@@ -63,7 +65,7 @@ class Provenance:
     def __post_init__(self) -> None:
         if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
                 self.accepted is not None):
-            raise ValueError(f'accepted = {self.accepted} does not fit the reasons '
+            raise ValueError(f'accepted = {self.accepted} contradicts the reasons '
                              f'{list(self.reasons)}')
 
     @property
@@ -107,6 +109,8 @@ class LiftedModel:
     pre_feedback: Array | None = None
     #: closed loops of the model's law; None where they are not known, or none failed
     verified_loops: VerifiedLoops | None = None
+    #: (n_u,) dead time of each input in s, from its application to its effect; or one for all
+    dead_time: Array = field(default_factory=lambda: np.zeros(()))
 
     __repr__ = short_repr
 
@@ -119,6 +123,8 @@ class LiftedModel:
                     of.names, of.units, of.lower.tolist(), of.upper.tolist(), strict=True):
                 lines.append(f'{role} {name}: trained from {shown(low, unit):.6g} to '
                              f'{shown(high, unit):.6g} {display_unit(unit)}')
+        lines += [f'dead time of {name}: {seconds:.6g} s' for name, seconds in zip(
+            self.inputs.names, self.dead_time.tolist(), strict=True) if seconds > 0.0]
         rates = self.eigenvalues.real
         lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
                   *(f'held-out {name}: {value:.3g}' for name, value in about.metrics.items()),
@@ -139,6 +145,13 @@ class LiftedModel:
                             ('readout', (n_x, self.observables.features.n_z))):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, frozen(value, name, shape))
+        dead = frozen(self.dead_time if np.ndim(self.dead_time) else np.full(n_u, self.dead_time),
+                      'dead_time', (n_u,))
+        object.__setattr__(self, 'dead_time', dead)
+        for name, seconds in zip(self.inputs.names, dead.tolist(), strict=True):
+            if not 0.0 <= seconds <= LONGEST_DEAD_TIME:
+                raise ValueError(f'the dead time of {name} must be 0 to {LONGEST_DEAD_TIME:g} s, '
+                                 f'got {seconds:g} s')
         if self.input_terms is not None and (
                 self.input_terms.coefficients.shape[1:] != self.B.shape):
             raise ValueError(f'incompatible input terms: expected {("any", *self.B.shape)}, got '
@@ -205,7 +218,8 @@ class LiftedModel:
         Simulate the states under inputs that are held: dx/dt = f(x) + B(x) u.
 
         :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
-        :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
+        :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units, from
+            the time at which they act on: :attr:`dead_time` does not count.
         :param sample_period: in the model's time unit, or (K,) periods.
         :return: (..., K + 1, n_x) states at the samples, in state units.
         :raises RuntimeError: when the prediction diverges.
@@ -240,7 +254,7 @@ class LiftedModel:
             xi = solver.y.reshape(shape)
             if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
                 raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
-                                   'inputs within the training box')
+                                   'inputs within the trained range')
             path.append(xi)
         return self.states.to_physical(np.stack(path, axis=-2))
 
@@ -335,7 +349,7 @@ class LiftedModel:
 
     def failed_near(self, x: Array, x_ref: Array) -> bool:
         """
-        Tell whether the law failed in the tested loop nearest to a state and a set-point.
+        Whether the law failed in the tested loop nearest to a state and a set-point.
 
         Both (n_x,) in scaled deviations; see :attr:`verified_loops`.
         """

@@ -108,7 +108,7 @@ def check(model: LiftedModel) -> None:
             ('the number of metrics', len(origin.metrics), _MAX_ENTRIES),
             ('the number of reasons', len(origin.reasons), _MAX_ENTRIES)):
         if size > limit:
-            raise ValueError(f'{name} is {size}, at most {limit} can be controlled with')
+            raise ValueError(f'{name} is {size}, the maximum is {limit}')
     for signals in (model.states, model.inputs):
         for name, unit in zip(signals.names, signals.units, strict=True):
             _check_text('the name of a signal', name)
@@ -132,11 +132,11 @@ def check(model: LiftedModel) -> None:
 
 def _check_text(what: str, text: object, longest: int = _MAX_NAME) -> None:
     if not isinstance(text, str):
-        raise TypeError(f'{what} must be a text, got {text!r}')
+        raise TypeError(f'{what} must be a string, got {text!r}')
     if len(text) > longest:
-        raise ValueError(f'{what} has {len(text)} characters, at most {longest} may be')
+        raise ValueError(f'{what} has {len(text)} characters, the maximum is {longest}')
     if not text.isprintable():
-        raise ValueError(f'{what} = {text!a} holds characters that cannot be shown')
+        raise ValueError(f'{what} = {text!a} contains unprintable characters')
 
 
 def _description(model: LiftedModel) -> dict[str, Any]:
@@ -146,6 +146,8 @@ def _description(model: LiftedModel) -> dict[str, Any]:
         'states': _signals(model.states), 'time_unit': model.time_unit}
     if isinstance(model.observables, NetworkObservables):
         about['identity'] = model.observables.identity
+    if model.dead_time.any():
+        about['dead_time'] = model.dead_time.tolist()
     if model.training_states is not None:
         about['fill_distance'] = model.training_states.fill_distance
     return about
@@ -198,7 +200,7 @@ def _read(path: Path) -> bytes:
         raise ModelFileError(f'cannot read the model file {path}: {error.strerror}') from error
     if len(content) > _MAX_BYTES:
         raise ModelFileError(f'{path} is not a usable model file: it has more than {_MAX_BYTES} '
-                             'bytes, far more than any model; check the path')
+                             'bytes, the maximum; check the path')
     return content
 
 
@@ -208,14 +210,14 @@ def _parsed(content: bytes) -> LiftedModel:
     # the library has checked the header, and gives its metadata for paths alone
     header = json.loads(content[8:8 + int.from_bytes(content[:8], 'little')])
     if _KEY not in header.get('__metadata__', {}):
-        raise ValueError('it is a safetensors file of something else')
+        raise ValueError('it is a safetensors file, but not of a model')
     metadata = json.loads(header['__metadata__'][_KEY])
     if (version := metadata['format_version']) != FORMAT_VERSION:
         raise ValueError(f'it has format version {version!r}, this package reads '
                          f'{FORMAT_VERSION}')
     about = metadata['model']
     if metadata['sha256'] != _checksum(about, tensors):
-        raise ValueError('its checksum is wrong, so it was damaged or edited')
+        raise ValueError('its checksum is wrong: the file was damaged or edited')
     for name, array in tensors.items():
         expected = {'exponents': np.int64, 'verified_loops.lost': np.bool_}.get(name, np.float64)
         if array.dtype != expected:
@@ -244,7 +246,9 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
         readout=tensors.pop('readout', None),
         input_terms=None if terms is None else InputTerms(terms),
         pre_feedback=tensors.pop('pre_feedback', None),
-        verified_loops=tried)
+        verified_loops=tried,
+        dead_time=np.array(_of_type(list, about, 'dead_time') if 'dead_time' in about else 0.0,
+                           dtype=np.float64))
     if tensors:
         raise ValueError(f'it holds unknown arrays: {", ".join(sorted(tensors))}')
     return model

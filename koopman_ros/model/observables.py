@@ -194,10 +194,11 @@ class PolynomialObservables(Observables):
             raise ValueError(f'the first {n_x} rows of exponents must be the states, the identity '
                              f'matrix, got {E[:n_x].tolist()}')
         if np.any(E.sum(axis=1) == 0):
-            raise ValueError('a row of exponents is a constant, which N(0) = 0 rules out: drop it')
+            raise ValueError('a row of exponents is a constant, which N(0) = 0 excludes: remove '
+                             'it')
         rows, counts = np.unique(E, axis=0, return_counts=True)
         if np.any(counts > 1):
-            raise ValueError(f'the row {rows[np.argmax(counts)].tolist()} of exponents comes '
+            raise ValueError(f'the row {rows[np.argmax(counts)].tolist()} of exponents occurs '
                              f'{np.max(counts)} times: keep one')
         E.setflags(write=False)
         object.__setattr__(self, 'exponents', E)

@@ -24,7 +24,7 @@ class TrainingStates:
 
     A box around the data of several states has corners without data.
 
-    :raises ValueError: naming what does not fit.
+    :raises ValueError: naming the mismatch.
     """
 
     states: Array  #: (M, n_x) in scaled deviations, M from 1 to 256
@@ -82,11 +82,11 @@ class VerifiedLoops:
     """
     The closed loops that a model's law was tested in, and which of them failed.
 
-    :raises ValueError: naming what does not fit.
+    :raises ValueError: naming the mismatch.
     """
 
     starts: Array  #: (N, n_x) initial states in scaled deviations, N from 1 to 1024
-    setpoints: Array  #: (N, n_x) likewise
+    setpoints: Array  #: (N, n_x) set-points of the loops
     #: (N,) whether the law did not arrive, or had no gain, where a linear law arrived
     lost: NDArray[np.bool_]
 
@@ -112,7 +112,7 @@ class VerifiedLoops:
 
     def failed_near(self, x: Array, x_ref: Array, half_widths: Array) -> bool:
         """
-        Tell whether the loop nearest to a state and a set-point, (n_x,) each and scaled, failed.
+        Whether the loop nearest to a state and a set-point, (n_x,) each and scaled, failed.
 
         Of two loops at the same distance, in half-ranges, the one that arrived counts.
         """

@@ -16,7 +16,7 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_srvs.srv import Trigger
 
-from koopman_ros.control import events, MANUAL, Mode, StepReport
+from koopman_ros.control import AppliedInputs, events, MANUAL, Mode, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words
@@ -79,8 +79,8 @@ class ControllerNode(ManagedNode):
         model = str(given.get('model') or plant_defaults(system, 'controller').get('model', ''))
         if not model:
             raise ConfigurationError(
-                f'there is no model of the system {system!r}: name one in model, or in system one '
-                f'of {", ".join(bundled_plants())}')
+                f'no model is known for the system {system!r}: set model, or set system to one of '
+                f'{", ".join(bundled_plants())}')
         loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
@@ -89,6 +89,7 @@ class ControllerNode(ManagedNode):
         self._loaded: LoadedModel | None = loaded
         # (n_u,) last command before the node became inactive, which is still in force at the plant
         self._last_command: Array | None = None
+        self._applied = AppliedInputs()  # inputs that may still act then
 
     def configure(self) -> None:
         """Load the model and create the loop, which does not command yet."""
@@ -156,7 +157,7 @@ class ControllerNode(ManagedNode):
         """Begin to command, from the present inputs; earlier set-point requests are kept."""
         with self._loop.lock:
             self._timing, self._received = Timing(self), time.monotonic()
-            self._loop.begin(self._timing)
+            self._loop.begin(self._timing, self._applied)
             self._measurements.begin(
                 self._timing, lambda: self._settings.measurement_timeout or _SOURCES_WINDOW,
                 lambda: self._loop.state.command is not None)
@@ -169,6 +170,7 @@ class ControllerNode(ManagedNode):
             self._measurements.end()
             if self._loop.state.command is not None:
                 self._last_command = self._loop.state.command
+                self._applied = self._loop.state.applied
 
     def complete(self) -> None:
         """Stop watchdog and model reload before the middleware shuts down."""
@@ -211,8 +213,8 @@ class ControllerNode(ManagedNode):
                                     advance is not Advance.OLD)
         if outcome is None or outcome.report is None:
             self.get_logger().error(
-                'a measurement is not answered, as a control step takes longer than the watchdog '
-                'waits: choose a smaller model', throttle_duration_sec=1.0)
+                'no command for a measurement, because a control step takes longer than the '
+                'watchdog waits: choose a smaller model', throttle_duration_sec=1.0)
             return
         report = outcome.report
         self._recent.add(
@@ -269,8 +271,8 @@ class ControllerNode(ManagedNode):
                 self.get_logger().info(change, throttle_duration_sec=1.0)
             self._logged = report
         if report.measurement.clock_went_back:
-            self.get_logger().warning('the measurement is older than the last one: time starts '
-                                      'afresh', throttle_duration_sec=1.0)
+            self.get_logger().warning('the stamp of the measurement jumped back by more than 1 s: '
+                                      'controller time is reset', throttle_duration_sec=1.0)
         # of many measurements within PERIOD the status shows the first, and then the last
         until, *told = self._last_status
         now = time.monotonic()

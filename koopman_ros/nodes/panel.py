@@ -66,7 +66,7 @@ _REMOTE_PERIOD = 0.5  # s between two looks at other nodes
 _LOGGED = 300  # characters of an action in the log
 #: node, service and type of the service, by action
 _SERVICES = {
-    'reload': (CONTROLLER, 'reload_model', Trigger),
+    'reset': (PLANT, 'reset', Trigger), 'reload': (CONTROLLER, 'reload_model', Trigger),
     'automatic': (CONTROLLER, 'set_automatic', SetBool),
     'train': (TRAINER, 'train', Trigger), 'cancel': (TRAINER, 'cancel_training', Trigger),
     'record': (TRAINER, 'record', SetBool), 'experiment': (TRAINER, 'experiment', SetBool)}
@@ -110,9 +110,8 @@ class PanelNode(LoopNode):
         self._subscribe()
         self._operator_actions = self._matching.publish(topics.AUDIT_LOG)
         self._nodes = {role: RemoteNode(
-            self, getattr(settings, role),
-            {service: kind for of, service, kind in _SERVICES.values() if of == role},
-            partial(self.view.take_parameters, role)) for role in (CONTROLLER, TRAINER)}
+            self, name, {service: kind for of, service, kind in _SERVICES.values() if of == role},
+            partial(self.view.take_parameters, role)) for role, name in nodes.items()}
         self._wake = self.create_guard_condition(self._on_actions)
         wall_timer(self, _PERIOD, self._on_timer)
         wall_timer(self, _REMOTE_PERIOD, self._on_remote_timer)
@@ -149,8 +148,8 @@ class PanelNode(LoopNode):
             store = AlarmStore(self.view.alarms, Path(path), time.time())
         except (OSError, ValueError) as error:
             raise ConfigurationError(
-                f'alarm_file = {path!r} cannot be used ({error}): name a new file in a folder '
-                'that can be written, or one that a panel wrote') from error
+                f'alarm_file = {path!r} cannot be used ({error}): name a new file in a writable '
+                'folder, or a file written by a panel') from error
         if store.complaint:
             self.get_logger().warning(store.complaint)
         return store
@@ -160,8 +159,8 @@ class PanelNode(LoopNode):
             from koopman_ros.panel.server import PanelServer
         except ImportError as error:
             raise ConfigurationError(
-                f'the panel needs {error.name}, which is missing: pip install '
-                "'nicegui>=3' argon2-cffi itsdangerous limits") from error
+                f"the panel needs {error.name}, which is not installed: pip install 'nicegui>=3' "
+                'argon2-cffi itsdangerous limits') from error
         settings = self.settings
         server = PanelServer(
             self, settings.host, settings.port, settings.users, settings.tls_certificate,
@@ -272,7 +271,7 @@ class PanelNode(LoopNode):
         try:
             model = load(model_path(name))
         except (OSError, ValueError) as error:
-            self.get_logger().warning(f'no training range is shown: {error}')
+            self.get_logger().warning(f'trained ranges are not shown: {error}')
             self._training_ranges, card = {}, {}
         else:
             self._training_ranges, card = training_ranges(model), model_card(model)
@@ -347,7 +346,9 @@ class PanelNode(LoopNode):
             reply(_not_running(CONTROLLER))
             return
         accepted = 'accepted'
-        if not setpoint and (limited := self.view.limited(name, value)) != value:
+        if setpoint and self.snapshot.mode == 'manual':
+            accepted = 'accepted: the controller follows it only in automatic mode'
+        elif not setpoint and (limited := self.view.limited(name, value)) != value:
             accepted = f'limited to {limited:.6g} {printed(read)}'
         own = float(conversion(read, unit)(value))
         answered = self._repeated.send(name, place, unit, own)
@@ -374,7 +375,7 @@ class PanelNode(LoopNode):
         return f'outside {to_read(low):.6g} to {to_read(high):.6g} {read}, the trained range'
 
     def _status(self) -> TaskReport:
-        return TaskReport(Severity.OK, f'{self._server.pages} pages open', {
+        return TaskReport(Severity.OK, f'{self._server.pages} pages are open', {
             'address': self._server.address, 'pages': self._server.pages})
 
 

@@ -43,11 +43,11 @@ _SILENCE = 3.0  # s without a command, and five periods, after which somebody sh
 class RunPhase(Enum):
     """Phase of the simulation; the value is the message for the operator."""
 
-    WAITING = 'waiting for the loop: no controller yet'
+    WAITING = 'waiting for a controller or trainer to subscribe'
     RUNNING = 'running'
-    FINISHED = 'finished: the duration is over'
-    OUT_OF_STAMPS = (f'finished: the stamps of messages end at {LAST_STAMP_SECONDS} s; start the '
-                     'plant again with a smaller start_time')
+    FINISHED = 'finished: simulated duration reached'
+    OUT_OF_STAMPS = (f'finished: message stamps end at {LAST_STAMP_SECONDS} s; restart the plant '
+                     'with a smaller start_time')
     TRIPPED = 'stopped'
 
 
@@ -110,11 +110,11 @@ class PlantNode(ManagedNode):
         else:
             self._tick = wall_timer(self, wall_period, self._step_in_time)
         self.follow_table(table, parameters, self._on_parameters)
-        pace = ('as fast as it can' if not parameters.speed else 'in real time'
-                if self._real_time else f'{parameters.speed:g} times as fast as the clock')
-        start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s on'
-        lockstep = (f', in lock-step: it begins with {parameters.lockstep_subscribers} '
-                    'subscribers and a controller') if parameters.lockstep else ''
+        pace = ('as fast as possible' if not parameters.speed else 'in real time'
+                if self._real_time else f'at {parameters.speed:g} times real time')
+        start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s'
+        lockstep = (f', in lock-step: starts when {parameters.lockstep_subscribers} nodes '
+                    'subscribe and a controller is found') if parameters.lockstep else ''
         self.get_logger().info(f'{self._plant.process.system.name} started: a measurement every '
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
@@ -216,7 +216,7 @@ class PlantNode(ManagedNode):
         stamp, frame_id = stamp_message(self._plant.process.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
-        self._applied.send(self._plant.process.u, stamp, frame_id)
+        self._applied.send(self._plant.process.applied, stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
         self._states.send(measured, stamp, frame_id, variance, resolution)
 
@@ -226,7 +226,7 @@ class PlantNode(ManagedNode):
             self._plant.advance(time_ns)
         except plants.IntegrationError as error:
             self._phase, self._trip = RunPhase.TRIPPED, str(error)
-            self.get_logger().error(f'{error}; call ~/reset to start again')
+            self.get_logger().error(f'{error}; call ~/reset to restart')
             self._diagnostics.publish_if_changed()
             return False
         return True
@@ -258,7 +258,7 @@ class PlantNode(ManagedNode):
             self._rejection = (
                 f'{base_name(wrong[0], unit)} command '
                 f'{quantity_text(self._received[wrong[0]], unit)} is not finite and was rejected: '
-                'the last good one is held')
+                'the last valid one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
         if not lockstep:
@@ -277,7 +277,7 @@ class PlantNode(ManagedNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._phase in (RunPhase.FINISHED, RunPhase.OUT_OF_STAMPS):
-            response.message = ('the duration is over: start the plant again'
+            response.message = ('the simulated duration is reached: restart the plant'
                                 if self._phase is RunPhase.FINISHED else self._phase.value)
             return response
         response.success = True
@@ -293,7 +293,7 @@ class PlantNode(ManagedNode):
         return response
 
     def _resynchronise(self) -> None:
-        """Resume after a stop, during which the plant's time stood still."""
+        """Resume after a stop, during which the plant's time did not advance."""
         if self._settings.lockstep:
             self._answered = True
             self._continue_lockstep()
@@ -324,8 +324,8 @@ class PlantNode(ManagedNode):
             level = Severity.WARN
         elif self._unanswered():
             level, message = Severity.WARN, (
-                'running, but no command arrives: the last one is held; check that the controller '
-                'is active, and its topics and domain')
+                'running, but no command is received: the last one is held; check that the '
+                'controller is active, and its topics and ROS domain')
         return TaskReport(level, message, lambda: {
             'time [s]': seconds_text(self._plant.process.time_ns),
             **self._plant.figures(),

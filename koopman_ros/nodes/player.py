@@ -56,7 +56,7 @@ class PlayerNode(LoopNode):
         if not played:
             known = ', '.join(sorted(t for t, count in content.counts.items() if count))
             raise ConfigurationError(f'bag {settings.bag!r} has no message on {", ".join(names)}: '
-                                     f'choose topics among {known or "none"}')
+                                     f'choose from {known or "none"}')
         self._total = sum(content.counts[topic] for topic in played)
         # a measurement is whole when all of its parts are out
         self._measured = {'/' + name.lstrip('/') for name in settings.measurement} & set(played)
@@ -98,8 +98,8 @@ class PlayerNode(LoopNode):
                 if time.monotonic() - self._asked > self._settings.answer_timeout:
                     self._give_up(
                         f'no command for the measurement at {self._open / NANOSECONDS:.3f} s '
-                        f'within {self._settings.answer_timeout:g} s: is the controller alive? A '
-                        'rate above 0 plays without waiting for answers')
+                        f'within {self._settings.answer_timeout:g} s: check that the controller '
+                        'is running; a rate above 0 plays without waiting for answers')
             elif self._lockstep:
                 self._play_in_lockstep()
             else:
@@ -107,7 +107,7 @@ class PlayerNode(LoopNode):
         except records.BagReadError as error:
             self._give_up(str(error))
         except MemoryError:
-            self._give_up('the messages of five seconds do not fit into memory: play fewer topics')
+            self._give_up('five seconds of messages do not fit into memory: play fewer topics')
 
     def _begin(self) -> None:
         """Start once all subscribers are there."""
@@ -124,7 +124,7 @@ class PlayerNode(LoopNode):
             self.get_logger().info(f'playing {self._settings.bag}')
         elif time.monotonic() - self._wall_start > self._settings.wait_timeout:
             self._give_up(
-                f'{", ".join(missing)} found no counterpart within '
+                f'{", ".join(missing)} found no subscriber or publisher within '
                 f'{self._settings.wait_timeout:g} s: start the controller first, or set '
                 'wait_for_subscribers to 0')
 
@@ -167,8 +167,9 @@ class PlayerNode(LoopNode):
                 continue
             patience = Duration(seconds=self._settings.answer_timeout)
             if not self._outlets[message.topic].wait_for_all_acked(patience):
-                self._give_up(f'nobody received a message on {message.topic} within '
-                              f'{self._settings.answer_timeout:g} s: is the controller alive?')
+                self._give_up(f'no node received a message on {message.topic} within '
+                              f'{self._settings.answer_timeout:g} s: check that the controller is '
+                              'running')
                 return
             self._received.add(message.topic)
         self._say_progress()
@@ -206,7 +207,8 @@ class PlayerNode(LoopNode):
         self.get_logger().info(f'played {self._sent} messages in {seconds:.3f} s')
         self.exit_code = 0
         if not received:
-            self._give_up('not all of the last messages were received: are the subscribers alive?')
+            self._give_up('not all of the last messages were received: check that the subscribers '
+                          'are running')
 
     def _give_up(self, reason: str) -> None:
         self._timer.cancel()
@@ -223,7 +225,7 @@ def _stamp_ns(message: records.BagMessage) -> int | None:
 
 
 def recorded_offer(offered: tuple[Qos, ...]) -> QoSProfile:
-    """Offer what all publishers of the recording offered."""
+    """Return the quality of service that all recorded publishers offered."""
     best_effort = {o.reliability for o in offered} == {QosReliability.BEST_EFFORT}
     latched = {o.durability for o in offered} == {QosDurability.TRANSIENT_LOCAL}
     return topics.profile(

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The replay: the records in bags through the control step again, and beside a new model."""
+"""The replay: re-runs the control step on recorded bags, also with a new model."""
 
 from collections.abc import Callable, Mapping
 import sys
@@ -34,16 +34,16 @@ def _run(parameters: ReplayParameters, topic: str, given: Mapping[str, Any]) -> 
     try:
         result = replay_bags(parameters, topic, given)
     except MemoryError:
-        print('replay: memory does not suffice for these bags: replay them one by one, or shorter '
+        print('replay: out of memory: replay the bags one by one, or shorter '
               'ones', file=sys.stderr)
         return 1
     if result is Result.DIFFERENT:
-        print('replay: not all recorded commands are reproduced within '
-              f'{parameters.tolerance:g}: see the report for the first, and replay with the '
-              'package that recorded them', file=sys.stderr)
+        print(f'replay: not all recorded commands are reproduced within {parameters.tolerance:g}: '
+              'see the report for the first difference, and replay with the package that recorded '
+              'the bag', file=sys.stderr)
     elif result is Result.NOTHING_COMPARED:
         print('replay: nothing to compare in a bag: its records hold no snapshot before a '
-              'command; give bags that begin with the run, or go on for longer', file=sys.stderr)
+              'command; use bags that begin with the run, or longer ones', file=sys.stderr)
     return result
 
 

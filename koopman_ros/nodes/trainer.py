@@ -25,7 +25,7 @@ from koopman_ros.ros.training import present_lift, Training
 
 
 class TrainerNode(ManagedNode):
-    """Compose what the trainer does; docs/reference/interfaces.md has its topics and services."""
+    """Combine recording, experiments and training; see docs/reference/interfaces.md."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('trainer', **options)

@@ -4,7 +4,7 @@
 """
 Users of the panel, their roles, and hashes of their passwords.
 
-``python -m koopman_ros.panel.access FILE NAME ROLE`` asks for a password and stores the user.
+``python -m koopman_ros.panel.access FILE NAME ROLE`` reads a password and stores the user.
 """
 
 import argparse
@@ -140,7 +140,7 @@ def write_user(path: str | os.PathLike[str], name: str, role: Role, secret: str)
     name = normalised(name)
     line = f'{name}:{role.value}:{secret}'
     if line.split() != [line]:
-        raise ValueError('a line of the file has no blanks: the name or the hash is wrong')
+        raise ValueError('the name and the hash must not contain spaces')
     owner = target.stat() if target.exists() else None
     lines = _read(target).splitlines() if owner else []
     kept = [line for line in lines if normalised(line.partition(':')[0].strip()) != name]
@@ -157,8 +157,8 @@ def write_user(path: str | os.PathLike[str], name: str, role: Role, secret: str)
 def _read(path: str | os.PathLike[str]) -> str:
     content, about = read_bounded(Path(path), MAX_FILE)
     if about.st_mode & 0o022:
-        raise ValueError(f'{path} can be written by others, its mode is '
-                         f'{stat.S_IMODE(about.st_mode):04o}: chmod 600 it, and check it')
+        raise ValueError(f'{path} is writable by others (mode {stat.S_IMODE(about.st_mode):04o}): '
+                         'chmod 600 it, and check its content')
     return content.decode()
 
 
@@ -169,7 +169,7 @@ def _parsed(text: str, path: str | os.PathLike[str]) -> dict[str, _User]:
             try:
                 name, user = _user(line.strip())
                 if name in users:
-                    raise ValueError(f'there is a user {name!r} already')
+                    raise ValueError(f'user {name!r} already exists')
             except ValueError as error:
                 raise ValueError(f'{path}, line {number}: {error}') from error
             users[name] = user

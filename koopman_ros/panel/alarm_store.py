@@ -59,7 +59,7 @@ class AlarmStore:
 
     def _load(self, content: bytes, now: float) -> None:
         if not _BEGIN.match(content):
-            raise ValueError(f'{self._path} is no file of alarms, and is not replaced')
+            raise ValueError(f'{self._path} is not an alarm file and is not replaced')
         try:
             self._alarms.restore(*_parsed(content.decode()), now)
         except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError,
@@ -67,8 +67,8 @@ class AlarmStore:
             aside = _unused(self._path)
             # fails if there is one by now
             os.link(self._path, aside)
-            self.complaint = (f'the alarms of {self._path} are not loaded, as the file is damaged '
-                              f'({error}): it is kept as {aside}')
+            self.complaint = (f'the alarms of {self._path} are not loaded, because the file is '
+                              f'damaged ({error}): it is kept as {aside}')
 
     def save(self, now: float) -> None:
         """Save changes, every few seconds; to be called more often."""
@@ -91,8 +91,8 @@ class AlarmStore:
             file.flush()
             saved = _identity(file.fileno())
             if self._path.exists() and _identity(self._path) != self._own:
-                raise FileExistsError(f'another program has written {self._path} since, and it is '
-                                      'not replaced: give each panel its own alarm_file')
+                raise FileExistsError(f'another program has changed {self._path}, so it is not '
+                                      'replaced: give each panel its own alarm_file')
         self._own = saved
 
 
@@ -108,7 +108,7 @@ def _identity(of: Path | int) -> _Identity:
 
 
 def _unused(path: Path) -> Path:
-    """Return a name beside a file that no other file has."""
+    """Return an unused name in the folder of a file."""
     number, found = 1, path.with_name(f'{path.name}.damaged')
     while os.path.lexists(found):
         number, found = number + 1, path.with_name(f'{path.name}.damaged{number + 1}')

@@ -168,7 +168,7 @@ class Alarms:
         """Acknowledge an alarm; return the reason if that is not possible."""
         def act(record: _Record) -> str:
             if record.state is AlarmState.ACKNOWLEDGED:
-                return f'it was acknowledged already, by {record.acknowledged_by}'
+                return f'already acknowledged by {record.acknowledged_by}'
             back = record.state is AlarmState.RETURNED
             record.state = AlarmState.NORMAL if back else AlarmState.ACKNOWLEDGED
             record.acknowledged_by = '' if back else sanitize_text(who, MAX_WHO)
@@ -193,7 +193,7 @@ class Alarms:
         """Show a shelved alarm again; return the reason if that is not possible."""
         def act(record: _Record) -> str:
             if record.shelved_until is None:
-                return 'it is not shelved'
+                return 'the alarm is not shelved'
             record.shelved_until = None
             self._note(now, record, 'unshelved', who)
             return ''
@@ -232,7 +232,7 @@ class Alarms:
     def restore(self, alarms: Iterable[Alarm], journal: Iterable[AlarmLogEntry],
                 now: float) -> None:
         """
-        Replace all alarms by those of before a restart.
+        Replace all alarms by those before a restart.
 
         An active alarm stays active until its condition has not been reported for a while.
 
@@ -268,7 +268,7 @@ class Alarms:
             record = self._records.get(key)
             if record is None or (record.state is AlarmState.NORMAL
                                   and not (shelved and record.shelved_until is not None)):
-                return f'there is no such alarm to {what}'
+                return f'this alarm no longer exists and cannot be used to {what}'
             refused = act(record)
             self._tidy(record)
             return refused

@@ -5,12 +5,16 @@
 
 from collections import deque
 from collections.abc import Mapping
+import re
 
 from koopman_ros.panel.alarms import Alarms, Priority
 from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.snapshot import (
+    CONTROL,
     CONTROLLER,
     ERROR,
+    EXPERIMENT,
+    MEASUREMENTS,
     OK,
     PLANT,
     REQUESTS,
@@ -18,14 +22,18 @@ from koopman_ros.panel.snapshot import (
     SilentTopic,
     TaskStatus,
     TRAINER,
+    TRAINING,
 )
 
 _SILENT = 3.5  # s without a status, of which there is one per second
+_START = 30.0  # s for which the nodes of a loop may start one after the other
+_ENDED = 10.0  # s for which an experiment or training that failed is an active alarm
 _PERIODS = 5.0  # usual times between two measurements without one
 _MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
 _MAX_NAME = 200  # characters
-# So many errors within so many seconds are an alarm, however short each of them is.
+# errors within seconds that are an alarm, however short each of them is
 _REPEATED, _WITHIN = 5, 60.0
+_NUMBER = re.compile(r'(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]\d+)?')
 
 
 class Conditions:
@@ -43,6 +51,9 @@ class Conditions:
         self._nodes, self._start = dict(nodes), now
         # wall time and message of the last changes to ERROR, by task
         self._errors: dict[str, deque[tuple[float, str]]] = {}
+        self._keys: dict[str, tuple[str, ...]] = {}  # of the alarms of each task
+        self._since: dict[str, float] = {}  # wall time of the present message, by task
+        self._begun: dict[str, float] = {}  # wall time of the first message, by role
         self._last: dict[str, float] = {}  # wall time of the last message, by role
         self._period = 0.0  # of the measurements
         self._watched = [CONTROLLER, PLANT]
@@ -50,6 +61,8 @@ class Conditions:
     def take_message(self, role: str, now: float) -> None:
         """Take note of a message of a node; of the plant it is a measurement."""
         last = self._last.get(role)
+        if last is None or now - last > self._patience(role):
+            self._begun[role] = now
         if role == PLANT and last is not None and now > last:
             self._period = min(0.9 * (self._period or now - last) + 0.1 * (now - last), 600.0)
         self._last[role] = now
@@ -84,36 +97,81 @@ class Conditions:
         if role in (PLANT, CONTROLLER):
             self.plant = plant or self.plant
         before = self.statuses.get(name)
-        self.statuses[name] = TaskStatus(name, level, message, dict(values))
+        status = self.statuses[name] = TaskStatus(
+            name, level, message or ('' if level == OK else 'no reason was given'), dict(values))
+        if before is None or before.message != status.message:
+            self._since[name] = now
         if level >= ERROR and (before is None or before.level < ERROR):
-            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append((now, message))
-        # a refused request is shown to its operator
+            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append((now, status.message))
         priority = Priority.HIGH if level >= ERROR else (
-            Priority.MEDIUM if role == CONTROLLER and name != REQUESTS else Priority.LOW)
-        # a warning that the control task repeats has a task and an alarm of its own
-        repeated = level < ERROR and values.get('condition', 'control') != 'control'
-        self.alarms.report(name, level > OK and not repeated, priority, f'{name}: {message}', now)
+            Priority.MEDIUM if role == CONTROLLER else Priority.LOW)
+        active, texts = level > OK and self._is_alarm(status, now), {name: status.message}
+        warnings = [text for key, text in values.items() if key.startswith('warning ')]
+        if warnings := warnings or [status.message] * (name == CONTROL):
+            # a condition is its sentence without the numbers
+            texts = {sanitize_text(f'{name}: {_NUMBER.sub("#", text)}', _MAX_NAME): text
+                     for text in warnings}
+        for key in {*self._keys.get(name, ()), *texts}:
+            self.alarms.report(key, active and key in texts, priority,
+                               f'{name}: {texts.get(key, "")}', now)
+        self._keys[name] = tuple(texts)
+
+    def _is_alarm(self, status: TaskStatus, now: float) -> bool:
+        """Return whether a warning or an error is an alarm, and no other alarm shows it."""
+        if status.name == REQUESTS or (
+                status.name == EXPERIMENT and status.message.startswith('refused')):
+            # the operator who made the request reads the answer
+            return False
+        if status.name in (EXPERIMENT, TRAINING):
+            return now - self._since[status.name] < _ENDED
+        if status.name.startswith(f'{PLANT}: ') and any(
+                status.message in other.message for other in self.statuses.values()
+                if other.level > OK and other.name.startswith(f'{CONTROLLER}: ')):
+            # the controller has noticed it as well
+            return False
+        if status.name == MEASUREMENTS:
+            return not self._is_silent(PLANT, now)
+        if status.name != CONTROL:
+            return True
+        if self._unmeasured():
+            return now - self._begun[CONTROLLER] > _START and not self._is_silent(PLANT, now)
+        return status.level >= ERROR or status.values.get('condition', 'control') == 'control'
+
+    def _unmeasured(self) -> bool:
+        """Return whether the controller complains of missing measurements."""
+        status = self.statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
+        try:
+            return status.level > OK and (status.values.get('measurements') == '0' or float(
+                status.values['since last measurement [s]']) > self._patience(PLANT))
+        except (KeyError, ValueError):
+            return False
 
     def advance(self, now: float) -> None:
         """Raise the alarms of silence and of repeated errors, and let delays run out."""
-        silent = {silence.role for silence in self.silences(now)}
         for name, errors in self._errors.items():
             often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
                 f'{name}, repeated errors', often, Priority.HIGH, f'{name}: at least {_REPEATED} '
                 f'errors within {_WITHIN:g} s, the last: {errors[-1][1]}', now)
         for role in self._watched:
-            text = 'no measurement' if role == PLANT else f'no message from the {role}'
-            self.alarms.report(f'silence of {role}', role in silent,
+            text = f'no message from the {role}'
+            if role == PLANT:
+                # the message of the controller says how it reacts
+                reported = self._unmeasured() and not self._is_silent(CONTROLLER, now)
+                text = self.statuses[CONTROL].message if reported else 'no measurement'
+            silent = self._is_silent(role, now) and (
+                role in self._last or now - self._start > _START)
+            self.alarms.report(f'silence of {role}', silent,
                                Priority.LOW if role == TRAINER else Priority.HIGH, text, now)
         self.alarms.advance(now)
 
     def silences(self, now: float) -> tuple[SilentTopic, ...]:
         """Return the silent nodes."""
-        found = []
-        for role in self._watched:
-            patience = max(_SILENT, _PERIODS * self._period) if role == PLANT else _SILENT
-            last = self._last.get(role, self._start)
-            if now - last > patience:
-                found.append(SilentTopic(role, last, role in self._last))
-        return tuple(found)
+        return tuple(SilentTopic(role, self._last.get(role, self._start), role in self._last)
+                     for role in self._watched if self._is_silent(role, now))
+
+    def _is_silent(self, role: str, now: float) -> bool:
+        return now - self._last.get(role, self._start) > self._patience(role)
+
+    def _patience(self, role: str) -> float:
+        return max(_SILENT, _PERIODS * self._period) if role == PLANT else _SILENT

@@ -24,6 +24,16 @@ def number(value: float, decimals: int) -> str:
     return f'{value:.{decimals}f}' if math.isfinite(value) else '–'
 
 
+def span_text(bounds: Range, decimals: int) -> str:
+    """Write a range; each number of these decimals within those written is in the range."""
+    # the slack is that of converted units
+    scale, slack = 10.0 ** decimals, 1e-6
+    low, high = (rounded(end * scale + side * slack) / scale if math.isfinite(end) else end
+                 for rounded, side, end in zip((math.ceil, math.floor), (-1, 1), bounds,
+                                               strict=True))
+    return f'{number(low, decimals)} to {number(high, decimals)}'
+
+
 def pen(kind: str, name: str) -> str:
     """Return the name of the pen of a signal."""
     suffix = {'active_setpoints': ' set-point', 'predicted': ' predicted', 'planned': ' planned',
@@ -54,6 +64,10 @@ class Faceplate:
         """Write a value without the unit."""
         return number(value, self.decimals)
 
+    def span_text(self, bounds: Range) -> str:
+        """Write a range without the unit."""
+        return span_text(bounds, self.decimals)
+
     def share(self, value: float) -> float:
         """Return the place of a value on the bar, from 0 to 1."""
         low, high = self.span
@@ -77,7 +91,7 @@ class InputFaceplate(Faceplate):
 
     command: float
     applied: float  #: measured behind the actuator
-    manual: float  #: last accepted manual command
+    manual: float  #: requested in manual mode, within the limits, or the command
     disturbance: float  #: as a change of the input, in the signal's own unit
     own_unit: str  #: of the disturbance
 
@@ -132,8 +146,8 @@ class SignalValues:
             abnormal = 'at its lower limit'
         return InputFaceplate(
             self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
-            self.active, self.plan, command, applied, self.get('manual'), self.get('disturbance'),
-            self.unit)
+            self.active, self.plan, command, applied, self.get('manual', command),
+            self.get('disturbance'), self.unit)
 
 
 def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:
@@ -142,7 +156,9 @@ def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:
     finite = [value for value in values if math.isfinite(value)]
     low, high = known or (min(finite, default=0.0), max(finite, default=1.0))
     margin = 0.1 * (high - low) or max(1.0, 0.1 * abs(high))
-    return min([low - margin, *finite]), max([high + margin, *finite])
+    # a range of positive numbers begins at zero at most
+    begin = max(low - margin, 0.0) if low >= 0.0 else low - margin
+    return min([begin, *finite]), max([high + margin, *finite])
 
 
 def _decimals(span: Range) -> int:

@@ -9,8 +9,9 @@ import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+import re
 import time
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 from nicegui import ui
 from nicegui.element import Element
@@ -24,10 +25,11 @@ from koopman_ros.panel.view_model import LoopViewModel
 
 PERIOD = 0.25  # s between two updates of a page
 _TIMEOUT = 40.0  # s for an answer
-_TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
+TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
          '/tuning': 'Tuning'}
 _TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
 _ADDRESSES = ('href', 'src')
+_DEGREES = re.compile(r'\bdeg(?=[CF]\b)')
 _Kind = TypeVar('_Kind', bound=Element)
 NOT_ALLOWED = Answer(False, 'view only: log in as operator to make changes')
 
@@ -73,14 +75,14 @@ class PageLayout:
     """
 
     def __init__(self, source: Source, visitor: Visitor, path: str) -> None:
-        self.source, self.visitor = source, visitor
+        self.source, self.visitor, self._path = source, visitor, path
         self.enabled = visitor.may_act()  #: whether the controls can be used
         self._shown: Snapshot | None = None
         self._updates: list[Callable[[Snapshot], None]] = []
         self._beat_at = 0.0
         ui.add_css(CSS)
         ui.add_head_html(WATCH)
-        ui.page_title(f'{_TABS[path]} – {source.title}')
+        ui.page_title(f'{TABS[path]} – {source.title}')
         ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
         self._head(path)
         self.body = box('page')
@@ -94,7 +96,7 @@ class PageLayout:
             if self.visitor.named:
                 link('Log out', '/logout')
         with box('tabs', tag='nav').props('aria-label=Pages'):
-            tabs = {target: link(name, target) for target, name in _TABS.items()}
+            tabs = {target: link(name, target) for target, name in TABS.items()}
         tabs[path].classes('here').props('aria-current=page')
         banner = label('div', '', 'banner hidden').props('role=alert')
 
@@ -108,11 +110,12 @@ class PageLayout:
                 f'Alarms ({unacknowledged})' if unacknowledged else 'Alarms')
             if now.wall - self._beat_at >= 1.0:
                 self._beat_at = now.wall
-                beat.set_text(clock(now.wall))
+                beat.set_text(f'wall time {clock(now.wall)}')
                 attribute(beat, 'data-beat', f'{now.wall:.1f}')
             silent = [f'no message from the {one.role} since {clock(one.since)}' + (
                 '' if one.ever else ', the start of the panel') for one in now.silences]
-            banner.set_text(f'⚠ Connection lost: {"; ".join(silent)}')
+            known = any(one.ever for one in now.silences)
+            banner.set_text(f'⚠ {"Connection lost" if known else "Waiting"}: {"; ".join(silent)}')
             show_if(banner, bool(silent))
 
         self.follow(show)
@@ -135,10 +138,24 @@ class PageLayout:
         if not self.visitor.may_look():
             # logged out on another page, or idle for too long
             self._timer.cancel()
-            ui.navigate.to('/login')
+            ui.navigate.to(f'/login?page={self._path}')
             return
         for update in self._updates:
             update(now)
+
+    def card(self, title: str, name: str, role: str) -> Element:
+        """Return a card that is grey, with controls that do nothing, while a node is silent."""
+        found = card(title, name)
+
+        def show(now: Snapshot) -> None:
+            silent = any(one.role == role for one in now.silences)
+            if silent and 'inert' not in found.props:
+                found.props('inert')
+            elif not silent and 'inert' in found.props:
+                found.props(remove='inert')
+
+        self.follow(show)
+        return found
 
     # Actions.
 
@@ -148,9 +165,16 @@ class PageLayout:
             return NOT_ALLOWED
         future = self.source.ask(Action(self.visitor.name, what, name, value, old))
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
+            answer: Answer = await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
         except TimeoutError:
-            return Answer(False, f'no answer within {_TIMEOUT:g} s')
+            answer = Answer(False, f'no answer within {_TIMEOUT:g} s')
+        self._end_if_closed()
+        return answer
+
+    def _end_if_closed(self) -> None:
+        """End the present task if its page was closed."""
+        if self.body.is_deleted:
+            raise asyncio.CancelledError
 
     def control(self, element: Any) -> Any:
         """Return a control, disabled for a viewer."""
@@ -168,17 +192,26 @@ class PageLayout:
         if control.enabled is not (enabled := self.enabled and possible):
             control.set_enabled(enabled)
 
-    async def confirm(self, question: str, yes: str, details: Sequence[str] = ()) -> bool:
-        """Return whether the visitor confirms; Escape cancels."""
+    async def confirm(self, question: str, yes: str, details: Sequence[str] = (),
+                      changes: Sequence[Sequence[str]] = ()) -> bool:
+        """
+        Return whether the visitor confirms; Escape cancels.
+
+        :param changes: rows of three cells: a title, and the values before and after.
+        """
         with ui.dialog() as dialog, box('card'):
             label('div', question, 'value')
             for line in details:
                 label('div', line)
+            with box('changes'):
+                for cell in (cell for row in changes for cell in row):
+                    label('div', cell)
             with box('row1'):
                 ui.button('Cancel', on_click=lambda: dialog.submit(False)).props(
                     'outline autofocus')
                 ui.button(yes, on_click=lambda: dialog.submit(True)).props('unelevated')
         found = await dialog
+        self._end_if_closed()
         dialog.delete()
         return bool(found)
 
@@ -245,11 +278,15 @@ def card(title: str, name: str) -> Element:
 
 
 class _Label(ui.label):
-    """Text in an element of any tag."""
+    """Text in an element of any tag, with the degrees of nodes and files as people write them."""
 
     def __init__(self, tag: str, text: str) -> None:
-        super().__init__(text)
+        super().__init__()
         self.tag = tag
+        self.set_text(text)
+
+    def set_text(self, text: str) -> Self:
+        return super().set_text(_DEGREES.sub('°', text))
 
 
 def label(tag: str, text: str, classes: str = '') -> ui.label:

@@ -74,9 +74,9 @@ class LearningWatch:
         if self._job is not None:
             return Answer(False, 'a comparison is running')
         if not new:
-            return Answer(False, 'there is no new model: train one')
+            return Answer(False, 'no new model: train one first')
         if not self._bag:
-            return Answer(False, 'nothing was recorded since the panel was started: record first')
+            return Answer(False, 'nothing was recorded since the panel started: record first')
         self._folder = tempfile.TemporaryDirectory(prefix='koopman_ros_panel_')
         folder = Path(self._folder.name)
         parameters = {

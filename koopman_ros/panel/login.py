@@ -5,6 +5,7 @@
 
 import asyncio
 from collections.abc import Mapping
+from functools import partial
 from html import escape
 import math
 from typing import Any
@@ -15,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from koopman_ros.panel.access import Role, Users
-from koopman_ros.panel.layout import Source, Visitor
+from koopman_ros.panel.layout import Source, TABS, Visitor
 from koopman_ros.panel.sessions import Session, Sessions, Throttle
 
 _LONGEST_FORM = 8192  # bytes
@@ -28,7 +29,7 @@ _PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
 form{{background:#e9e9e6;border:1px solid #a9a9a5;max-width:340px;margin:12vh auto 0;padding:20px}}
 label{{display:block;margin:12px 0 4px}}input,button{{font:inherit;width:100%;padding:10px;
 box-sizing:border-box}}button{{margin-top:18px}}p{{color:#a40000;font-weight:600}}
-</style></head><body><form method="post" action="/login"><h1>{title}</h1>{message}
+</style></head><body><form method="post" action="/login{query}"><h1>{title}</h1>{message}
 <label for="name">Name</label><input id="name" name="name" autocomplete="username" autofocus
 required><label for="password">Password</label><input id="password" name="password"
 type="password" autocomplete="current-password" required><button>Log in</button></form>
@@ -52,7 +53,7 @@ class AccessControl:
         return scope['session'].get(_ID)
 
     def session(self, scope: Mapping[str, Any], *, use: bool = True) -> Session | None:
-        """Return the session of a request, None if nobody is logged in."""
+        """Return the session of a request, None if no user is logged in."""
         if self.users is None:
             return Session('operator', Role.OPERATOR)
         return self.sessions.find(self.session_id(scope), use=use)
@@ -71,17 +72,19 @@ class AccessControl:
 
 def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
     """Serve the pages by which users log in and out."""
-    def form(message: str = '', status: int = 200) -> HTMLResponse:
+    def login_form(page: str, message: str = '', status: int = 200) -> HTMLResponse:
         shown = f'<p role="alert">{escape(message)}</p>' if message else ''
-        return HTMLResponse(_PAGE.format(title=escape(source.title), message=shown), status,
-                            {'cache-control': 'no-store'})
+        return HTMLResponse(_PAGE.format(
+            title=escape(source.title), message=shown,
+            query=f'?page={page}' if page in TABS else ''), status, {'cache-control': 'no-store'})
 
     @app.get('/login', response_model=None)
-    def login_page() -> Response:
-        return RedirectResponse('/', 303) if keeper.users is None else form()
+    def login_page(page: str = '/') -> Response:
+        return RedirectResponse('/', 303) if keeper.users is None else login_form(page)
 
     @app.post('/login', response_model=None)
-    async def log_in(request: Request) -> Response:
+    async def log_in(request: Request, page: str = '/') -> Response:
+        form = partial(login_form, page)
         if keeper.users is None:
             return RedirectResponse('/', 303)
         if int(request.headers.get('content-length', _LONGEST_FORM + 1)) > _LONGEST_FORM:
@@ -101,7 +104,7 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
             return form('name or password is wrong', 401)
         keeper.throttle.succeeded(address, name)
         request.session[_ID] = keeper.sessions.open(name, role)
-        return RedirectResponse('/', 303)
+        return RedirectResponse(page if page in TABS else '/', 303)
 
     @app.get('/logout', response_model=None)
     def log_out(request: Request) -> Response:

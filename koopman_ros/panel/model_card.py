@@ -3,11 +3,13 @@
 
 """Words for the active model: origin and figures in its file, and in the controller's status."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from koopman_ros.core.units import unit_label
 from koopman_ros.model import LiftedModel
+from koopman_ros.model_classes import LINEAR, NEURAL_DRIFT
 from koopman_ros.panel.faceplates import Range, readable
+from koopman_ros.panel.snapshot import Snapshot
 
 _METRICS = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
             'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
@@ -18,6 +20,16 @@ _STATUS = {'model file time': 'File written', 'model training data': 'Training d
            'model check': 'Check on recent data', 'law': 'Control law',
            'gain norm': 'Norm of the feedback gain',
            'predicted growth per sample': 'Predicted growth per sample'}
+#: figures of a training, by their key without the signal
+_TRAINING = {'step': 'Step', 'model_class': 'Model class',
+             'measurements_used': 'Measurements used',
+             'derivative_method': 'Derivatives', 'noise': 'Measurement noise',
+             'heldout_error': 'Held-out error',
+             'heldout_error_of_present_lift': 'Held-out error of the active model',
+             'heldout_error_of_linear_model': 'Held-out error of a linear model',
+             'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
+             'closed_loop_cost_beside_linear': 'Closed-loop cost relative to linear control'}
+_COMPARED = ('Model class', 'Acceptance')
 _OUTSIDE = ' outside training box [half-ranges]'
 _UNKNOWN = ('', 'none', 'nan')
 
@@ -39,6 +51,10 @@ def model_card(model: LiftedModel) -> dict[str, str]:
         'Written by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'Random seed': '' if origin.seed is None else str(origin.seed)}
     titles = dict(_METRICS)
+    metrics = dict(origin.metrics)
+    if model.kind in (LINEAR, NEURAL_DRIFT):
+        # without a lift
+        metrics.pop('rw', None)
     for key, title in _METRICS_OF_STATES.items():
         for name, unit in zip(model.states.names, model.states.units, strict=True):
             several = len(model.states.names) > 1
@@ -46,7 +62,40 @@ def model_card(model: LiftedModel) -> dict[str, str]:
                 f'{title}{f", {readable(name)}" if several else ""} '
                 f'[{unit if unit == "K" else unit_label(unit)}]')
     return found | {titles.get(name, name): f'{figure:.4g}'
-                    for name, figure in origin.metrics.items()}
+                    for name, figure in metrics.items()}
+
+
+def model_changes(now: Snapshot, new: LiftedModel, trained: Mapping[str, Range]
+                  ) -> list[Sequence[str]]:
+    """
+    Return the changes by a new model: a title, and the value of the active and the new model.
+
+    :param trained: training ranges of the new model, in the units in which people read them.
+    """
+    rows: list[Sequence[str]] = []
+    for face in (*now.states, *now.inputs):
+        active, other = (face.span_text(bounds) if bounds else '–'
+                         for bounds in (face.training, trained.get(face.name)))
+        rows.append((f'Training range, {face.label} [{face.unit}]', active, other))
+    card = model_card(new)
+    # the reasons of a verdict fill no column
+    return rows + [(title, *(one.get(title, '–').partition(' (')[0] for one in (now.model, card)))
+                   for title in dict.fromkeys((*now.model, *card))
+                   if title in _COMPARED or title.startswith('Held-out')]
+
+
+def training_card(values: Mapping[str, str]) -> dict[str, str]:
+    """Return the figures of a training in the trainer's status, by their names in words."""
+    found = {}
+    for key, value in values.items():
+        title, _, signal = key.partition(': ')
+        if key.startswith(('class ', 'constant ')):
+            found[key[:1].upper() + key[1:]] = value
+        elif title in _TRAINING:
+            unit = values.get(f'units: {signal}', '')
+            found[f'{_TRAINING[title]}, {readable(signal)} [{unit}]' if signal
+                  else _TRAINING[title]] = value
+    return found
 
 
 def status_card(values: Mapping[str, str]) -> dict[str, str]:
@@ -56,6 +105,6 @@ def status_card(values: Mapping[str, str]) -> dict[str, str]:
     for key, value in values.items():
         if key.endswith(_OUTSIDE):
             name = key.removesuffix(_OUTSIDE)
-            subject = 'State' if name == 'distance' else name.capitalize()
+            subject = 'State' if name == 'distance' else readable(name).capitalize()
             found[f'{subject} outside the training range [half-ranges]'] = value
     return {title: value for title, value in found.items() if value not in _UNKNOWN}

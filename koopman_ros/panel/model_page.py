@@ -5,15 +5,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 import math
 
 from nicegui import ui
 
+from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import printed
-from koopman_ros.panel.layout import AnswerLine, box, card, label, PageLayout, show_if
-from koopman_ros.panel.model_card import status_card
+from koopman_ros.model import load
+from koopman_ros.panel.faceplates import readable
+from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
+from koopman_ros.panel.model_card import (
+    model_changes,
+    status_card,
+    training_card,
+    training_ranges,
+)
 from koopman_ros.panel.report_cards import comparison_card, report_card
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import (
@@ -31,6 +40,7 @@ from koopman_ros.panel.snapshot import (
 from koopman_ros.parameters.description import ParameterDescription
 
 _DONE = 'done [%]'
+_FORCE = 'load_refused_model'
 
 
 def model_page(page: PageLayout) -> None:
@@ -40,7 +50,7 @@ def model_page(page: PageLayout) -> None:
         with box('cards loose'):
             _recording(page)
             _experiment(page)
-            _training(page)
+        _training(page)
         report_card(page)
         comparison_card(page)
 
@@ -91,33 +101,51 @@ class _Task:
 
 
 def _model(page: PageLayout) -> None:
-    with card('active model', 'Model'):
+    with page.card('active model', 'Model', CONTROLLER):
         name = label('div', '', 'value')
         task, origin = _Task(columns=True), _Figures(columns=True)
-        trained = label('div', '', 'quiet')
+        training = label('div', '', 'quiet')
 
         async def reload() -> None:
             answer.set_text('sent …')
             answer.show(await page.act('reload', CONTROLLER))
 
-        async def activate(new: str) -> None:
-            now = page.source.snapshot
-            if not await page.confirm(f'Activate model {new}?', 'Activate', [
-                    f'It replaces {now.status(CONTROL).values.get("model", "the active model")} '
-                    'if it predicts the recent measurements as well.',
-                    now.status(TRAINING).message]):
+        async def activate(name: str, rejected: bool = False) -> None:
+            now, view = page.source.snapshot, page.source.view
+            active = now.status(CONTROL).values.get('model', 'the active model')
+            details = [
+                name, f'It replaces {active} if it predicts the recent measurements as well.']
+            changes: list[Sequence[str]] = []
+            reasons = now.status(TRAINING).message
+            try:
+                new = await asyncio.to_thread(load, model_path(name))
+            except (OSError, ValueError) as error:
+                details.append(f'The panel cannot show the changes: {error}')
+            else:
+                rejected = new.provenance.accepted is False
+                reasons = '; '.join(new.provenance.reasons)
+                changes = [('', 'active model', 'new model'), *model_changes(
+                    now, new, view.shown_ranges(training_ranges(new)))]
+            if rejected:
+                details.append(f'✖ Training rejected this model: {reasons}.')
+            if not await page.confirm('Activate this model?', 'Activate by force' if rejected
+                                      else 'Activate', details, changes):
                 return
-            answer.set_text('sent …')
             # the controller reads the file again even where its name is the same
-            answer.show(await page.act('parameters', CONTROLLER, {'model': new},
-                                       {'model': now.parameter(CONTROLLER, 'model')}))
+            wanted = {'model': name, **({_FORCE: True} if rejected else {})}
+            old = {key: now.parameter(CONTROLLER, key) for key in wanted}
+            answer.set_text('sent …')
+            answer.show(await page.act('parameters', CONTROLLER, wanted, old))
+            if old.get(_FORCE) is False:
+                # for this model alone
+                await page.act('parameters', CONTROLLER, {_FORCE: False}, {_FORCE: True})
 
-        def trained_model() -> str:
+        def trained() -> tuple[str, bool]:
             values = page.source.snapshot.status(TRAINING).values
-            return values.get('model_file', '') if values.get('accepted') == 'True' else ''
+            return values.get('model_file', ''), values.get('accepted') == 'False'
 
         with box('row1'):
-            new = page.button('Activate the new model …', lambda: activate(trained_model()))
+            new = page.button('', lambda: activate(*trained()))
             back = page.button('', lambda: activate(page.source.snapshot.previous_model))
             page.button('Reload model file', reload)
         answer = AnswerLine()
@@ -127,11 +155,12 @@ def _model(page: PageLayout) -> None:
         name.set_text(control.values.get('model', '–'))
         task.show(control, status_card(control.values))
         origin.show(now.model)
-        ranges = ', '.join(f'{face.label} {face.text(face.training[0])} to '
-                           f'{face.text(face.training[1])} {face.unit}'
+        ranges = ', '.join(f'{face.label} {face.span_text(face.training)} {face.unit}'
                            for face in (*now.states, *now.inputs) if face.training)
-        trained.set_text(f'Training range: {ranges or "not known"}')
-        show_if(new, bool(trained_model()))
+        training.set_text(f'Training range: {ranges or "not known"}')
+        file, rejected = trained()
+        show_if(new, bool(file))
+        new.set_text(f'Activate the {"rejected" if rejected else "new"} model …')
         show_if(back, bool(now.previous_model))
         back.set_text(f'Back to {now.previous_model} …')
 
@@ -152,7 +181,7 @@ def _buttons(page: PageLayout, actions: Mapping[str, Callable[[], Awaitable[Answ
 
 
 def _recording(page: PageLayout) -> None:
-    with card('recording', 'Recording'):
+    with page.card('recording', 'Recording', TRAINER):
         task = _Task()
         record, stop = _buttons(page, {'Record': partial(page.act, 'record', TRAINER, True),
                                        'Stop': partial(page.act, 'record', TRAINER, False)})
@@ -168,9 +197,9 @@ def _recording(page: PageLayout) -> None:
 
 
 def _experiment(page: PageLayout) -> None:
-    with card('experiment', 'Experiment'):
+    with page.card('experiment', 'Experiment', TRAINER):
         task = _Task()
-        limits = label('div', '', 'lines quiet')
+        limits, obstacle = label('div', '', 'lines quiet'), label('div', '', 'hidden')
 
         async def start() -> Answer | None:
             lines = experiment_limits(page.source.snapshot.parameters.get(TRAINER, {}))
@@ -178,16 +207,34 @@ def _experiment(page: PageLayout) -> None:
                 'Start the experiment?', 'Start the experiment',
                 ['The experiment applies random steps within these limits:', *lines]) else None
 
-        _, end = _buttons(page, {'Start …': start,
+        begin, end = _buttons(page, {'Start …': start,
                                  'End': partial(page.act, 'experiment', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
+        reason = experiment_obstacle(now)
+        obstacle.set_text(f'Start is not possible: {reason}')
+        show_if(obstacle, bool(reason))
+        page.allow(begin, not reason)
         page.allow(end, 'left [s]' in found.values)
-        task.show(found, found.values)
+        task.show(found, {'time left [s]' if key == 'left [s]' else key: value
+                          for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
 
     page.follow(show)
+
+
+def experiment_obstacle(now: Snapshot) -> str:
+    """Return why no experiment can start, and what to do, or nothing."""
+    signal = now.parameter(TRAINER, 'experiment_signal')
+    if now.status(EXPERIMENT).values.get('left [s]', '0') != '0':
+        return 'an experiment is running'
+    if signal == 'command' and now.mode:
+        return ('the controller commands the inputs; stop it, or set experiment_signal to '
+                'setpoint or manual on the tuning page')
+    wanted = {'setpoint': 'automatic', 'manual': 'manual'}.get(str(signal), now.mode)
+    return '' if now.mode == wanted else (
+        f'with experiment_signal = {signal}, the controller must be in {wanted} mode')
 
 
 def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[str]:
@@ -196,7 +243,8 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         return ['Trainer not running: no limits available']
 
     def text(name: str) -> str:
-        return f'{parameters[name].text} {printed(parameters[name].unit)}'.rstrip()
+        value, unit = parameters[name].value, printed(parameters[name].unit)
+        return f'{value:.6g} {unit}' if isinstance(value, float) else f'{value} {unit}'.rstrip()
 
     on = parameters['experiment_signal'].text
     lines = [f'steps: {on}, for {text("experiment_length")}, each '
@@ -206,19 +254,20 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         if last != 'experiment_min':
             continue
         if on == 'setpoint' and f'{signal}.setpoint_min' in parameters:
-            lines.append(f'{signal}: set-points {text(f"{signal}.setpoint_min")} to '
+            lines.append(f'{readable(signal)}: set-points {text(f"{signal}.setpoint_min")} to '
                          f'{text(f"{signal}.setpoint_max")}')
         what = 'steps within' if f'{signal}.safe_value' in parameters else 'aborts outside'
-        lines.append(f'{signal}: {what} {text(name)} to {text(f"{signal}.experiment_max")}')
+        lines.append(f'{readable(signal)}: {what} {text(name)} to '
+                     f'{text(f"{signal}.experiment_max")}')
     return lines
 
 
 def _training(page: PageLayout) -> None:
-    with card('training', 'Training'):
+    with page.card('training', 'Training', TRAINER):
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')
-        task = _Task()
+        task = _Task(columns=True)
         train, cancel = _buttons(page, {'Train': partial(page.act, 'train', TRAINER),
                                         'Cancel': partial(page.act, 'cancel', TRAINER)})
 
@@ -233,7 +282,6 @@ def _training(page: PageLayout) -> None:
         page.allow(cancel, running)
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)
         share.set_text('' if math.isnan(done) else f'{done:.0f} %')
-        task.show(found, {key.replace('_', ' '): value
-                          for key, value in found.values.items() if key != _DONE})
+        task.show(found, training_card(found.values))
 
     page.follow(show)

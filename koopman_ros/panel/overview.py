@@ -13,20 +13,25 @@ from nicegui import ui
 from nicegui.element import Element
 
 from koopman_ros.panel.alarm_page import alarm_rows
-from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, number, StateFaceplate
+from koopman_ros.panel.faceplates import (
+    Faceplate,
+    InputFaceplate,
+    number,
+    Range,
+    StateFaceplate,
+)
 from koopman_ros.panel.layout import (
     AnswerLine,
     attribute,
     box,
-    card,
     label,
     PageLayout,
     place,
     show_if,
 )
 from koopman_ros.panel.requests import Answer
-from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, Snapshot
-from koopman_ros.panel.trend_page import TrendChart
+from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot
+from koopman_ros.panel.trend_chart import TrendChart
 
 _STRIP = 3  # alarms that are shown here
 
@@ -42,7 +47,8 @@ def overview(page: PageLayout) -> None:
             for at, own in enumerate(now.inputs):
                 _input_card(page, at, own)
             _controller_card(page)
-        chart = TrendChart(page, 180, zoom=False)
+        _simulation(page)
+        chart = TrendChart(page, 220, zoom=False)
         page.follow(lambda _: chart.update())
 
 
@@ -83,7 +89,7 @@ class _Bar:
         self._low.set_text(low)
         self._high.set_text(high)
         self._between.set_text('' if face.training is None else (
-            f'trained {face.text(face.training[0])} to {face.text(face.training[1])}'))
+            f'trained {face.span_text(face.training)}'))
 
 
 class _Faceplate:
@@ -110,46 +116,47 @@ class _Faceplate:
 class _Entry:
     """Entry of a number: typed, stepped by the arrow keys, or by a slider."""
 
-    def __init__(self, page: PageLayout, title: str, face: Faceplate,
-                 send: Callable[[float], Any], present: Callable[[], float]) -> None:
-        self._send, self._present = send, present
-        step = 10.0 ** -face.decimals
-        self._low, self._high = (round(end, face.decimals) for end in face.span)
+    def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any]) -> None:
+        self._send = send
+        self._shown: float | None = None  # present value in the field until a user types
+        self._ends: Range = (0.0, 1.0)
         with box('ask'):
-            self._field = page.control(ui.number(
-                title, step=step, format=f'%.{face.decimals}f', on_change=self._typed).props(
-                    'outlined dense'))
+            self._field = page.control(ui.number(title, on_change=self._typed).props(
+                'outlined dense'))
             page.control(ui.button('Set', on_click=self._submit).props('unelevated'))
         self._slider = page.control(attribute(ui.slider(
-            min=self._low, max=self._high, step=step, on_change=self._slid).props('color=grey-8'),
+            min=0.0, max=1.0, on_change=self._slid).props('color=grey-8'),
             'aria-label', f'{title}, slider'))
         self._answer = AnswerLine()
         self._field.on('keydown.enter', self._submit)
         self._field.on('keydown.escape', self._reset)
-        self._started = False
 
-    def start(self, value: float) -> None:
-        """Show the present value when it is known."""
-        if not self._started and math.isfinite(value):
-            self._started = True
-            self._reset()
+    def show(self, face: Faceplate, present: float) -> None:
+        """Follow the present value until a user types another one."""
+        low, high = (round(end, face.decimals) for end in face.span)
+        if (low, high) != self._ends:
+            self._ends, step = (low, high), 10.0 ** -face.decimals
+            self._field.format = f'%.{face.decimals}f'
+            self._field.props['step'] = step
+            self._slider.props.update({'min': low, 'max': high, 'step': step})
+        if math.isfinite(present) and self._field.value == self._shown:
+            self._shown = round(present, face.decimals)
+            self._field.set_value(self._shown)
+            self._slider.set_value(self._shown)
 
     def _reset(self) -> None:
-        value = self._present()
-        if math.isfinite(value):
-            self._field.set_value(value)
-            self._slider.set_value(value)
+        self._field.set_value(self._shown)
         self._answer.set_text('')
 
     def _slid(self, event: Any) -> None:
         # the slider keeps within its ends a value that was typed beyond them
-        typed = self._field.value
-        beyond = typed is not None and not self._low <= typed <= self._high
-        if self._started and event.value != typed and not beyond:
+        typed, (low, high) = self._field.value, self._ends
+        if self._shown is not None and event.value != typed and (
+                typed is None or low <= typed <= high):
             self._field.set_value(event.value)
 
     def _typed(self, event: Any) -> None:
-        if self._started and event.value is not None and event.value != self._slider.value:
+        if event.value is not None and event.value != self._slider.value:
             self._slider.set_value(event.value)
 
     async def _submit(self) -> None:
@@ -159,6 +166,8 @@ class _Entry:
             return
         self._answer.set_text('sent …')
         self._answer.show(await self._send(float(value)))
+        # whatever the answer is, the field shows the present value again
+        self._shown = value
 
 
 def _signal_card(face: Faceplate) -> Element:
@@ -168,7 +177,7 @@ def _signal_card(face: Faceplate) -> Element:
 
 def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
     def present() -> float:
-        return page.source.snapshot.states[at].setpoint
+        return page.source.snapshot.states[at].target
 
     async def send(value: float) -> Answer:
         return await page.act('setpoint', face.name, value, present())
@@ -180,7 +189,7 @@ def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
                 label('span', 'set-point')
                 setpoint = label('span', '', 'value')
             target = label('div', '', 'quiet')
-            entry = _Entry(page, f'Set-point of {face.label}, {face.unit}', face, send, present)
+            entry = _Entry(page, f'Set-point of {face.label}, {face.unit}', send)
         predicted = label('div', '', 'quiet')
 
     def show(now: Snapshot) -> None:
@@ -190,7 +199,7 @@ def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
             setpoint.set_text(f'{own.text(own.setpoint)} {own.unit}')
             ramps = math.isfinite(own.target) and own.text(own.target) != own.text(own.setpoint)
             target.set_text(f'target {own.text(own.target)} {own.unit} (ramping)' if ramps else '')
-            entry.start(own.setpoint)
+            entry.show(own, own.target)
         predicted.set_text(f'model prediction {number(own.predicted, own.decimals + 1)} {own.unit}'
                            if math.isfinite(own.predicted) else '')
 
@@ -199,7 +208,7 @@ def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
 
 def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
     def present() -> float:
-        return page.source.snapshot.inputs[at].command
+        return page.source.snapshot.inputs[at].manual
 
     async def send(value: float) -> Answer:
         return await page.act('manual', face.name, value, present())
@@ -211,28 +220,41 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
             applied = label('span', '', 'value')
         details = label('div', '', 'quiet')
         with box('') as manual:
-            entry = _Entry(page, f'Manual command: {face.label}, {face.unit}', face, send, present)
+            entry = _Entry(page, f'Manual command: {face.label}, {face.unit}', send)
 
     def show(now: Snapshot) -> None:
         own = now.inputs[at]
         plate.show(own, own.command, own.applied)
         applied.set_text(f'{own.text(own.applied)} {own.unit}')
-        limits = f'limits {own.text(own.limits[0])} to {own.text(own.limits[1])} {own.unit}' if (
-            own.limits) else 'limits not known'
+        limits = f'limits {own.span_text(own.limits)} {own.unit}' if own.limits else (
+            'limits not known')
         # no minus zero
         change = round(own.disturbance, own.decimals + 1) + 0.0
         disturbance = f' · disturbance {change:+.{own.decimals + 1}f} {own.own_unit}' if (
             math.isfinite(change)) else ''
         details.set_text(limits + disturbance)
         show_if(manual, now.mode == 'manual')
-        entry.start(own.command)
+        entry.show(own, own.manual)
 
     page.follow(show)
 
 
+def _simulation(page: PageLayout) -> None:
+    async def reset() -> None:
+        if await page.confirm('Reset the simulated plant?', 'Reset the simulated plant',
+                              ['It jumps to the state in which it was started.']):
+            answer.show(await page.act('reset', PLANT))
+
+    with box('row1 hidden') as row:
+        page.button('Reset the simulated plant …', reset)
+        answer = AnswerLine()
+    # the driver of a real plant is no node of ours
+    page.follow(lambda now: show_if(row, bool(now.parameters.get(PLANT))))
+
+
 def _controller_card(page: PageLayout) -> None:
-    with card('controller', 'Controller'):
-        mode, level = label('div', '', 'big'), label('div', '', 'value')
+    with page.card('controller', 'Controller', CONTROLLER):
+        mode, level = label('div', '', 'mode'), label('div', '', 'value')
         fallback = label('div', '▲ FALLBACK CONTROL ACTIVE', 'abnormal hidden')
         reason, message = label('div', ''), label('div', '', 'quiet')
         estimates = label('div', '')

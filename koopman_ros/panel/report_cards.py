@@ -108,7 +108,8 @@ def comparison_card(page: PageLayout) -> None:
         if not found.running:
             answer.set_text('')
             state.set_text(f'✖ {found.problem}' if found.problem else
-                           f'{found.model}, compared at {clock(found.since)}')
+                           f'{found.model}, compared at {clock(found.since)}' if found.model
+                           else '')
         show_findings(found)
 
     page.follow(show)

@@ -23,7 +23,7 @@ class Action:
     """Action of an operator."""
 
     who: str
-    #: setpoint, manual, automatic, reload, record, experiment, train, cancel, compare,
+    #: setpoint, manual, automatic, reset, reload, record, experiment, train, cancel, compare,
     #: end comparison or parameters
     what: str
     name: str = ''  #: of the signal or the node

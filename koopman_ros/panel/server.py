@@ -55,7 +55,7 @@ _PAGES: dict[str, Callable[[PageLayout], None]] = {
 
 
 class _AuthMiddleware:
-    """Middleware that refuses requests of other origins, and those of nobody who is logged in."""
+    """Middleware that rejects requests of other origins, and those without a login."""
 
     def __init__(self, app: Any, keeper: AccessControl, listener: Listener) -> None:
         self._app, self._keeper, self._listener = app, keeper, listener
@@ -86,7 +86,9 @@ class _AuthMiddleware:
                              users=self._keeper.users is not None):
             return Response(f'refused: {reason}\n', 403)
         if not logged_in and scope['path'] != '/login':
-            return RedirectResponse('/login', 303) if page else Response('log in first\n', 401)
+            asked = '' if scope['path'] == '/' else f'?page={scope["path"]}'
+            return RedirectResponse(f'/login{asked}', 303) if page else Response(
+                'log in first\n', 401)
         if scope['type'] == 'http' and scope['path'].startswith(_SOCKETS):
             # the id of a socket that polls would be a credential
             return Response('refused: only WebSockets are served here\n', 403)
@@ -134,12 +136,17 @@ class PanelServer:
     :param users: file of users, empty for none.
     :param proxies: addresses and networks of trusted proxies, empty for none.
     :raises ValueError: for an address that needs users, or a wrong file.
-    :raises OSError: for an address in use, or a file that cannot be read.
+    :raises OSError: for an address in use.
     """
 
     def __init__(self, source: Source, host: str, port: int, users: str, certificate: str,
                  key: str, proxies: Sequence[str] = ()) -> None:
-        found = Users.read(users) if users else None
+        try:
+            found = Users.read(users) if users else None
+        except OSError as error:
+            raise ValueError(
+                f'users = {users!r} cannot be read ({error.strerror}): write the file with '
+                f'python -m koopman_ros.panel.access {users} NAME operator') from error
         _check(host, users, found, certificate, key, proxies)
         self._socket = _bound(host, port)
         shown = f'[{host}]' if ':' in host else host
@@ -185,7 +192,7 @@ class PanelServer:
         while not self._server.started and self._thread.is_alive() and time.monotonic() < end:
             time.sleep(_POLL)
         if not self._server.started:
-            raise OSError(f'the pages cannot be served, or not within {_START:g} s')
+            raise OSError(f'the web server failed, or did not start within {_START:g} s')
 
     def stop(self) -> None:
         """Stop to serve."""
@@ -196,16 +203,15 @@ class PanelServer:
 def _check(host: str, file: str, users: Users | None, certificate: str, key: str,
            proxies: Sequence[str]) -> None:
     if users is not None and not len(users):
-        raise ValueError(f'users = {file!r} has no user in it: add one with '
-                         f'python -m koopman_ros.panel.access {file} NAME operator')
+        raise ValueError(f'users = {file!r} contains no user: add one with python -m '
+                         f'koopman_ros.panel.access {file} NAME operator')
     if users is None and not is_loopback(host):
         raise ValueError(
-            f'the panel is not served on {host!r} without passwords: name a file of users, '
-            'written by python -m koopman_ros.panel.access FILE NAME ROLE, or serve it on '
-            '127.0.0.1')
+            f'host = {host!r} requires passwords: set users to a file written by python -m '
+            'koopman_ros.panel.access FILE NAME ROLE, or set host to 127.0.0.1')
     if users is None and proxies:
-        raise ValueError('trusted_proxy needs users: a proxy lets other machines reach the panel; '
-                         'name a file of users')
+        raise ValueError('trusted_proxy requires users, because a proxy lets other machines reach '
+                         'the panel: set users')
     if certificate:
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)

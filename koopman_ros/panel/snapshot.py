@@ -18,6 +18,7 @@ OK, WARN, ERROR = 0, 1, 2  #: levels of a status
 PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'  #: roles of nodes
 ROLES: Mapping[str, str] = MappingProxyType({role: role for role in (PLANT, CONTROLLER, TRAINER)})
 CONTROL, REQUESTS = f'{CONTROLLER}: control', f'{CONTROLLER}: requests'
+MEASUREMENTS = f'{CONTROLLER}: measurements'
 TRAINING, RECORDING = f'{TRAINER}: training', f'{TRAINER}: recording'
 EXPERIMENT = f'{TRAINER}: experiment'
 LOST = 'connection lost'  #: message of a silent node

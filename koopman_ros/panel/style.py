@@ -23,16 +23,19 @@ a { color: var(--text); }
 .tabs a.here { background: var(--ground); font-weight: 600; border: 1px solid var(--line);
   border-bottom: none; }
 .page { padding: 12px 16px; display: flex; flex-direction: column; gap: 12px; }
-.cards { display: grid; gap: 12px;
-  grid-template-columns: repeat(auto-fit, minmax(min(320px, 100%), 1fr)); }
+.cards { display: flex; flex-wrap: wrap; gap: 12px; }
+.cards > * { flex: 1 1 max(min(320px, 100%), 33.3% - 12px); }
+.cards:has(> :nth-child(4):last-child) > * { flex-basis: max(min(320px, 100%), 50% - 12px); }
 .loose { align-items: start; }
 .card { background: var(--card); border: 1px solid var(--line); padding: 12px 14px;
-  display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: anywhere; }
+  display: flex; flex-direction: column; gap: 8px; min-width: 0; overflow-wrap: break-word; }
+.card[inert] > :not(h2) { opacity: .45; }
 .page h2 { font-size: 1.05rem; line-height: 1.3; margin: 0; font-weight: 600; }
 .row1 { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: baseline; }
 .between { justify-content: space-between; }
 .big { font-size: 3.4rem; line-height: 1.05; font-weight: 600;
   font-variant-numeric: tabular-nums; }
+.mode { font-size: 2.4rem; line-height: 1.2; font-weight: 600; }
 .unit { font-size: 1.4rem; }
 .value { font-size: 1.5rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .abnormal { align-self: flex-start; color: #fff; background: var(--medium); padding: 2px 8px;
@@ -61,6 +64,8 @@ a { color: var(--text); }
 .alarm .what { flex: 1 1 240px; min-width: 0; overflow-wrap: anywhere; }
 .banner { background: var(--high); color: #fff; font-weight: 700; padding: 10px 16px; }
 #lost { position: sticky; top: 0; z-index: 9000; }
+.changes { display: grid; gap: 4px 16px;
+  grid-template-columns: minmax(0, 3fr) minmax(0, 2fr) minmax(0, 2fr); }
 .pairs { display: grid; gap: 2px 32px; }
 .columns { grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); }
 .pair { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 12px; }
@@ -78,7 +83,6 @@ a { color: var(--text); }
 .journal { font-variant-numeric: tabular-nums; }
 @media (max-width: 600px) {
   .page { padding: 8px; }
-  .cards { grid-template-columns: minmax(0, 1fr); }
   .tabs { padding: 0; }
   .tabs a { padding: 10px 7px; font-size: .95rem; }
   .head { padding: 6px 8px; }

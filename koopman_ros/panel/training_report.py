@@ -85,7 +85,7 @@ def report_time(base: Path) -> int:
 
 def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -> TrainingReport:
     """
-    Return the report beside a model.
+    Return the report of a model.
 
     :param trained: figures of the trainer's status; a report with others is a problem.
     """
@@ -93,10 +93,11 @@ def read_report(base: Path, trained: Mapping[str, str] = MappingProxyType({})) -
     try:
         figures = _figures_of(path)
     except (OSError, ValueError) as error:
-        return TrainingReport('the panel cannot read the report, perhaps it is on another '
-                              f'machine: {sanitize_text(str(error), _MAX_LINE)}')
+        return TrainingReport('the panel cannot read the report (is it on another machine?): '
+                              f'{sanitize_text(str(error), _MAX_LINE)}')
     if any(name in trained and trained[name] != str(figures.get(name)) for name in _IDENTIFYING):
-        return TrainingReport(f'the panel cannot read the report: {path} is of another training')
+        return TrainingReport(f'the panel cannot read the report: {path} belongs to another '
+                              'training')
     return TrainingReport(
         lines=(*_texts(figures.get('reasons')),
                *(f'Warning: {text}' for text in _texts(figures.get('warnings')))),
@@ -144,7 +145,7 @@ def _figures_of(path: Path) -> Mapping[str, Any]:
     except RecursionError:
         raise ValueError(f'{path} is nested too deeply') from None
     if not isinstance(found, dict):
-        raise ValueError(f'{path} holds no figures')
+        raise ValueError(f'{path} contains no figures')
     return found
 
 

@@ -1,169 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Page of the trends of all signals, and their chart, which the overview has as well."""
+"""Page of the trends: the chart, the time that it shows, and the events in it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-import math
 import time
 from typing import Any
 
 from nicegui import ui
-from nicegui.events import GenericEventArguments
-import numpy as np
 
-from koopman_ros.core.arrays import Array
-from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, pen, Range, StateFaceplate
 from koopman_ros.panel.layout import box, label, PageLayout
 from koopman_ros.panel.snapshot import Snapshot
-from koopman_ros.panel.trends import TrendMark
+from koopman_ros.panel.trend_chart import EPOCH, SPANS, TrendChart
 
-#: length and period of the updates in s
-SPANS = {'10 min': (600.0, 1.0), '1 h': (3600.0, 2.0), '8 h': (28800.0, 5.0)}
-_BUCKETS = 500
-_ALL: Range = (0.0, 1.0)  # shares of the time shown
-_PAUSE = 0.3  # s between two updates of a zoom
-_EPOCH = 1e9  # s; a later stamp is a wall time, an earlier one is a simulated time
-_MARKS = 40  # last events that are shown
-_LEAST = 0.1  # of the range of a signal, which an axis shows
-_INKS = ('#1d1d1b', '#4b6a88', '#7a6a45', '#6b4b6b', '#3f6b54', '#8a5a44')
-_LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
-          'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
-_ABNORMAL = '#8a4b00'
-# in the browser
-_CLOCK = 'p => new Date(p.value).toTimeString().slice(0, 8)'
-_PLANT_CLOCK = 'p => new Date(p.value).toISOString().slice(11, 19)'
-_QUIET = '#6b6b67'
-
-
-@dataclass(frozen=True)
-class _Pen:
-    kind: str
-    signal: str
-    key: str  # in the trends
-    title: str
-    label: str  # of the signal
-    steps: bool  # whether the value holds until the next one
-
-
-_Charts = Sequence[tuple[str, Sequence[_Pen]]]
-
-
-def _charts(now: Snapshot) -> _Charts:
-    """Return the unit and the pens of each chart: of the states, and of the inputs."""
-    found: dict[tuple[bool, str], list[_Pen]] = {}
-    for face in (*now.states, *now.inputs):
-        is_input = isinstance(face, InputFaceplate)
-        kinds = ['commands', 'applied', 'planned']
-        if isinstance(face, StateFaceplate):
-            kinds = ['measured', 'active_setpoints', 'predicted', 'planned'] if (
-                face.controlled) else ['measured', 'predicted']
-        found.setdefault((is_input, face.unit), []).extend(
-            _Pen(kind, face.name, pen(kind, face.name), f'{pen(kind, face.label)} [{face.unit}]',
-                 face.label,
-                 kind in ('commands', 'active_setpoints') or (kind == 'planned' and is_input))
-            for kind in kinds)
-    return [(unit, pens) for (_, unit), pens in found.items()]
-
-
-class TrendChart:
-    """
-    Chart of all pens over time.
-
-    :param height: of the chart of one unit, in pixels.
-    :param zoom: whether it can be zoomed.
-    """
-
-    def __init__(self, page: PageLayout, height: int, *, zoom: bool) -> None:
-        self._page = page
-        self._charts = _charts(page.source.snapshot)
-        self._span, self._whole, self._due, self._zoomed = '10 min', False, 0.0, _ALL
-        self.marks: Sequence[TrendMark] = ()  #: events in the time shown
-        # a time that is not known yet may be either
-        simulated = page.source.snapshot.time < _EPOCH
-        self._chart = ui.echart(_options(self._charts, height, zoom, simulated)).props(
-            'aria-label="Trends of all signals" role=img')
-        self._chart.style['height'] = f'{height * len(self._charts) + (105 if zoom else 60)}px'
-        if zoom:
-            self._chart.on('chart:datazoom', self._on_zoom, ['start', 'end', 'batch'],
-                           throttle=_PAUSE, leading_events=False)
-
-    def show(self, span: str, whole: bool) -> None:
-        """Show another span of time, and the whole range of each signal or that of its values."""
-        self._span, self._whole, self._due = span, whole, 0.0
-        self.update()
-
-    def _on_zoom(self, event: GenericEventArguments) -> None:
-        if (shares := zoomed(event.args)) is not None and shares != self._zoomed:
-            self._zoomed, self._due = shares, 0.0
-            self.update()
-
-    def update(self) -> None:
-        """Draw new values when they are due."""
-        length, period = SPANS[self._span]
-        trends = self._page.source.view.trends
-        if time.monotonic() < self._due or (latest := trends.latest) is None:
-            return
-        self._due = time.monotonic() + period
-        now = self._page.source.snapshot
-        faces = {face.name: face for face in (*now.states, *now.inputs)}
-        # simulated time begins at 0
-        begin = latest - length if latest >= _EPOCH else max(latest - length, 0.0)
-        end = min(plan_end(now, latest), latest + length)
-        pens = [own for _, pens in self._charts for own in pens]
-        values = trends.window([own.key for own in pens], begin, latest, _BUCKETS)
-        if self._zoomed != _ALL:
-            # as fine in the zoomed window as in the whole
-            first, last = (begin + share * (end - begin) for share in self._zoomed)
-            fine = trends.window(list(values), first, last, _BUCKETS)
-            values = {key: _refined(values[key], fine[key]) for key in values}
-        for own in pens:
-            if own.kind == 'planned':
-                times, plan = np.reshape(faces[own.signal].plan, (-1, 2)).T
-                values[own.key] = times, plan
-        self.marks = trends.marks(begin, latest)[-_MARKS:]
-        self._chart.run_chart_method('setOption', {
-            'useUTC': latest < _EPOCH,
-            # without a plan there is no line
-            'legend': {'data': [own.title for own in pens if own.kind != 'planned'
-                                or faces[own.signal].plan]},
-            'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end} for _ in self._charts],
-            'yAxis': [axis_ends([faces[own.signal].span for own in pens],
-                            () if self._whole else [values[own.key][1] for own in pens])
-                      for _, pens in self._charts],
-            'series': [{'name': own.title, 'data': _points(*values[own.key]),
-                        'markLine': _lines(own, faces[own.signal],
-                                           self.marks if own is pens[0] else ())}
-                       for _, pens in self._charts for own in pens]})
-
-
-def plan_end(now: Snapshot, latest: float) -> float:
-    """Return the last time of the plans, or the latest time without one."""
-    return max([latest, *(face.plan[-1][0] for face in (*now.states, *now.inputs) if face.plan)])
-
-
-def zoomed(event: Any) -> Range | None:
-    """Return begin and end of a zoomed window, as shares, from an event of a browser."""
-    try:
-        batch = event.get('batch')
-        one = batch[0] if batch else event
-        first, last = float(one['start']) / 100.0, float(one['end']) / 100.0
-    except (AttributeError, LookupError, TypeError, ValueError):
-        return None
-    return (first, last) if 0.0 <= first < last <= 1.0 else None
-
-
-def _refined(whole: tuple[Array, Array], fine: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Replace a part of a pen by the same part with more values."""
-    times, values = whole
-    if not len(fine[0]):
-        return whole
-    before, behind = times < fine[0][0], times > fine[0][-1]
-    return (np.concatenate((times[before], fine[0], times[behind])),
-            np.concatenate((values[before], fine[1], values[behind])))
+_DAY = 86400.0  # s
 
 
 def trend_page(page: PageLayout) -> None:
@@ -174,8 +25,13 @@ def trend_page(page: PageLayout) -> None:
                 'aria-label="Time shown" unelevated color=grey-5 text-color=black '
                 'toggle-color=grey-9')
             whole = ui.checkbox('whole range')
-            label('span', 'Scroll or pinch to zoom, drag to pan, hover to read values', 'quiet')
-        chart = TrendChart(page, 260, zoom=True)
+            until = ui.input('Until, h:mm:ss', placeholder='now').props('outlined dense')
+            earlier = ui.button('Earlier').props('outline')
+            later = ui.button('Later').props('outline')
+            ui.button('Now', on_click=lambda: until.set_value('')).props('outline')
+            label('span', 'Click a name to hide its line; scroll or pinch to zoom, drag to pan, '
+                  'hover to read values and events', 'quiet')
+        chart = TrendChart(page, 290, zoom=True)
         label('h2', 'Events')
         events = box('card journal').props('role=list aria-label=Events')
     shown: list[Any] = [None]
@@ -188,104 +44,52 @@ def trend_page(page: PageLayout) -> None:
         events.clear()
         with events:
             for mark in reversed(chart.marks):
-                label('div', f'{_time_of_day(mark.time)}  {mark.kind}: {mark.text}').props(
-                    'role=listitem')
+                label('div', f'{_clock(mark.time)}  {mark.text}').props('role=listitem')
             if not chart.marks:
                 label('div', 'none in this time', 'quiet')
 
-    for control in (span, whole):
+    def end() -> float | None:
+        return time_of_day(str(until.value), page.source.view.trends.latest or 0.0)
+
+    def change() -> None:
         # a browser may send any value
-        control.on_value_change(lambda _: chart.show(str(span.value), bool(whole.value)) if (
-            span.value in SPANS) else None)
+        if span.value in SPANS:
+            chart.show(str(span.value), bool(whole.value), end())
+
+    def shift(sign: float) -> None:
+        latest = page.source.view.trends.latest
+        if span.value in SPANS and latest is not None:
+            found = (latest if (now := end()) is None else now) + sign * SPANS[span.value][0] / 2.0
+            # a time of day is one of the last 24 hours
+            first = 0.0 if latest < EPOCH else latest - _DAY + 1.0
+            until.set_value('' if found >= latest else _clock(max(found, first)))
+
+    for control in (span, whole, until):
+        control.on_value_change(change)
+    earlier.on_click(lambda: shift(-1.0))
+    later.on_click(lambda: shift(1.0))
     page.follow(show)
 
 
-def _time_of_day(seconds: float) -> str:
-    moment = time.gmtime(seconds) if seconds < _EPOCH else time.localtime(seconds)
-    return time.strftime('%H:%M:%S', moment)
+def _clock(seconds: float) -> str:
+    """Write a time of day, or the hours, minutes and seconds of a simulation."""
+    if seconds >= EPOCH:
+        return time.strftime('%H:%M:%S', time.localtime(seconds))
+    return f'{int(seconds // 3600.0):02}' + time.strftime(':%M:%S', time.gmtime(seconds))
 
 
-def _points(times: Array, values: Array) -> list[list[float | None]]:
-    return [[1e3 * t, round(v, 6) if math.isfinite(v) else None]
-            for t, v in zip(times.tolist(), values.tolist(), strict=True)]
+def time_of_day(text: str, latest: float) -> float | None:
+    """
+    Return a time that is written as h:mm:ss or h:mm; None for another text.
 
-
-def axis_ends(spans: Sequence[Range], pens: Sequence[Array]) -> dict[str, float | None]:
-    """Return the ends of an axis: of the spans without pens, else such that noise stays small."""
-    low, high = min(low for low, _ in spans), max(high for _, high in spans)
-    if not pens:
-        return {'min': round(low, 6), 'max': round(high, 6)}
-    least = _LEAST * (high - low)
-    values = np.concatenate(pens)
-    values = values[np.isfinite(values)]
-    if not len(values) or np.ptp(values) >= least:
-        # the chart finds round numbers
-        return {'min': None, 'max': None}
-    middle = 0.5 * float(np.min(values) + np.max(values))
-    step = 10.0 ** math.floor(math.log10(least) - 0.5)
-    return {'min': round(math.floor((middle - 0.5 * least) / step) * step, 6),
-            'max': round(math.ceil((middle + 0.5 * least) / step) * step, 6)}
-
-
-def _lines(own: _Pen, face: Faceplate, marks: Sequence[TrendMark]) -> dict[str, Any]:
-    """Return the limits of a signal as horizontal lines, and events as vertical ones."""
-    ranges = {'trained': face.training, 'limit': face.limits} if (
-        own.kind in ('measured', 'commands')) else {}
-    # the chart fails at an end that is not finite
-    found: list[dict[str, Any]] = [{'yAxis': end, 'name': name} for name, bounds in ranges.items()
-                                   for end in bounds or () if math.isfinite(end)]
-    found += [{'xAxis': 1e3 * mark.time, 'name': mark.kind, 'lineStyle': {
-        'type': 'solid', 'color': _ABNORMAL if mark.kind == 'alarm' else _QUIET}}
-        for mark in marks]
-    return {'symbol': 'none', 'silent': True, 'animation': False, 'data': found,
-            'lineStyle': {'type': 'dashed', 'color': '#8a8a86'},
-            'label': {'formatter': '{b}', 'position': 'insideEndTop', 'fontSize': 10,
-                      'color': '#4d4d4a'}}
-
-
-def _options(charts: _Charts, height: int, zoom: bool, simulated: bool) -> dict[str, Any]:
-    """Return the options of charts without data, one above the other."""
-    several = range(len(charts))
-    pens = [(at, own) for at, (_, own_pens) in enumerate(charts) for own in own_pens]
-    grey = {'borderColor': '#a9a9a5', 'fillerColor': 'rgba(90,90,86,.25)',
-            'handleStyle': {'color': '#4d4d4a', 'borderColor': '#4d4d4a'},
-            'moveHandleStyle': {'color': '#8a8a86'}, 'brushSelect': False,
-            'emphasis': {'handleStyle': {'color': '#1d1d1b'},
-                         'moveHandleStyle': {'color': '#4d4d4a'}}}
-    return {
-        'animation': False, 'backgroundColor': 'transparent',
-        'textStyle': {'color': '#1d1d1b', 'fontSize': 13},
-        'axisPointer': {'link': [{'xAxisIndex': 'all'}]},
-        # drawn: the usual one is HTML
-        'tooltip': {'trigger': 'axis', 'renderMode': 'richText', 'confine': True,
-                    'transitionDuration': 0,
-                    ':valueFormatter': "v => v == null ? '–' : (+v).toPrecision(6)",
-                    'axisPointer': {'type': 'cross', 'label': {'backgroundColor': '#4d4d4a'}}},
-        'legend': {'type': 'scroll', 'top': 4, 'pageIconColor': '#4d4d4a',
-                   'data': [own.title for _, own in pens if own.kind != 'planned'],
-                   'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
-                   # less than that of the text cuts it where there are several pages of pens
-                   'itemHeight': 14, 'itemWidth': 14},
-        'grid': [{'left': 56, 'right': 16, 'top': 60 + height * at, 'height': height - 60}
-                 for at in several],
-        'xAxis': [{'type': 'time', 'gridIndex': at, 'axisPointer': {'label': {
-            ':formatter': _CLOCK if not simulated else _PLANT_CLOCK}}, 'axisLabel': {
-            'formatter': '{HH}:{mm}:{ss}', 'hideOverlap': True, 'color': '#1d1d1b'}}
-            for at in several],
-        'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
-                   'name': f'{", ".join(dict.fromkeys(own.label for own in own_pens))} [{unit}]',
-                   'axisLabel': {'color': '#1d1d1b'},
-                   'nameTextStyle': {'color': '#1d1d1b', 'align': 'left'},
-                   'splitLine': {'lineStyle': {'color': '#c4c4c0'}}}
-                  for at, (unit, own_pens) in enumerate(charts)],
-        'dataZoom': [] if not zoom else [
-            {'type': 'inside', 'xAxisIndex': list(several), 'filterMode': 'none'},
-            {'type': 'slider', 'xAxisIndex': list(several), 'bottom': 6, 'height': 24,
-             'filterMode': 'none', 'showDataShadow': False, 'labelFormatter': '', **grey}],
-        'series': [{'type': 'line', 'name': own.title, 'showSymbol': False,
-                    'xAxisIndex': at, 'yAxisIndex': at, 'data': [],
-                    'step': 'end' if own.steps else False,
-                    'color': _INKS[number % len(_INKS)],
-                    'lineStyle': dict(zip(('type', 'width'), _LINES.get(
-                        own.kind, ('dashed', 1.2)), strict=True))}
-                   for number, (at, own) in enumerate(pens)]}
+    :param latest: time of the last value; a wall time is the last one before it.
+    """
+    try:
+        hours, minutes, seconds = (*map(int, text.split(':')), 0)[:3]
+    except ValueError:
+        return None
+    after = 3600.0 * hours + 60.0 * minutes + seconds
+    if latest < EPOCH:
+        return after
+    found = time.mktime((*time.localtime(latest)[:3], 0, 0, 0, 0, 0, -1)) + after
+    return found if found <= latest else found - _DAY

@@ -4,7 +4,8 @@
 """History of values over time, and its decimation, which keeps each extreme."""
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 import threading
@@ -18,6 +19,7 @@ from koopman_ros.panel.files import sanitize_text
 MAX_BUCKETS = 10_000
 MAX_MARKS = 2_000  #: of each kind: many of one kind leave the others
 MAX_TEXT = 200  # characters of a mark
+_SAID = 3  # last events of a group that are written out
 
 _FIRST_ROOM = 1024  # values
 _OF_A_BUCKET = 4  # values of a bucket: first, last, lowest and highest
@@ -31,6 +33,31 @@ class TrendMark:
     time: float
     kind: str
     text: str
+
+
+@dataclass(frozen=True)
+class MarkGroup:
+    """Events that are near in time, as one mark."""
+
+    time: float  #: of the first
+    label: str  #: kinds, with their numbers
+    text: str
+    alarm: bool  #: whether an alarm is one of them
+
+
+def grouped(marks: Sequence[TrendMark], width: float) -> list[MarkGroup]:
+    """Return events in order as marks, each of the events within a width of its first one."""
+    groups: list[list[TrendMark]] = []
+    for mark in marks:
+        if not groups or mark.time > groups[-1][0].time + width:
+            groups.append([])
+        groups[-1].append(mark)
+    return [MarkGroup(group[0].time, ', '.join(
+        f'{kind} ×{count}' if count > 1 else kind
+        for kind, count in Counter(mark.kind for mark in group).items()), '; '.join((
+            *((f'{len(group) - _SAID} earlier',) if len(group) > _SAID else ()),
+            *(f'{mark.kind}: {mark.text}' for mark in group[-_SAID:]))),
+        any(mark.kind == 'alarm' for mark in group)) for group in groups]
 
 
 class _RecordedPen:

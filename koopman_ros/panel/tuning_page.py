@@ -34,9 +34,8 @@ def tuning_page(page: PageLayout) -> None:
 
 
 def _node(page: PageLayout, node: str) -> None:
-    with attribute(box('card', tag='section'), 'aria-label', f'Parameters of the {node}'):
-        with box('row1 between'):
-            label('h2', node)
+    with page.card(node, f'Parameters of the {node}', node):
+        with box('row1'):
             ui.button('Export YAML', on_click=lambda: ui.download.content(
                 exported(node, page.source.snapshot.parameters.get(node, {})),
                 f'{node}.yaml')).props('outline')
@@ -91,8 +90,11 @@ class _Row:
                 return
             with box(''):
                 with box('ask'):
+                    choices = {bool: ('false', 'true'), str: parameter.choices}.get(
+                        type(parameter.value))
                     self._field = page.control(attribute(
-                        ui.input().props('outlined dense'), 'aria-label', title))
+                        (ui.select(list(choices)) if choices else ui.input()).props(
+                            'outlined dense'), 'aria-label', title))
                     attribute(page.button('Set', self._submit), 'aria-label',
                               f'Set {parameter.name}')
                 self._answer = AnswerLine()
@@ -107,7 +109,7 @@ class _Row:
         if parameter.read_only:
             self._field.set_text(parameter.text)
         elif self._field.value in ('', self._text, None):
-            # what is being typed stays
+            # a text that a user is typing stays
             self._field.set_value(parameter.text)
         self._text = parameter.text
 

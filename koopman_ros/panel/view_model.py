@@ -117,7 +117,7 @@ class LoopViewModel:
                 deviation = found.get(('deviation', name))
                 spread = f' ± {deviation[0]:.2g}' if deviation else ''
                 estimates.append(
-                    (readable(name), f'{value:.4g}{spread} {unit.replace("deg", "°")}'))
+                    (readable(name), f'{value:.4g}{spread} {printed(unit)}'))
         self._estimates = tuple(estimates)
 
     def take_plan(self, names: Sequence[str], stamp: float, times: Sequence[float],
@@ -177,14 +177,15 @@ class LoopViewModel:
                 for name, value in zip(names, fields['value'], strict=True):
                     own = self._states[name]
                     own.values['target'] = own.shown(value)
-                    self._mark('setpoint', f'{readable(name)} {own.values["target"]:.6g} '
+                    self._mark('set-point', f'{readable(name)} {own.values["target"]:.6g} '
                                            f'{printed(own.read)}')
             case 'manual_command' if fields['accepted']:
                 for own, value in zip(self._inputs.values(), fields['value'], strict=True):
-                    own.values['manual'] = own.shown(value)
+                    own.values['manual'] = self.limited(own.name, own.shown(value))
                 self._mark('manual', 'manual command')
             case 'mode':
                 self._mode = str(fields['mode'])
+                self._forget('manual')
                 self._mark('mode', f'{self._mode} mode')
             case 'model':
                 self._mark('model', f'model {fields["model"]["name"]}')
@@ -195,8 +196,15 @@ class LoopViewModel:
                 if 'model' in fields:
                     self._replace_model(fields['model'])
             case 'start' | 'snapshot':
+                if event == 'start':
+                    self._forget('manual', 'target')
                 self._mode = str(fields['state']['mode']['name']).lower()
                 self._model = dict(fields['model'])
+
+    def _forget(self, *kinds: str) -> None:
+        for own in self._all.values():
+            for kind in kinds:
+                own.values.pop(kind, None)
 
     def _replace_model(self, model: Mapping[str, Any]) -> None:
         before, self._model = self._model, dict(model)
@@ -225,9 +233,14 @@ class LoopViewModel:
         :param about: origin and held-out figures, in words.
         """
         self._about = MappingProxyType(dict(about))
+        shown = self.shown_ranges(ranges)
         for name, own in self._all.items():
-            bounds = ranges.get(name)
-            own.training = bounds and (own.shown(bounds[0]), own.shown(bounds[1]))
+            own.training = shown.get(name)
+
+    def shown_ranges(self, ranges: Mapping[str, Range]) -> dict[str, Range]:
+        """Return ranges of the shown signals in the units in which people read them."""
+        return {name: (own.shown(ranges[name][0]), own.shown(ranges[name][1]))
+                for name, own in self._all.items() if name in ranges}
 
     # Snapshots.
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the controller node, and of the replay: its own beside a controller's."""
+"""Parameters of the controller node, and of the replay, which has those as well."""
 
 from collections.abc import Mapping
 import contextlib
@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
@@ -23,7 +24,7 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
-from koopman_ros.estimation import Estimator, ESTIMATORS
+from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
     box_defaults,
@@ -51,32 +52,33 @@ class ControllerParameters:
     model: str = parameter(
         '', 'Name of a bundled model, or path of a .safetensors model file.')
     states_measured: tuple[str, ...] = parameter(
-        ('',), 'Measured signals with their units, e.g. level [m], which the model must have; its '
-        'other states are estimated; an empty name: all states.', read_only=True)
+        ('',), 'Measured signals with their units, e.g. level [m]. The model must have them; its '
+               'other states are estimated. An empty name: all states.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'Inputs with their units, e.g. pump [V], which the model must have; an empty name: '
-        'all inputs.', read_only=True)
+        ('',), 'Inputs with their units, e.g. pump [V]. The model must have them. An empty name: '
+               'all inputs.', read_only=True)
     autostart: bool = parameter(
-        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        True, 'Configure and activate at start-up; false: left to a lifecycle manager.',
         read_only=True)
     synchronisation_tolerance: float = parameter(
-        0.0, 'Largest difference between the stamps of messages that are one measurement.', 's',
+        0.0, 'Largest difference between the stamps of messages that belong to one '
+             'measurement.', 's',
         0.0, 10.0, read_only=True)
     tuning: Tuning = nested(Tuning)
     measurement_timeout: float = parameter(
-        10.0, 'Plant time without a measurement whose stamp advances after which the inputs are '
-        'held and diagnostics turn to ERROR; 0: no timeout.', 's', 0.0, 86400.0)
+        10.0, 'Plant time without a newer measurement after which the inputs are held and '
+              'diagnostics report ERROR; 0: no timeout.', 's', 0.0, 86400.0)
     max_measurement_age: float = parameter(
-        5.0, 'Age of a measurement at its arrival above which diagnostics warn; 0: no warning.',
+        5.0, 'Age of a measurement on receipt above which diagnostics warn; 0: no warning.',
         's', 0.0, 86400.0)
     load_refused_model: bool = parameter(
-        False, 'Load a model file although its training rejected it.')
+        False, 'Also load a model that its training rejected.')
     model_check_factor: float = parameter(
         2.0, 'A new model is rejected if its prediction error on recent measurements exceeds that '
-        'of the present model by more than this factor; 0: no check.', '', 0.0, 1e6,
+             'of the current model by more than this factor; 0: no check.', '', 0.0, 1e6,
         smallest=1.0)
     model_check_length: float = parameter(
-        600.0, 'Duration of the measurements that are kept for that check.', 's', 0.0, 86400.0,
+        600.0, 'Length of the measurement history used by that check.', 's', 0.0, 86400.0,
         open_minimum=True)
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces, 'measured')
     inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
@@ -86,9 +88,9 @@ class ControllerParameters:
 
 def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
     """
-    Return the controller with a model, whatever states that has beside the measured ones.
+    Return the controller with a model, which may have states that are not measured.
 
-    :raises ValueError: where the estimator cannot do with what is measured.
+    :raises ValueError: if the measured signals do not suffice for the estimator.
     """
     own = signals_of(model, parameters.tuning.controlled, parameters.states)
     tuning = of_other_states(parameters.tuning, tuple(parameters.every_state), model.states.names)
@@ -128,10 +130,14 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     return found
 
 
+def _modes(model: LiftedModel) -> NDArray[np.complex128]:
+    return np.asarray(np.linalg.eigvals(
+        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit)
+
+
 def _dynamics(model: LiftedModel) -> dict[str, Any]:
-    """Return what suits a model's modes: an unstable plant cannot wait, and is planned for."""
-    modes = np.linalg.eigvals(
-        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
+    """Return defaults for a model's modes: an unstable plant cannot wait, and needs a plan."""
+    modes = _modes(model)
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
     stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
     levels = {} if np.all(modes.real <= 0.0) else {'fallback_order': ('mpc', 'sdre', 'linear')}
@@ -144,13 +150,20 @@ def _dynamics(model: LiftedModel) -> dict[str, Any]:
             'observer_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
 
 
+def _longest_dead_time(model: LiftedModel, given: Mapping[str, Any]) -> float:
+    named = (given.get(f'{name}.dead_time') for name in model.inputs.names)
+    return max((seconds if isinstance(seconds, float) and seconds >= 0.0 else known
+                for seconds, known in zip(named, model.dead_time.tolist(), strict=True)),
+               default=0.0)
+
+
 def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
              ) -> ParameterTable[ControllerParameters]:
     """
     Return the parameters of a controller with a model.
 
     Its trained range, scaling and time constants are the defaults, unless the preset of a plant
-    says otherwise.
+    overrides them.
 
     :param given: values that are known already, of which system, signals and plug-ins count.
     :raises ConfigurationError: for signals, given or of a preset, that the model has not.
@@ -164,8 +177,8 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     if expected.inputs != found.inputs or not expected.states.items() <= found.states.items():
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
-            'system, correct states_measured and inputs_commanded, or name in system what the '
-            'model is of (none that is shipped: -p "system:=\'\'")')
+            'system, correct states_measured and inputs_commanded, or set system to the plant of '
+            'the model (for a plant that is not bundled: -p "system:=\'\'")')
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))),
                          expected.states)
     defaults: dict[str, Any] = {**signals.defaults(), **_dynamics(model)}
@@ -175,6 +188,11 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         defaults |= {f'{name}.weight': 1.0 / scale ** 2
                      for name, scale in zip(one.names, one.scale.tolist(), strict=True)
                      if name in signals.units}
+    defaults |= {**own, 'system': system}
+    if dead_time := _longest_dead_time(model, {**defaults, **given}):
+        bandwidth = largest_bandwidth(dead_time, float(np.min(np.abs(_modes(model)))))
+        defaults['observer_bandwidth'] = min(
+            defaults['observer_bandwidth'], float(f'{bandwidth:.2g}'))
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),
@@ -182,8 +200,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         signals={'states': signals.every, 'measured': signals.states,
                  'controlled': {name: signals.states[name] for name in signals.controlled},
                  'inputs': signals.inputs},
-        plugins=_plugin_parameters({**own, **given}),
-        defaults={**defaults, **own, 'system': system})
+        plugins=_plugin_parameters({**own, **given}), defaults=defaults)
 
 
 @dataclass(frozen=True)
@@ -191,23 +208,21 @@ class ReplayParameters:
     """Snapshot of the replay's parameters; a controller's may be given for the new model."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'Bundled plant whose topics are those of the bag; any other name: no '
-        'defaults.')
+        DEFAULT_SYSTEM, 'Bundled plant whose topics the bag has; any other name: no defaults.')
     model: str = parameter(
-        '', 'Where to look for a recorded model that is not a bundled one: a .safetensors file, a '
-        'name, or a folder of such files.')
+        '', 'Location of recorded models that are not bundled: a .safetensors file, a name, or a '
+            'folder of such files.')
     bags: tuple[str, ...] = parameter(
         ('run_1',), 'Bags to replay, each as a separate run: .mcap files or bag folders.')
     new_model: str = parameter(
-        '', 'Model, by name or path, whose commands are compared with the recorded ones. The '
-        'recorded parameters of the controller apply except those given here. Empty: only check '
-        'that the recorded commands are reproduced.')
+        '', 'Model, by name or path, whose commands are compared with the recorded ones. Recorded '
+            'controller parameters apply unless they are given here. Empty: only check that the '
+            'recorded commands are reproduced.')
     output: str = parameter(
-        'replay', 'Folder for report.md, summary.json and the pictures; existing ones are '
-        'replaced.')
+        'replay', 'Folder for report.md, summary.json and the plots; existing files are replaced.')
     tolerance: float = parameter(
-        0.1, 'Difference between two commands, in the unit of the input, above which it is '
-        'counted and marked.', '', 0.0, 1e9)
+        0.1, 'Difference between two commands, in the unit of the input, above which they count '
+             'as different.', '', 0.0, 1e9)
     recover: bool = parameter(
         False, 'Read the intact part of bags that are damaged or were not closed.')
     last: float = parameter(
@@ -217,7 +232,7 @@ class ReplayParameters:
 
 def _check_replay(values: ReplayParameters) -> str:
     if not values.bags or not all(values.bags):
-        return f'bags = {list(values.bags)} must hold at least one path and no empty one'
+        return f'bags = {list(values.bags)} must contain at least one path and no empty one'
     if not values.output:
         return "output = '' must name a folder, e.g. replay"
     return ''

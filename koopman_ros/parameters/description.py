@@ -54,7 +54,7 @@ class ParameterDescription:
             try:
                 return tuple(map(float, parts))
             except ValueError:
-                raise ValueError('write numbers with commas between them') from None
+                raise ValueError('separate numbers by commas') from None
         if self.choices and text not in self.choices:
             raise ValueError(f'must be {self.range}')
         return text

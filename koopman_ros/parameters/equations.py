@@ -24,14 +24,14 @@ def named_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float] | None]:
             found[match['name']] = None if match['low'] is None else (
                 float(match['low']), float(match['high']))
         except ValueError as error:
-            raise ValueError(f'{text!r} must be a name, or one with a range as friction [0.01, '
-                             '0.5], each name once') from error
+            raise ValueError(f'{text!r} must be a name, optionally with a range, e.g. friction '
+                             '[0.01, 0.5], each name once') from error
     return found
 
 
 def refused(equations: str, texts: Sequence[str]) -> str:
     """
-    Say why equations cannot be fitted, or nothing.
+    Return why equations cannot be fitted, or an empty string.
 
     :param equations: name of a plant, empty for none.
     :param texts: their constants, see :func:`named_ranges`.
@@ -45,5 +45,5 @@ def refused(equations: str, texts: Sequence[str]) -> str:
     except ValueError as error:
         return f'physical_model = {equations!r} with estimated_constants = {list(texts)}: {error}'
     return '' if equations or not ranges else (
-        f'estimated_constants names {", ".join(ranges)}, must be empty without equations: give '
-        'the plant whose constants they are')
+        f'estimated_constants names {", ".join(ranges)}, but there are no equations: set '
+        'physical_model to the plant with these constants')

@@ -31,17 +31,17 @@ _TRIALS = 3
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model with what tells its versions apart."""
+    """A model with the identity of its file."""
 
     name: str  #: of a shipped model, or the path of a file
     model: LiftedModel
     file_time: str  #: when the file was written, in UTC
     digest: str  #: SHA-256 of the file
-    comparison: str = ''  #: with the model before, on what was measured then; empty at the start
+    comparison: str = ''  #: with the previous model, on the measurements then; empty at the start
 
     @property
     def identity(self) -> dict[str, str]:
-        """What records name it by."""
+        """The identity of the model in records."""
         return {'name': self.name, 'digest': self.digest}
 
     @property
@@ -53,19 +53,19 @@ class LoadedModel:
 
 @dataclass(frozen=True)
 class ModelCheckContext:
-    """What a new model has to cope with."""
+    """The situation in which a new model must work."""
 
     parameters: ControllerParameters
     state: State
     measured: Array  #: (n_y,) last measurement; NaN before the first
-    recent: PredictionWindows | None  #: what was measured lately; None while that is too little
+    recent: PredictionWindows | None  #: recent measurements; None while they are too few
 
     def controller(self, model: LiftedModel) -> Controller:
-        """Return what would act with a model; ModelFileError where that cannot be."""
+        """Return the controller of a model; ModelFileError where it cannot be."""
         try:
             return built(self.parameters, model)
         except ValueError as error:
-            raise ModelFileError(f'the model does not suit the parameters: {error}') from error
+            raise ModelFileError(f'the model does not fit the parameters: {error}') from error
 
 
 def ranges(model: LiftedModel) -> str:
@@ -85,23 +85,23 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
     :param force: whether to load a model that its training refused.
     """
     if not name:
-        raise ModelFileError('model is empty: name a shipped model or a .safetensors file')
+        raise ModelFileError('model is empty: name a bundled model or a .safetensors file')
     if len(name.encode()) > _LONGEST_PATH or '\0' in name:
-        raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
-                             f'{_LONGEST_PATH} bytes: check it')
+        raise ModelFileError(f'model = {name[:50]!r}... is not a valid path (at most '
+                             f'{_LONGEST_PATH} bytes): check it')
     path = model_path(name)
     model, digest = load_with_digest(path)
     if reason := unusable(model):
         raise ModelFileError(f'{path}: {reason}')
     if model.provenance.accepted is False and not force:
         raise ModelFileError(
-            f'{path} was {model.provenance.acceptance}: train it again, or set '
-            'load_refused_model to true to control with it all the same')
+            f'{path} was {model.provenance.acceptance}: train it again, or set load_refused_model '
+            'to true to use it anyway')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and signals.states.items() <= own.states.items()):
         raise ModelFileError(
-            f'{path} has {own}, this controller was started for {signals}: choose a model of '
+            f'{path} has {own}, but this controller was started for {signals}: choose a model of '
             'the same signals, or restart the controller')
     _refuse_slow(path, model)
     written = 'unknown'
@@ -131,13 +131,13 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
         needed.append(time.thread_time() - begun)
     if min(needed) > _LONGEST_STEP:
         raise ModelFileError(
-            f'{path}: a control step with the model takes {min(needed):.3g} s of a processor, at '
-            f'most {_LONGEST_STEP:g} s are allowed: train one with fewer coordinates (n_z = '
-            f'{model.n_z})')
+            f'{path}: a control step with the model takes {min(needed):.3g} s of processor time, '
+            f'more than the allowed {_LONGEST_STEP:g} s: train a model with fewer coordinates '
+            f'(now n_z = {model.n_z})')
 
 
 def refuse_setpoints(model: LiftedModel, situation: ModelCheckContext) -> None:
-    """Raise ModelFileError for a model that cannot track what the operator asked for."""
+    """Raise ModelFileError for a model that cannot track the requested set-point."""
     controller = situation.controller(model)
     if (refusal := controller.untrained(situation.state.setpoint)) is not None:
         raise ModelFileError(words_of(signals_of(model))(refusal))
@@ -156,8 +156,8 @@ def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None
                 continue
             if (problem := controller.try_law(place, setpoint)) is not None:
                 tried = (f'tried at {listed(model.states, place)} with the set-point '
-                         f'{listed(controller.controlled, setpoint)} the model fails '
-                         f'({words_of(signals_of(model))(problem)})')
+                         f'{listed(controller.controlled, setpoint)} the control law of the model '
+                         f'fails ({words_of(signals_of(model))(problem)})')
                 # another model fails for the same reason
                 raise ModelFileError(tried if controller.usable.unusable is not None else
                                      f'{tried}: train it again, or change the weights')
@@ -165,14 +165,14 @@ def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None
 
 def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheckContext) -> str:
     """
-    Raise ModelFileError for a model that predicts what was measured lately much worse.
+    Raise ModelFileError for a model that predicts recent measurements much worse.
 
-    :return: how well it does beside the present one, in words.
+    :return: the comparison with the current one, in words.
     """
     found = None if situation.recent is None else compare(
         situation.controller(present), situation.controller(model), situation.recent)
     if found is None:
-        return 'not compared with the model before: too little was measured so far'
+        return 'not compared with the previous model: too few measurements so far'
     i = int(np.argmax(found.ratio))
     name, unit = list(situation.parameters.states)[i], list(signals_of(
         model, measured=situation.parameters.states).states.values())[i]
@@ -182,11 +182,11 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheck
     most = situation.parameters.model_check_factor
     if most and not found.ratio[i] <= most:
         raise ModelFileError(
-            f'the model {words.format("present one")}, at most '
-            f'{most * found.allowance[i]:.2g} {unit} are allowed: train it again '
-            'with more data, or set model_check_factor = 0 to load it all the same')
+            f'the model {words.format("present one")}, at most {most * found.allowance[i]:.2g} '
+            f'{unit} are allowed: train it again with more data, or set model_check_factor = 0 to '
+            'load it anyway')
     return words.format('model before') + (
-        '' if found.tells else '; nothing moved that would tell more')
+        '' if found.tells else '; the signals moved too little for a stricter check')
 
 
 def listed(signals: Coordinates, values: Array) -> str:
@@ -196,20 +196,20 @@ def listed(signals: Coordinates, values: Array) -> str:
 
 
 def rests_outside(controller: Controller) -> str:
-    """Say that the safe input keeps the plant where no law may act, or return ''."""
+    """Return the warning that the safe input keeps the plant where no law may act, or ''."""
     model, rest = controller.model, controller.rest
     # a model without training data is a linearisation, which does not know where that is
     if rest.holding is None or not model.provenance.data_digest:
         return ''
     safe, holding = controller.safe_input, rest.holding
-    where = 'does not come to rest' if np.isnan(rest.x).any() else (
-        f'rests at about {listed(model.states, rest.x)} if one extrapolates')
+    where = 'does not settle' if np.isnan(rest.x).any() else (
+        f'would settle at about {listed(model.states, rest.x)} by extrapolation')
     inputs = model.inputs.names, model.inputs.units
     better = ', '.join(
         f'{name}.safe_value = {quantity_text(held, unit)} or {"more" if held > now else "less"}'
         for name, unit, now, held in zip(*inputs, safe.tolist(), holding.tolist(), strict=True))
     under = ', '.join(f'{name}.safe_value = {quantity_text(now, unit)}' for name, unit, now in zip(
         *inputs, safe.tolist(), strict=True))
-    return (f'under {under} the plant leaves the trained range, {ranges(model)}, and '
-            f'{where}: no law can act there, and the way back is slow; record data from there and '
-            f'train again, or set {better} if that is still safe')
+    return (f'under {under} the plant leaves the trained range, {ranges(model)}, and {where}: no '
+            'law can act there, and recovery is slow; record data there and train again, or set '
+            f'{better} if that is still safe')

@@ -25,7 +25,7 @@ from koopman_ros.parameters.trainer import trainer_signals
 
 
 def _shown_unit() -> Any:
-    return parameter('', 'Unit of this signal on the pages; empty: the unit of its parameters.',
+    return parameter('', 'Unit shown for this signal; empty: the unit of its parameters.',
                      read_only=True)
 
 
@@ -51,8 +51,8 @@ class PanelParameters:
         DEFAULT_SYSTEM, 'Bundled plant whose signals and topics are the defaults; any other '
         'name: no defaults.', read_only=True)
     model: str = parameter(
-        '', 'Model whose signals are shown if no other parameter names them: a bundled one by '
-        'name, or the path of a .safetensors file.', read_only=True)
+        '', 'Model whose signals are shown if no other parameter names them: name of a bundled '
+            'model, or path of a .safetensors file.', read_only=True)
     states_measured: tuple[str, ...] = parameter(
         ('',), 'Measured signals with their units, e.g. level [m]; an empty name: those of the '
         'model.', read_only=True)
@@ -68,24 +68,24 @@ class PanelParameters:
     title: str = parameter(
         '', 'Title of all pages; empty: the name of the plant.', read_only=True)
     host: str = parameter(
-        '127.0.0.1', 'Address of the web server; users are required unless it is a loopback '
-        'address.',
+        '127.0.0.1', 'Address of the web server. Users are required unless it is a loopback '
+                     'address.',
         read_only=True)
     port: int = parameter(
         8080, 'Port of the web server; 0: any free port.', '', 0, 65535, read_only=True)
     users: str = parameter(
-        '', 'File of users with their roles and hashed passwords; empty: every user of this '
-        'machine is the operator.', read_only=True)
+        '', 'File of users with roles and hashed passwords; empty: every user of this machine is '
+            'an operator.', read_only=True)
     tls_certificate: str = parameter(
-        '', 'TLS certificate, as a PEM file; empty: no encryption.', read_only=True)
+        '', 'TLS certificate (PEM file); empty: no encryption.', read_only=True)
     tls_key: str = parameter(
-        '', 'Private key of the certificate, as a PEM file.', read_only=True)
+        '', 'Private key of the certificate (PEM file).', read_only=True)
     trusted_proxy: tuple[str, ...] = parameter(
         ('',), 'Addresses or networks of reverse proxies whose X-Forwarded-For and '
         'X-Forwarded-Proto are trusted; an empty name: none. Requires users.', read_only=True)
     alarm_file: str = parameter(
-        '', 'File that keeps alarms, shelving and the last 24 hours across a restart; empty: '
-        'none.', read_only=True)
+        '', 'File that keeps alarms, shelving and the last 24 hours across restarts; empty: '
+            'none.', read_only=True)
     span: float = parameter(
         28800.0, 'Length of the trends.', 's', 600.0, 604800.0, read_only=True)
     states: Mapping[str, ShownState] = per_signal(ShownState)
@@ -118,7 +118,7 @@ def panel_table(present: LiftedModel | None = None,
 
     def check(values: PanelParameters) -> str:
         if bool(values.tls_certificate) != bool(values.tls_key):
-            return 'tls_certificate and tls_key belong together: give both, or neither'
+            return 'tls_certificate and tls_key must be set together: set both, or neither'
         for name in ('controller', 'trainer', 'host'):
             if not getattr(values, name):
                 return f"{name} = '' must not be empty"
@@ -133,8 +133,8 @@ def panel_table(present: LiftedModel | None = None,
             try:
                 conversion(unit, read[name])
             except ValueError as error:
-                return (f'{name}.shown_unit = {read[name]!r} must be a unit of the dimension of '
-                        f'{unit}: {error}')
+                return (f'{name}.shown_unit = {read[name]!r} must have the dimension of {unit}: '
+                        f'{error}')
         return SignalTopics(signals, values.states, values.inputs).check()
 
     return ParameterTable(

@@ -13,7 +13,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import group, parameter, per_signal, signal_value, UNBOUNDED
-from koopman_ros.core.units import check_unit, LAST_STAMP_SECONDS
+from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.parameters.signal_topics import (
     CommandedPlaces,
     DEFAULT_SYSTEM,
@@ -51,9 +51,9 @@ class StateParameters(MeasuredPlace):
     bias: float = parameter(
         0.0, 'Offset of the measurement.', '{unit}', -UNBOUNDED, UNBOUNDED)
     resolution: float = parameter(
-        0.0, 'Resolution of the measurement; 0: unlimited.', '{unit}', 0.0, 1e9)
+        0.0, 'Resolution of the measurement; 0: exact.', '{unit}', 0.0, 1e9)
     initial_offset: float = parameter(
-        0.0, 'Distance from the steady state at the start.', '{unit}', -UNBOUNDED, UNBOUNDED,
+        0.0, 'Initial offset from the steady state.', '{unit}', -UNBOUNDED, UNBOUNDED,
         read_only=True)
 
 
@@ -62,14 +62,18 @@ class InputParameters(CommandedPlaces):
     """The actuator of an input."""
 
     min: float = signal_value(
-        -UNBOUNDED, 'Lowest value that the actuator reaches.')
+        -UNBOUNDED, 'Lower limit of the actuator.')
     max: float = signal_value(
-        UNBOUNDED, 'Highest value that the actuator reaches.')
+        UNBOUNDED, 'Upper limit of the actuator.')
     delay: float = parameter(
-        0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
+        0.0, 'Delay between a command and its application, which the measured input shows.', 's',
+        0.0, 3600.0)
     lag: float = parameter(
-        0.0, 'Time constant with which the input follows its command; 0: at once.', 's', 0.0,
+        0.0, 'Time constant of the actuator; 0: no lag.', 's', 0.0,
         3600.0)
+    dead_time: float = parameter(
+        0.0, 'Dead time between the applied input and its effect, which the measured input does '
+        'not show.', 's', 0.0, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -77,13 +81,13 @@ class PlantParameters:
     """Snapshot of the plant's parameters, in the units that people read."""
 
     system: str = parameter(
-        DEFAULT_SYSTEM, 'Plant to simulate: one of the library, an entry point of the group '
-        'koopman_ros.plants, or package.module:Class.', read_only=True)
+        DEFAULT_SYSTEM, 'Plant to simulate: the name of a library plant, an entry point of the '
+                        'group koopman_ros.plants, or package.module:Class.', read_only=True)
     measured: tuple[str, ...] = parameter(
         ('',), 'States whose measurements must have subscribers before lock-step starts; an empty '
         'name: all.', read_only=True)
     autostart: bool = parameter(
-        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        True, 'Configure and activate at start-up; false: left to a lifecycle manager.',
         read_only=True)
     sample_period: float = parameter(
         1.0, 'Time between measurements.', 's', 1e-3, 3600.0, read_only=True)
@@ -92,19 +96,22 @@ class PlantParameters:
         1.0, 'Simulated seconds per second; 0: as fast as possible.', '', 0.0, 1e6, smallest=1e-6,
         read_only=True)
     lockstep: bool = parameter(
-        False, 'Wait for the command of each measurement before the next one.',
+        False, 'Lock-step: wait for the command of each measurement before the next one.',
         read_only=True)
     lockstep_timeout: float = parameter(
-        5.0, 'Wall time after which lock-step continues with the last command.', 's', 0.01, 3600.0,
+        5.0, 'Wall time without a command after which lock-step continues with the last '
+             'one.', 's', 0.01, 3600.0,
         read_only=True)
     lockstep_subscribers: int = parameter(
-        1, 'Number of subscribers of the measurements before lock-step starts.', '', 1, 1000,
+        1, 'Number of subscribers to the measurements that lock-step waits for at the '
+           'start.', '', 1, 1000,
         read_only=True)
     duration: float = parameter(
-        0.0, 'Simulated time after which the simulation stops; 0: never.', 's', 0.0, 1e9,
+        0.0, 'Simulated duration; 0: unlimited.', 's', 0.0, 1e9,
         read_only=True)
     start_time: float = parameter(
-        1.0, 'Time of the first measurement when not in real time.', 's', 1e-3, LAST_STAMP_SECONDS,
+        1.0, 'Stamp of the first measurement when not in real '
+             'time.', 's', 1e-3, LAST_STAMP_SECONDS,
         read_only=True)
     publish_clock: bool = parameter(True, 'Publish /clock when not in real time.', read_only=True)
     frame_id: str = parameter('plant', 'frame_id of the messages.', read_only=True)
@@ -118,8 +125,8 @@ class PlantTable(ParameterTable[PlantParameters]):
     """
     The table of a plant.
 
-    :param given: what is known of the values already, of which `system` counts.
-    :raises ConfigurationError: for a system that there is not, or that cannot be built.
+    :param given: known values, of which `system` is used.
+    :raises ConfigurationError: for an unknown system, or one that cannot be constructed.
     """
 
     def __init__(self, given: Mapping[str, Any] = MappingProxyType({})) -> None:
@@ -127,8 +134,6 @@ class PlantTable(ParameterTable[PlantParameters]):
         try:
             self.plant = plant_class(system)
             reference = build(self.plant, {})
-            for unit in (*reference.state_units, *reference.input_units):
-                check_unit(unit)
         except ValueError as error:
             raise ConfigurationError(f'system = {system!r}: {error}') from error
         self.described = signals = Signals(
@@ -150,15 +155,15 @@ class PlantTable(ParameterTable[PlantParameters]):
         return build(self.plant, values.constants, nominal_state)
 
     def actuator(self, values: PlantParameters) -> Actuator:
-        """Return what stands before the inputs, in the plant's units."""
+        """Return the actuators of the inputs, in the plant's units."""
         units = self.described.inputs
         tuned = values.inputs
         return Actuator(in_own_units(tuned, 'min', units), in_own_units(tuned, 'max', units),
-                        np.array([tuned[name].delay for name in units]),
-                        np.array([tuned[name].lag for name in units]))
+                        *(np.array([getattr(tuned[name], one) for name in units])
+                          for one in ('delay', 'lag', 'dead_time')))
 
     def _build(self, values: PlantParameters) -> None:
-        """Build what a plant starts with, down to the tolerances of its integration."""
+        """Build the plant's process, including the tolerances of its integration."""
         self.actuator(values)
         try:
             system = self.system(values)
@@ -171,12 +176,12 @@ class PlantTable(ParameterTable[PlantParameters]):
 def _cross_check(signals: Signals, values: PlantParameters) -> str:
     if values.start_time + values.duration > LAST_STAMP_SECONDS:
         return (f'start_time + duration = {values.start_time + values.duration:.10g} s must be at '
-                f'most {LAST_STAMP_SECONDS} s, where the stamps of messages end: choose a smaller '
+                f'most {LAST_STAMP_SECONDS} s, the largest message stamp: choose a smaller '
                 'start_time')
     if len(values.frame_id) > LONGEST_FRAME_ID:
-        return (f'frame_id has {len(values.frame_id)} characters, must have at most '
+        return (f'frame_id has {len(values.frame_id)} characters, the maximum is '
                 f'{LONGEST_FRAME_ID}: shorten it')
     if unknown := set(filter(None, values.measured)) - set(signals.states):
-        return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}, the '
-                f'states are {", ".join(signals.states)}: choose among them')
+        return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}: choose '
+                f'from the states {", ".join(signals.states)}')
     return SignalTopics(signals, values.states, values.inputs, PLANT_KINDS).check()

@@ -31,7 +31,7 @@ AUDIT_LOG = 'audit_log'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 
-#: what is controlled where nothing else is said
+#: the default system
 DEFAULT_SYSTEM = 'reactor'
 
 LONGEST_FRAME_ID = 256  # characters that are passed on
@@ -53,12 +53,10 @@ def _topic(description: str) -> Any:
 class MeasuredPlace:
     """Where a signal is measured."""
 
-    topic: str = _topic('Topic of the measurements; for an input, of the applied value.')
-    type: str = _topic('Type of these messages as package/msg/Name; empty: the usual type for the '
-                       'unit.')
-    field: str = _topic('Field of the message that holds the value, e.g. temperature, '
-                        'twist.linear.x, data[2] or position[shaft]; empty: the usual field of '
-                        'the type.')
+    topic: str = _topic('Topic of the measurements; for an input: of the applied value.')
+    type: str = _topic('Message type as package/msg/Name; empty: the usual type for the unit.')
+    field: str = _topic('Message field that holds the value, e.g. temperature, twist.linear.x, '
+                        'data[2] or position[shaft]; empty: the usual field of the type.')
     unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 
@@ -66,8 +64,8 @@ class MeasuredPlace:
 class StatePlaces(MeasuredPlace):
     """Where a measured state is; its set-points and prediction have the same type and field."""
 
-    setpoint_topic: str = _topic('Topic on which set-points are requested.')
-    active_setpoint_topic: str = _topic('Topic of the set-point in use.')
+    setpoint_topic: str = _topic('Topic of requested set-points.')
+    active_setpoint_topic: str = _topic('Topic of the active set-point.')
     predicted_topic: str = _topic('Topic of the predicted measurement.')
 
 
@@ -76,9 +74,9 @@ class CommandedPlaces(MeasuredPlace):
     """Where an input is measured, and where it is commanded."""
 
     command_topic: str = _topic('Topic of the commands.')
-    command_type: str = _topic('Type of the commands; empty: that of the measurements.')
-    command_field: str = _topic('Field of the command that holds the value; empty: the usual '
-                                'field of the type.')
+    command_type: str = _topic('Message type of the commands; empty: that of the measurements.')
+    command_field: str = _topic('Message field that holds the command; empty: the usual field of '
+                                'the type.')
     command_unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 
@@ -122,18 +120,18 @@ class Signals:
         for name in (*self.states, *self.inputs):
             if not SIGNAL_NAME.fullmatch(name):
                 raise ConfigurationError(
-                    f'{name!r} is a signal, which topics and parameters are named after: use '
+                    f'{name!r} is the name of a signal, used in topics and parameters: use '
                     'letters, digits and _, beginning with a letter')
         wrong = [name for name in self.controlled if name not in self.states]
         if wrong or len(set(self.controlled)) < len(self.controlled):
             raise ConfigurationError(
-                f'controlled = {list(self.controlled)} must name different ones of the measured '
-                f'signals {", ".join(self.states)}')
+                f'controlled = {list(self.controlled)} must name measured signals, each once: '
+                f'choose from {", ".join(self.states)}')
 
     def __str__(self) -> str:
         """Write states and inputs with units."""
         return ' and '.join(
-            f'{kind} ' + ', '.join(f'{name} [{unit}]' for name, unit in of.items())
+            f'{kind} ' + ', '.join(described(of))
             for kind, of in (('states', self.states), ('inputs', self.inputs)))
 
     def defaults(self) -> dict[str, str]:
@@ -224,17 +222,17 @@ class SignalTopics:
     applied = _role('inputs', 'topic')
 
     def check(self) -> str:
-        """Say what is wrong with them, or return an empty string."""
+        """Return their defect in words, or an empty string."""
         try:
             for kind in self.kinds:
                 places = getattr(self, kind)
                 if missing := [name for name, found in places.items() if not found.topic]:
-                    return f'{missing[0]} has no topic: name one'
+                    return f'{missing[0]} has no topic: set one'
             heard = {found.topic: name for name, found in self.measured.items()}
             for name, found in self.commands.items():
                 if found.topic in heard:
-                    return (f'{name} is commanded on {found.topic!r}, where {heard[found.topic]} '
-                            'is measured: name another topic for one of them')
+                    return (f'{name} is commanded on {found.topic!r}, the topic on which '
+                            f'{heard[found.topic]} is measured: change one of them')
         except ValueError as error:
             return str(error)
         return ''
@@ -266,10 +264,15 @@ def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Messag
     return found
 
 
-def named_units(described: Collection[str]) -> dict[str, str]:
+def described(units: Mapping[str, str]) -> tuple[str, ...]:
+    """Return signals as :func:`named_units` reads them, e.g. ``level [m]``."""
+    return tuple(f'{name} [{unit}]' for name, unit in units.items())
+
+
+def named_units(texts: Collection[str]) -> dict[str, str]:
     """Return units by name of signals described as ``name [unit]``; ConfigurationError if not."""
     found = {}
-    for text in described:
+    for text in texts:
         match = _NAMED.fullmatch(text.strip())
         if match is None or match[1] in found:
             raise ConfigurationError(f'{text!r} must be a name and a unit, each name once, e.g. '
@@ -327,6 +330,6 @@ def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None
 
 
 def refusal(names: Collection[str]) -> str:
-    """Say why a list of names cannot be that of topics, or return an empty string."""
+    """Return why a list of names cannot be that of topics, or an empty string."""
     return '' if names and all(names) else (
-        f'topics = {list(names)} must hold at least one name and no empty one')
+        f'topics = {list(names)} must contain at least one name and no empty one')

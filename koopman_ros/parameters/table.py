@@ -84,8 +84,14 @@ class Specification:
         bracket = '(' if self.open_minimum else '['
         return f'{bracket}{self.minimum:.10g}, {self.maximum:.10g}]{unit}'
 
+    @property
+    def notes(self) -> list[str]:
+        """The allowed values, and whether a node takes another one while it runs."""
+        return [*filter(None, [self.range_text]), *['fixed at start'] * self.read_only,
+                *['a module:name is fixed at start'] * self.code]
+
     def check(self, value: Any) -> str:
-        """Return what is wrong with a value of the right type, or an empty string."""
+        """Return the reason why a value of the right type is rejected, or an empty string."""
         unit = f' {self.unit}' if self.unit else ''
         if self.choices and value not in self.choices:
             return f'{self.name} = {value!r} must be {self.range_text}'
@@ -116,14 +122,14 @@ class ParameterTable(Generic[T]):
     The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
 
     :param signals: names and units of the signals, by field made with :func:`per_signal`, or by
-        what a column is declared for.
+        the signals of a column.
     :param groups: rows by field made with :func:`group`.
     :param plugins: parameter dataclasses by the name of the plug-in.
     :param defaults: values, by name, in place of those of the dataclass; foreign ones are ignored.
     :param ordered: names of which the first must be below the second, the same for each signal.
-    :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
-    :param build: builds from a snapshot what the node will use, of which a ValueError or an
-        ArithmeticError is the reason to refuse the snapshot.
+    :param cross_check: returns the defect of a whole snapshot, or an empty string.
+    :param build: builds the node's objects from a snapshot; a ValueError or an ArithmeticError of
+        it rejects the snapshot.
     """
 
     def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '',
@@ -258,7 +264,7 @@ class ParameterTable(Generic[T]):
             self.amended(snapshot, **{row.name: old[row.name]}))] or changed
         given = ' and '.join(self._given(row.name, values) for row in guilty)
         ranges = dict.fromkeys(f' in {row.range_text}' for row in guilty if row.range_text)
-        return f'{given} cannot be used: {error}; choose another value{" or".join(ranges)}'
+        return f'{given} is not usable: {error}; choose another value{" or".join(ranges)}'
 
     def _given(self, name: str, values: Mapping[str, Any]) -> str:
         return f'{name} = {values[name]} {self.rows[name].unit}'.rstrip()
@@ -276,17 +282,14 @@ class ParameterTable(Generic[T]):
         """Write the table as a commented ROS parameter file, for nodes of any name."""
         lines = ['/**:', '  ros__parameters:']
         for name, row in self.rows.items():
-            notes = [row.range_text] if row.range_text else []
-            notes += ['fixed at start'] if row.read_only else []
-            notes += ['a module:name is fixed at start'] if row.code else []
             lines += ['', f'    # {row.description}' + (f' [{row.unit}]' if row.unit else '')]
-            lines += [f'    #   {"; ".join(notes)}'] if notes else []
+            lines += [f'    #   {"; ".join(row.notes)}'] if row.notes else []
             lines.append(f'    {name}: {as_yaml(row.default)}')
         return '\n'.join(lines) + '\n'
 
 
 def in_own_units(tuned: Mapping[str, Any], attribute: str, units: Mapping[str, str]) -> Array:
-    """Return what :func:`signal_value` declared for signals (n,), in their own units."""
+    """Return values declared by :func:`signal_value` for signals (n,), in their own units."""
     return np.array([conversion(display_unit(unit), unit)(getattr(tuned[name], attribute))
                      for name, unit in units.items()])
 
@@ -338,7 +341,7 @@ def _shown_none(none: float, is_value: bool, unit: str) -> float:
 
 
 def lowest(unit: str) -> float:
-    """Return what a value in a unit cannot be below; as a limit it stands for none."""
+    """Return the lowest possible value in a unit; as a limit it means none."""
     # there is nothing below absolute zero
     return -ZERO_CELSIUS if unit == 'degC' else -UNBOUNDED
 

@@ -72,19 +72,19 @@ class TrainerParameters:
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
     autostart: bool = parameter(
-        True, 'Configure and activate at the start; false: a lifecycle manager does.',
+        True, 'Configure and activate at start-up; false: left to a lifecycle manager.',
         read_only=True)
     task: str = parameter(
         'record', 'record: run as a node that records, runs experiments and trains on request; '
-        'train: train from the bags and exit.', choices=('record', 'train'), read_only=True)
+                  'train: train from the bags, then '
+                  'exit.', choices=('record', 'train'), read_only=True)
     record_at_start: bool = parameter(
-        True, 'Start recording at the start, without waiting for ~/record.', read_only=True)
+        True, 'Start recording at start-up, without waiting for ~/record.', read_only=True)
     output: str = parameter(
         '', 'Bag to record: a file ending in .mcap or a new folder; empty: a folder named after '
-        'date and time. Nothing is overwritten: where run exists, run_2 is written.')
+            'date and time. Existing bags are kept: if run exists, run_2 is written.')
     topics: tuple[str, ...] = parameter(
-        ('',), 'Topics to record. Those outside the loop are subscribed as soon as they have a '
-        'publisher.')
+        ('',), 'Topics to record. Those outside the loop are subscribed when a publisher appears.')
     compression: str = parameter(
         'none', 'Compression of the bag. Uncompressed bags can be read even when damaged.',
         choices=('none', 'zstd', 'lz4'))
@@ -109,49 +109,51 @@ class TrainerParameters:
         10.0, 'Wall time without a newer measurement after which the experiment is aborted.', 's',
         0.0, 86400.0, open_minimum=True)
     experiment_seed: int = parameter(
-        0, 'Seed of the steps; equal seeds give equal steps.', '', 0, 2 ** 31)
+        0, 'Random seed of the steps.', '', 0, 2 ** 31)
     bags: tuple[str, ...] = parameter(
-        ('',), 'Training data: .mcap files or bag folders; an empty name: the bag that this '
-        'trainer records.')
+        ('',), 'Training data: .mcap files or bag folders; an empty name: the bag recorded by '
+               'this trainer.')
     model: str = parameter(
-        '', 'Present model, which a new one has to beat: a bundled model by name, or the path of '
-        'a .safetensors file; empty: train the first one.')
+        '', 'Current model, which a new one must beat: name of a bundled model, or path of a '
+            '.safetensors file; empty: train a first model.')
     model_output: str = parameter(
-        'retrained.safetensors', 'File to which an accepted model is written; its predecessor is '
-        'kept as .previous.safetensors.')
+        'retrained.safetensors', 'File for an accepted model; the file that it replaces is kept '
+                                 'as .previous.safetensors.')
     model_class: str = parameter(
         IDENTITY_LIFT, 'Class of the new model; best: train all of them and select one by '
         'comparison.', choices=(*CLASSES, BEST))
     lifted_dimension: int = parameter(
         3, 'Number of lifted coordinates n_z of a new identity lift.', '', 2, 8)
     restarts: int = parameter(
-        3, 'Random starts of the training of each coordinate; the best one is kept.', '', 1, 100)
+        3, 'Random restarts per coordinate; the best is kept.', '', 1, 100)
     training_seed: int = parameter(
-        0, 'Seed of the training, of the held-out selection, and of the selection from a long '
-        'record.', '', 0, 2 ** 31)
+        0, 'Random seed of the training, of the choice of held-out data, and of the thinning of '
+           'long records.', '', 0, 2 ** 31)
     training_samples: int = parameter(
-        20_000, 'Largest number of samples to train and test on. Longer records are averaged '
-        'where nothing is lost, then thinned to segments that cover their range.', '', 1000,
+        20_000, 'Largest number of samples for training and testing. Longer records are averaged '
+                'where no information is lost, then thinned to segments that cover their '
+                'range.', '', 1000,
         1_000_000)
     warm_start_model: str = parameter(
         '', 'Model of a similar plant from which the training starts: a bundled model by name, or '
         'the path of a model file; first (with --loops): the first accepted model of the fleet; '
         'empty: none.')
     executor: str = parameter(
-        '', 'Where training runs. Empty: one process; joblib: one process per core; joblib:N: N '
-        'processes; tcp://host:port: the workers of a Dask scheduler.', read_only=True)
+        '', 'Back end of the training. Empty: one process; joblib: one process per core; '
+            'joblib:N: N processes; tcp://host:port: the workers of a Dask '
+            'scheduler.', read_only=True)
     device: str = parameter(
-        'cpu', 'Device that evaluates the residuals, on every worker: cpu, or a GPU as torch '
-        'names it, e.g. cuda.')
+        'cpu', 'Device that evaluates the residuals on every worker: cpu, or a torch device, e.g. '
+               'cuda.')
     input_matrix: tuple[float, ...] = parameter(
         (0.0,), 'Known input matrix B, row by row: change of the rate of each state, in its unit '
         'per second, for each input; a single 0: learn it.')
     input_matrix_degree: int = parameter(
         0, 'Degree of a learned B(x) as a polynomial in the states; 0: constant B.', '', 0, 5)
     identification_methods: tuple[str, ...] = parameter(
-        ('weak_form', 'total_variation'), 'Methods that estimate the drift where all states are '
-        'measured; held-out segments decide between them: weak_form, total_variation, or '
-        'module:Class.', code=True)
+        ('weak_form', 'total_variation'), 'Methods that estimate the drift if all states are '
+                                          'measured, compared on held-out segments: weak_form, '
+                                          'total_variation, or module:Class.', code=True)
     methods: Mapping[str, Any] = plugin_parameters()
     unmeasured_states: int = parameter(
         0, 'Largest number of unmeasured states to estimate with the model; 0: all states are '
@@ -161,17 +163,18 @@ class TrainerParameters:
         'library, an entry point of the group koopman_ros.plants, or package.module:Class; empty: '
         'none.', code=True)
     estimated_constants: tuple[str, ...] = parameter(
-        ('',), 'Constants of the equations to estimate, in SI units, with their ranges, e.g. '
-        'friction [0.01, 0.5]; a name alone: the range of the class; an empty name: the constants '
-        'that the class marks as estimated.')
+        ('',), 'Constants of the equations to estimate, with ranges in SI units, e.g. friction '
+               '[0.01, 0.5]. Without a range: that of the class. An empty name: the constants '
+               'that the class marks as estimated.')
     synchronisation_tolerance: float = parameter(
-        0.0, 'Largest difference between the stamps of messages that are one measurement.', 's',
+        0.0, 'Largest difference between the stamps of messages that belong to one '
+             'measurement.', 's',
         0.0, 10.0)
     acceptance_margin: float = parameter(
-        0.1, 'A new model is accepted if its held-out error is smaller than those of the present '
-        'model and of the best linear model by at least this share.', '', 0.0, 0.99)
+        0.1, 'A new model is accepted if its held-out error is smaller than that of the current '
+             'model and of the best linear model by at least this fraction.', '', 0.0, 0.99)
     max_condition_number: float = parameter(
-        1e4, 'Largest condition number of the lifted coordinates of a new model.', '', 1.0, 1e12,
+        1e4, 'Largest accepted condition number of the lifted coordinates.', '', 1.0, 1e12,
         open_minimum=True)
 
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
@@ -189,21 +192,25 @@ class TrainerParameters:
     experiment_min: Array = value_column('inputs', 0.0, 'Lowest value of a step.')
     experiment_max: Array = value_column('inputs', 0.0, 'Highest value of a step.')
     experiment_rate_limit: Array = column(
-        'inputs', 0.0, 'Fastest change during the experiment; 0: any.', '{unit}/s', 0.0, 1e9)
+        'inputs', 0.0, 'Rate limit during the experiment; 0: none.', '{unit}/s', 0.0, 1e9)
     safe_value: Array = value_column(
         'inputs', 0.0, 'Safe value, at which the experiment starts and ends.')
     delay: Array = column(
-        'inputs', 0.0, 'Dead time between a command and its effect.', 's', 0.0, 3600.0)
+        'inputs', 0.0, 'Delay between a command and its application, where that is not recorded.',
+        's', 0.0, 3600.0)
+    dead_time: Array = column(
+        'inputs', -1.0, 'Dead time between the applied input and its effect; -1: found from the '
+        'record.', 's', -1.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
-        Return the plan of an experiment; a ValueError says what is missing.
+        Return the plan of an experiment; a ValueError names the missing parameters.
 
         :param setpoints: (n_c,) to come back to, for one that steps these; None steps the inputs.
         """
         on_setpoints = setpoints is not None
         if missing := self.missing(signals, on_setpoints):
-            raise ValueError('the bounds of the experiment are not known: give '
+            raise ValueError('the bounds of the experiment are unknown: set '
                              + ', '.join(missing))
         names, lower, upper = self._steps(signals, on_setpoints)
         rate = np.zeros(len(names)) if on_setpoints else self.experiment_rate_limit
@@ -240,11 +247,17 @@ class TrainerParameters:
         return {name: (low, high) for name, low, high in zip(
             names, lows.tolist(), highs.tolist(), strict=True) if low < high}
 
-    def training(self) -> dict[str, Any]:
+    def training(self, signals: Signals) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""
-        return {'model_class': self.model_class, 'coordinates': self.lifted_dimension,
+        gains = np.reshape(self.input_matrix, (-1, len(signals.inputs))).tolist() if (
+            self.input_matrix != (0.0,)) else []
+        return {'input_gain': {state: dict(zip(signals.inputs, row, strict=True))
+                               for state, row in zip(signals.states, gains, strict=False)},
+                'model_class': self.model_class, 'coordinates': self.lifted_dimension,
                 'seed': self.training_seed, 'starts': self.restarts,
                 'most_samples': self.training_samples,
+                'dead_time': {name: seconds for name, seconds in zip(
+                    signals.inputs, self.dead_time.tolist(), strict=True) if seconds >= 0.0},
                 'input_matrix_degree': self.input_matrix_degree,
                 'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
                 'constants': named_ranges(self.estimated_constants),
@@ -261,8 +274,8 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     Return the parameters of a trainer.
 
     :param present: the lift in use, whose signals and box are the defaults, or None without one.
-    :param given: what is known of the values already, of which system and signals count.
-    :raises ConfigurationError: where nothing says what the signals are.
+    :param given: known values, of which system and signals are used.
+    :raises ConfigurationError: if the signals are unknown.
     """
     system = system_of(given)
     own = plant_defaults(system, 'trainer')
@@ -296,9 +309,8 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
                       for name in ('states_measured', 'inputs_commanded'))
     if bool(states) != bool(inputs) or not (states or present):
         raise ConfigurationError(
-            f'the measured signals and inputs of the system {system_of(given)!r} are not known: '
-            f'give states_measured and inputs_commanded, each '
-            "a list like ['level [m]'], or the model of the plant")
+            f'the measured signals and inputs of the system {system_of(given)!r} are unknown: set '
+            "states_measured and inputs_commanded, each a list like ['level [m]'], or set model")
     controlled = tuple(filter(None, given.get('controlled', ())))
     if present is not None and not states:
         return signals_of(present, controlled)
@@ -328,8 +340,8 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if reason := refusal(values.topics):
         return reason
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
-        return (f'output = {values.output!r} is one file, which max_bag_size and '
-                'max_bag_duration cannot split: give the name of a folder, without .mcap')
+        return (f'output = {values.output!r} is a single file, which max_bag_size and '
+                'max_bag_duration cannot split: name a folder, without .mcap')
     if reason := executor_refusal(values.executor):
         return reason
     try:
@@ -343,16 +355,17 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
         return (f'input_matrix has {len(values.input_matrix)} numbers, must have {n_x} rows of '
                 f'{n_u}, or a single 0 to learn it')
     if values.input_matrix != (0.0,) and values.input_matrix_degree:
-        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
-                'input_matrix is given')
+        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 if input_matrix '
+                'is given')
     if values.unmeasured_states and values.input_matrix_degree:
-        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
-                'unmeasured_states are learned, on which B would depend')
+        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 if '
+                'unmeasured_states is above 0, because B would depend on them')
     if values.physical_model and values.unmeasured_states:
-        return (f'unmeasured_states is {values.unmeasured_states}, must be 0 where physical_model '
-                'says which states there are')
+        return (f'unmeasured_states is {values.unmeasured_states}, must be 0 if physical_model is '
+                'set, which defines the states')
     if values.physical_model and values.input_matrix != (0.0,):
-        return 'input_matrix must be a single 0 where physical_model says what the inputs do'
+        return ('input_matrix must be a single 0 if physical_model is set, which defines the '
+                'effect of the inputs')
     return (refused(values.physical_model, values.estimated_constants)
             or SignalTopics(signals, values.states, values.inputs).check())
 
@@ -366,30 +379,32 @@ class PlayerParameters:
         DEFAULT_SYSTEM, 'Bundled plant whose topics are the defaults; any other name: no '
         'defaults.', read_only=True)
     topics: tuple[str, ...] = parameter(
-        ('',), 'Topics to play. A relative name is looked up below / in the bag and published '
-        'under the namespace and remaps of the player.', read_only=True)
+        ('',), 'Topics to play. A relative name is looked up below / in the bag and published in '
+               'the namespace and with the remaps of the player.', read_only=True)
     rate: float = parameter(
         1.0, 'Recorded seconds per second, by time of receipt; 0: lock-step, as fast as the '
         'controller answers.', '', 0.0, 10000.0, smallest=1e-6, read_only=True)
     measurement: tuple[str, ...] = parameter(
-        ('',), 'Topics that carry one measurement together, which is answered.', read_only=True)
+        ('',), 'Topics that together carry one measurement, for which a command is '
+               'expected.', read_only=True)
     answer: str = parameter(
-        '', 'Topic of the answers, which carry the stamps of the measurements.', read_only=True)
+        '', 'Topic of the commands, which carry the stamps of the measurements.', read_only=True)
     answer_type: str = parameter(
-        '', 'Type of the answers if the bag has none.', read_only=True)
+        '', 'Message type of the commands if the bag has none.', read_only=True)
     clock: bool = parameter(
         False, 'Publish the stamp of each measurement on /clock first, for nodes with '
         'use_sim_time.', read_only=True)
     start_offset: float = parameter(
-        0.0, 'Time after the start of the bag at which playing begins.', 's', 0.0, 1e9,
+        0.0, 'Offset from the start of the bag at which playing begins.', 's', 0.0, 1e9,
         read_only=True)
     wait_for_subscribers: int = parameter(
-        1, 'Number of subscribers of each topic before the first message.', '', 0, 1000,
+        1, 'Number of subscribers of each topic to wait for before the first '
+           'message.', '', 0, 1000,
         read_only=True)
     wait_timeout: float = parameter(
         30.0, 'Longest wait for these subscribers.', 's', 0.0, 86400.0, read_only=True)
     answer_timeout: float = parameter(
-        5.0, 'Longest wait for an answer where rate is 0.', 's', 0.0, 86400.0, open_minimum=True,
+        5.0, 'Longest wait for a command if rate is 0.', 's', 0.0, 86400.0, open_minimum=True,
         read_only=True)
     recover: bool = parameter(
         False, 'Play the intact part of a bag that is damaged or was not closed.',

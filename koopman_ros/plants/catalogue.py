@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plants by name: those of the library, those that installed packages offer, and one's own."""
+"""Plants by name: those of the library, those of installed packages, and your own."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +13,7 @@ from koopman_ros.plants.constants import in_plant_units
 from koopman_ros.plants.system import ControlAffineSystem
 
 _LIBRARY = 'koopman_ros.plants.library'
-#: the classes of the library by name, each imported when it is asked for
+#: the classes of the library by name, each imported on first use
 PLANTS = {
     'reactor': f'{_LIBRARY}.reactor:OneStateReactor',
     'two_state': f'{_LIBRARY}.reactor:TwoStateReactor',
@@ -44,8 +44,8 @@ def plant_class(name: str) -> Any:
     known = PLANTS | {entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)
                       if entry.name not in PLANTS}
     if name not in known:
-        raise ValueError(f'there is no plant {name!r}: choose one of {", ".join(known)}, or write '
-                         'module:Class; a package that offers one by name must be built, and its '
+        raise ValueError(f'unknown plant {name!r}: choose one of {", ".join(known)}, or use '
+                         'module:Class; a package that provides a plant must be installed and its '
                          'workspace sourced')
     return load_plugin(name, 'plant', known)
 
@@ -58,9 +58,9 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
     :param values: constants in SI, by name, as :func:`constants_of` has them; the default of each
         that is missing.
     :param nominal_state: (n_x,) for a plant that raised EquilibriumError without, only then.
-    :raises ValueError: for a constant that there is not or that is outside its range, or for a
-        factory that returns no ControlAffineSystem.
-    :raises EquilibriumError: where the plant says so.
+    :raises ValueError: for an unknown constant or one outside its range, or for a factory that
+        returns no ControlAffineSystem.
+    :raises EquilibriumError: if the plant raises it.
     """
     constants = in_plant_units(plant, values)
     # a callable need not have a name
@@ -72,9 +72,9 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
     except ValueError:
         raise
     except BaseException as error:  # code of one's own may raise anything, SystemExit included
-        raise ValueError(f'the plant {name} cannot be built ({contained(error)}): correct its '
-                         'class') from error
+        raise ValueError(f'the plant {name} cannot be constructed ({contained(error)}): correct '
+                         'the class') from error
     if not isinstance(made, ControlAffineSystem):
         raise ValueError(f'the plant {name} returned a {type(made).__name__}, must be a '
-                         'ControlAffineSystem: return one from its method system')
+                         'ControlAffineSystem: return one from the method system')
     return made

@@ -24,7 +24,7 @@ def constant(default: float, unit: str, lower: float, upper: float, description:
 
     :param default: in the plant's unit, as `lower` and `upper`, the ends of its range.
     :param si: the unit in which a parameter shows it; the plant's by default. A temperature in K
-        with ``'degC'`` is shown as REP 103 has it.
+        with ``'degC'`` is shown in degrees Celsius, as in REP 103.
     :param factor: the value in the plant's unit is that in `si` times this factor.
     :param estimated: the range, in the plant's unit, in which it is looked for where the plant's
         equations are fitted to a record; None for one that is taken as known then.
@@ -61,7 +61,7 @@ class Constant:
     unit: str  #: of SI; degC for a temperature
     lower: float  #: lowest value
     upper: float  #: highest value
-    description: str  #: what it is
+    description: str  #: in words
     #: the range in which it is estimated from a record, None where it is taken as known
     estimated: tuple[float, float] | None = None
 
@@ -115,25 +115,25 @@ def estimated_parameters_of(plant: Any, ranges: Mapping[str, tuple[float, float]
     Return the constants of a plant's class to be estimated, each with the range of its search.
 
     :param ranges: lowest and highest value by name, in SI, None for the range that the class
-        gives; nothing at all for the constants of which the class says that they are estimated.
-    :raises ValueError: for a constant that there is not, and a range outside that of the class.
+        gives; empty for the constants that the class marks as estimated.
+    :raises ValueError: for an unknown constant, or a range outside that of the class.
     """
     known = {constant.name: constant for constant in constants_of(plant)}
     own = {name: constant.estimated for name, constant in known.items() if constant.estimated}
     if not (ranges or own):
-        raise ValueError(f'{plant.__name__} does not say which of its constants are to be '
-                         f'estimated: name some of {", ".join(known) or "none"}, with ranges')
+        raise ValueError(f'{plant.__name__} marks no constants as estimated: name some of '
+                         f'{", ".join(known) or "none"}, with ranges')
     found = []
     for name, given in (ranges or dict.fromkeys(own)).items():
         if name not in known:
-            raise ValueError(f'{name} is no constant of {plant.__name__}: it has '
+            raise ValueError(f'{name} is not a constant of {plant.__name__}: choose from '
                              f'{", ".join(known) or "none"}')
         one = known[name]
         low, high = given or own.get(name) or (one.lower, one.upper)
         if not one.lower <= low < high <= one.upper:
             raise ValueError(
-                f'the range of {name} is [{low:.10g}, {high:.10g}] {one.unit}, must rise and lie '
-                f'in [{one.lower:.10g}, {one.upper:.10g}] {one.unit}')
+                f'the range of {name} is [{low:.10g}, {high:.10g}] {one.unit}, must increase and '
+                f'lie in [{one.lower:.10g}, {one.upper:.10g}] {one.unit}')
         found.append(replace(one, lower=low, upper=high))
     return tuple(found)
 
@@ -142,13 +142,13 @@ def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:
     """
     Return constants given in SI in the units of the plant's class.
 
-    A default or an end of a range that was not changed comes back to the bit.
+    An unchanged default or end of a range is returned exactly.
 
     :raises ValueError: for a name that is no constant of the plant.
     """
     rows = {row.name: row for row in _rows(plant)}
     if unknown := values.keys() - rows.keys():
-        raise ValueError(f'{min(unknown)} is no constant of {plant.__name__}: it has '
+        raise ValueError(f'{min(unknown)} is not a constant of {plant.__name__}: choose from '
                          f'{", ".join(rows) or "none"}')
     return {name: _from_si(rows[name], value) for name, value in values.items()}
 

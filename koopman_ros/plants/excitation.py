@@ -42,9 +42,9 @@ class RandomStepDesign:
     """
 
     input_lower: ArrayLike  #: lowest input, a scalar or (n_u,), in input units
-    input_upper: ArrayLike  #: highest input, likewise; levels are uniform between the two
+    input_upper: ArrayLike  #: highest input; levels are uniform between the two
     state_lower: ArrayLike  #: lower corner of the box, a scalar or (n_x,), in state units
-    state_upper: ArrayLike  #: upper corner of the box, likewise
+    state_upper: ArrayLike  #: upper corner of the box
     #: how long each level is held, in time units: a number, or a shortest and a longest between
     #: which whole sample periods are equally likely
     hold_time: float | tuple[float, float]
@@ -61,8 +61,8 @@ class RandomStepDesign:
         shortest, longest = self.hold_samples
         if not 1 <= shortest <= longest:
             raise ValueError(
-                f'hold_time is {self.hold_time}, must allow a whole number of sample periods of '
-                f'{self.sample_period}: choose a multiple of it, or a wider range')
+                f'hold_time is {self.hold_time}, must contain a multiple of sample_period, '
+                f'{self.sample_period}: choose such a value, or a wider range')
 
     @property
     def hold_samples(self) -> tuple[int, int]:
@@ -88,15 +88,15 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
         tried keeps it inside.
     """
     if system.n_u == 0:
-        raise ValueError(f'{system.name} has no input to step; choose initial states instead')
+        raise ValueError(f'{system.name} has no input to excite; vary the initial states instead')
     holds = _whole_samples(duration, design.sample_period, system.time_unit)
     levels, box = _bounds(system, design)
     limits = integration_limits(system, design.rtol, *box)
     state = system.nominal_state if x0 is None else system.checked_state('x0', x0)
     if not np.all((state >= box[0]) & (state <= box[1])):
         raise ExcitationError(
-            f'{system.name}: at the start {_violation(system, box, state)}; '
-            'choose x0 inside the box, or a box around it')
+            f'{system.name}: at the start {_violation(system, box, state)}; choose x0 inside the '
+            'range, or a wider range')
 
     def safe_step(length: int) -> Episode:
         """Draw levels until one keeps the state in the box; return its step."""
@@ -116,8 +116,8 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
                 system.input_names, system.input_units, *levels, strict=True))
         raise ExcitationError(
             f'{system.name}: {_violation(system, box, out.state)} at {out.time:.6g} '
-            f'{system.time_unit}, and so it went with each of {design.max_redraws + 1} levels of '
-            f'{tried}; narrow the input bounds, widen the box or shorten hold_time')
+            f'{system.time_unit} for each of {design.max_redraws + 1} random levels of {tried}; '
+            'narrow the input bounds, widen the range or shorten hold_time')
 
     rng = np.random.default_rng(seed)
     states, inputs, sample = [state[None, :]], [], 0
@@ -174,9 +174,9 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
         found += batch
     if len(found) < episodes:
         raise ExcitationError(
-            f'{system.name}: of {_MOST_STARTS * episodes} starts {len(found)} could be kept in '
-            f'the box for {duration} {system.time_unit}, {episodes} are wanted; shorten the '
-            'episodes, widen the input bounds or the box')
+            f'{system.name}: from {_MOST_STARTS * episodes} initial states {len(found)} episodes '
+            f'stayed in the range for {duration} {system.time_unit}, {episodes} are needed; '
+            'shorten the episodes, or widen the input bounds or the range')
     return sample_derivatives(system, found)
 
 
@@ -211,5 +211,5 @@ def _violation(system: ControlAffineSystem, box: tuple[Array, Array], state: Arr
     lower, upper = box
     i = int(np.argmax((state < lower) | (state > upper)))
     unit = '' if system.state_units[i] == '1' else f' {system.state_units[i]}'
-    return (f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the box '
+    return (f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the range '
             f'[{lower[i]:.10g}, {upper[i]:.10g}]{unit}')

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that runs in time, behind its actuators (range, delay, lag), and its sensor."""
+"""A plant that runs in time, behind its actuators and dead times, and its sensor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -24,8 +25,9 @@ class Actuator:
 
     lower: float | Array = -np.inf  #: lowest value that each input reaches, in input units
     upper: float | Array = np.inf  #: highest such value
-    delay: float | Array = 0.0  #: how long after it was given a command takes effect, in s
+    delay: float | Array = 0.0  #: how long after it was given a command is applied, in s
     lag: float | Array = 0.0  #: time constant with which the input then follows, in s
+    dead_time: float | Array = 0.0  #: how long after it was applied an input acts, in s
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,7 @@ class Process:
     x: Array  #: present state (n_x,)
     u: Array  #: input (n_u,) that acts, up to the present time
     actuator: Actuator = Actuator()  #: between commands and input
-    command: Array | None = None  #: what the input follows (n_u,); None for what it is
+    command: Array | None = None  #: (n_u,) that the input follows; None for u
     #: commands that take effect later, by rising time: (time in ns, number of the input, value)
     pending: tuple[tuple[int, int, float], ...] = ()
 
@@ -45,12 +47,35 @@ class Process:
 
     @property
     def followed(self) -> Array:
-        """What the input follows (n_u,)."""
+        """The delayed command (n_u,) that the input follows."""
         return self.u if self.command is None else self.command
+
+    @property
+    def applied(self) -> Array:
+        """Input (n_u,) that is applied, as a sensor measures it, and acts after its dead time."""
+        dead, lag = (np.broadcast_to(value, self.u.shape)
+                     for value in (self.actuator.dead_time, self.actuator.lag))
+        if not dead.any():
+            return self.u
+        # what acts a dead time later depends on no later command
+        end_ns = [self.time_ns + round(seconds * NANOSECONDS) for seconds in dead.tolist()]
+        u, goal, since_ns = self.u.copy(), np.array(self.followed), [self.time_ns] * len(dead)
+        ends = ((end, i, np.nan) for i, end in enumerate(end_ns))
+        for due, i, command in (*self.pending, *ends):
+            if not since_ns[i] <= due <= end_ns[i]:
+                continue
+            if due > since_ns[i]:
+                reached = np.clip(goal, self.actuator.lower, self.actuator.upper)[i]
+                seconds = (due - since_ns[i]) / NANOSECONDS
+                u[i] = reached + (math.exp(-seconds / lag[i]) * (u[i] - reached)
+                                  if lag[i] > 0.0 else 0.0)
+            goal[i], since_ns[i] = command, due
+        return u
 
     def commanded(self, command: Array, time_ns: int) -> Process:
         """Return the process with a command given, in place of any that would act later."""
-        delays = np.broadcast_to(self.actuator.delay, command.shape).tolist()
+        delays = np.broadcast_to(
+            np.add(self.actuator.delay, self.actuator.dead_time), command.shape).tolist()
         effect_ns = [time_ns + round(delay * NANOSECONDS) for delay in delays]
         earlier = [entry for entry in self.pending if entry[0] < effect_ns[entry[1]]]
         new = zip(effect_ns, range(len(command)), command.tolist(), strict=True)
@@ -91,7 +116,7 @@ class Process:
 
 
 def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Array:
-    """Return a state (n_x,) so many nanoseconds later."""
+    """Return a state (n_x,) after a duration in nanoseconds."""
     if time_ns == 0:
         return x
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
@@ -102,7 +127,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> Contr
     Put a first-order lag before each input: d[x; v]/dt = [f(x) + B(x) v; -v / tau] + [0; u / tau].
 
     The inputs v that act become states; the time constants tau (n_u,) are in time units. An input
-    without one, of which tau is 0, stands still where it is.
+    without lag, of which tau is 0, stays where it is.
     """
     n_x, n_u = system.n_x, system.n_u
     rate = np.zeros(n_u)

@@ -24,7 +24,7 @@ def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike
                 input_upper: ArrayLike, state_lower: ArrayLike, state_upper: ArrayLike
                 ) -> NDArray[np.bool_]:
     """
-    Say from which states a limited input can bring the plant back to its nominal one.
+    Return from which states a limited input can return the plant to its nominal one.
 
     Tried is the linear-quadratic law of the plant linearised there, with states and inputs weighed
     in halves of their ranges, and limited. The state may not leave its box on the way.
@@ -49,8 +49,8 @@ def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike
     A, B = system.slope(x0, u0), system.input_matrix(x0)
     riccati = solve_riccati(A, B, np.diag(half ** -2.0), np.diag(half_u ** -2.0))
     if riccati.status is not RiccatiStatus.SOLVED:
-        raise ValueError(f'{system.name}: no feedback of its inputs stabilises it at its nominal '
-                         'state; choose another one, or add an input that acts on what grows')
+        raise ValueError(f'{system.name}: no state feedback stabilises its nominal state; choose '
+                         'another nominal state, or add an input that acts on the unstable modes')
     closed = np.linalg.eigvals(A - B @ riccati.K)
     fastest = max(np.max(np.abs(closed)), np.max(np.abs(np.linalg.eigvals(A))))
     step = _STEP / fastest

@@ -26,10 +26,11 @@ _MAX_STEPS_PER_HOLD = 20_000
 class IntegrationFailure(Enum):
     """Why a simulation ended early, and what to do about it."""
 
-    OUT_OF_BOUNDS = 'it left its bounds; choose an input that keeps it inside, or widen them'
-    NON_FINITE = 'its rate is not finite there; start where the model is defined'
-    STEP_TOO_SMALL = 'it changes too fast to follow; stop before it escapes, or set bounds'
-    TOO_MANY_STEPS = 'it needs too many integration steps; simulate shorter holds'
+    OUT_OF_BOUNDS = ('the state left its bounds; choose an input that keeps it inside, or widen '
+                     'the bounds')
+    NON_FINITE = 'the rate of the state is not finite there; start where the model is defined'
+    STEP_TOO_SMALL = 'the state diverges; stop earlier, or set bounds'
+    TOO_MANY_STEPS = 'the integration needs too many steps; shorten the hold times'
 
 
 class Limits(NamedTuple):

@@ -5,19 +5,25 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
-from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import check_time_unit, check_unit, SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
 
-# Of each state, by which B(x) is differentiated: rounding and curvature both leave about ten
-# digits.
+# Step of a central difference, as a share of the magnitude of a state: rounding and curvature both
+# leave about ten digits.
 _DIFFERENCE = 1e-5
+# Largest difference between a given Jacobian and finite differences, as a share of the largest
+# entry in a row. Both are compared these shares of the magnitudes away from the nominal state.
+_JACOBIAN_TOLERANCE = 1e-4
+_NEARBY = (0.01, 0.02)
+_UNDERFLOW = 1e-12  # a change of a rate that differences lose
 _NEWTON_STEPS = 50  # which are quick, and more than a plant near its nominal point needs
 
 
@@ -28,15 +34,35 @@ def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = T
     return frozen(whole, name, (length,), finite=finite)
 
 
+@dataclass(frozen=True)
+class _DifferencedDrift:
+    """The Jacobian of a drift by central differences."""
+
+    drift: ArrayFunction
+    scale: Array  # (n_x,) magnitudes of the states
+
+    def __call__(self, x: Array) -> Array:
+        return _differences(self.drift, x, self.scale)
+
+
+def _differences(function: ArrayFunction, x: Array, scale: Array) -> Array:
+    """Differentiate a function of states (..., n_x) to (..., n) by them: (..., n, n_x)."""
+    steps = _DIFFERENCE * np.diag(scale)
+    ahead, behind = (function(x[..., None, :] + sign * steps) for sign in (1.0, -1.0))
+    columns = (ahead - behind) / (2.0 * _DIFFERENCE * scale[:, None])
+    return np.asarray(columns.swapaxes(-1, -2), dtype=np.float64)
+
+
 @dataclass(frozen=True, eq=False)
 class ControlAffineSystem:
     """
     A plant dx/dt = f(x) + B(x) u (paper, eq. 22), with names, units and a nominal point.
 
-    :raises ValueError: when a shape, a unit or a bound does not fit, naming it.
+    :raises ValueError: for a shape, a unit or a bound that does not fit, or a Jacobian that is not
+        the derivative of the drift; the message names the entry.
     """
 
-    name: str  #: what the plant is called in messages
+    name: str  #: name of the plant in messages
     state_names: tuple[str, ...]  #: n_x names; their units, one each, in `state_units`
     state_units: tuple[str, ...]
     #: n_u names (n_u may be 0); their units, one each, in `input_units`
@@ -44,8 +70,10 @@ class ControlAffineSystem:
     input_units: tuple[str, ...]
     time_unit: str  #: 'min' or 's', the unit of every duration and of the rates
     drift: ArrayFunction = field(repr=False)  #: f, states (..., n_x) to rates (..., n_x)
-    #: df/dx, states (..., n_x) to (..., n_x, n_x)
-    drift_jacobian: ArrayFunction = field(repr=False)
+    #: df/dx, states (..., n_x) to (..., n_x, n_x); checked against finite differences of `drift`,
+    #: which are used by default
+    drift_jacobian: ArrayFunction = field(
+        default=cast(ArrayFunction, None), repr=False, kw_only=True)
     #: input matrix (n_x, n_u), or a function of states (..., n_x) to (..., n_x, n_u)
     B: Array | ArrayFunction
     nominal_state: Array  #: the point (n_x,) that deviations are measured from
@@ -58,19 +86,18 @@ class ControlAffineSystem:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        if self.time_unit not in SECONDS_PER_TIME_UNIT:
-            raise ValueError(
-                f'time_unit is {self.time_unit!r}, must be one of '
-                + ', '.join(map(repr, SECONDS_PER_TIME_UNIT)))
+        check_time_unit(self.time_unit)
         for kind in ('state', 'input'):
             names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
             object.__setattr__(self, f'{kind}_names', names)
             object.__setattr__(self, f'{kind}_units', units)
+            for unit in units:
+                check_unit(unit)
             if len(names) != len(units):
                 raise ValueError(f'incompatible {kind}_units: expected ({len(names)},), '
                                  f'got ({len(units)},)')
         if not self.state_names:
-            raise ValueError('state_names is empty, a system has at least one state')
+            raise ValueError('state_names is empty: a system needs at least one state')
         if not callable(self.B):
             object.__setattr__(self, 'B', frozen(self.B, 'B', (self.n_x, self.n_u)))
         for name, checked in (
@@ -80,6 +107,9 @@ class ControlAffineSystem:
         if not np.all(self.state_lower < self.state_upper):
             raise ValueError(
                 f'state_lower {self.state_lower} must lie below state_upper {self.state_upper}')
+        if self.drift_jacobian is None or isinstance(self.drift_jacobian, _DifferencedDrift):
+            object.__setattr__(
+                self, 'drift_jacobian', _DifferencedDrift(self.drift, self.state_scale))
         # a drift or a Jacobian that does not keep its leading axes
         single = self.nominal_state
         for state in (single, np.stack([single, single])):
@@ -93,6 +123,34 @@ class ControlAffineSystem:
                     raise ValueError(
                         f'incompatible {name} at x of shape {state.shape}: '
                         f'expected {expected}, got {got}')
+        self._check_jacobian()
+
+    def _check_jacobian(self) -> None:
+        """Raise ValueError for the worst entry of a given Jacobian that differs from the drift."""
+        if isinstance(self.drift_jacobian, _DifferencedDrift):
+            return
+        scale, excesses = self.state_scale, []
+        # two states, neither of them nominal, where a drift may have a kink that is legitimate
+        for share in _NEARBY:
+            x = np.clip(self.nominal_state + share * scale, self.state_lower, self.state_upper)
+            with np.errstate(all='ignore'):
+                given = np.asarray(self.drift_jacobian(x), dtype=np.float64)
+                expected = _differences(self.drift, x, scale)
+                rate = np.abs(self.drift(x))[:, None]
+            # in the magnitudes of the states
+            largest = np.maximum(rate, np.max(np.abs(expected) * scale, axis=-1, keepdims=True))
+            allowed = _JACOBIAN_TOLERANCE * largest + _UNDERFLOW
+            excesses.append(np.where(
+                np.abs(x - self.nominal_state) > 0.5 * share * scale,
+                np.abs(given - expected) * scale - allowed, 0.0))
+        excess = np.nan_to_num(np.min(excesses, axis=0))
+        i, j = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[i, j] > 0.0:
+            raise ValueError(
+                f'{self.name}: drift_jacobian has {given[i, j]:.6g} in row {i}, column {j} (rate '
+                f'of {self.state_names[i]} by {self.state_names[j]}) at {self.describe_state(x)}, '
+                f'finite differences of drift give {expected[i, j]:.6g}: correct it, or give no '
+                'drift_jacobian')
 
     @property
     def n_x(self) -> int:
@@ -141,12 +199,8 @@ class ControlAffineSystem:
         slope = self.drift_jacobian(x)
         if not callable(self.B):
             return slope
-        # of B by central differences
-        steps = _DIFFERENCE * np.diag(self.state_scale)
-        ahead, behind = (self.forcing(x[..., None, :] + sign * steps, u[..., None, :])
-                         for sign in (1.0, -1.0))
-        columns = (ahead - behind) / (2.0 * _DIFFERENCE * self.state_scale[:, None])
-        return slope + columns.swapaxes(-1, -2)
+        return slope + _differences(lambda states: self.forcing(states, u[..., None, :]), x,
+                                    self.state_scale)
 
     def checked_state(self, name: str, value: ArrayLike) -> Array:
         """Return `value` as a read-only state (n_x,); raise ValueError naming it if it is none."""
@@ -168,7 +222,7 @@ class ControlAffineSystem:
 
 
 def describe(system: ControlAffineSystem) -> PlantDescription:
-    """Return what training may know of a plant beside its data: all but the drift."""
+    """Return the known description of a plant, for training: all but the drift."""
     return PlantDescription(system.name, system.state_names, system.state_units,
                             system.input_names,
                             system.input_units, system.time_unit, system.nominal_state,
@@ -176,7 +230,7 @@ def describe(system: ControlAffineSystem) -> PlantDescription:
 
 
 class EquilibriumError(ValueError):
-    """There is no steady state or no holding input where one was asked for."""
+    """A requested steady state or holding input does not exist."""
 
 
 def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
@@ -198,8 +252,7 @@ def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
         raise EquilibriumError(
             f'{system.name}: no input holds {system.describe_state(held)}: '
             f'{system.state_names[worst]} still changes by {rate[worst]:.3g} '
-            f'{system.state_units[worst]}/{system.time_unit}; '
-            'choose a steady state')
+            f'{system.state_units[worst]}/{system.time_unit}; choose a steady state')
     return u
 
 
@@ -214,7 +267,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
     :raises EquilibriumError: when no input holds them.
     """
     if unknown := wanted.keys() - set(system.state_names):
-        raise ValueError(f'{min(unknown)} is no state of {system.name}: choose of '
+        raise ValueError(f'{min(unknown)} is not a state of {system.name}: choose from '
                          f'{", ".join(system.state_names)}')
     held = np.array([name in wanted for name in system.state_names])
     x, u = system.nominal_state.copy(), system.nominal_input

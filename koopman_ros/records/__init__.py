@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags in the layout of rosbag2 (MCAP), written and read on any machine with Python, no ROS."""
+"""Records of plants: tables, and bags of rosbag2 (MCAP), written and read without ROS."""
 
 from koopman_ros.records.decoding import BagMessage
 from koopman_ros.records.episodes import loop_episodes, stream_episodes
@@ -13,6 +13,7 @@ from koopman_ros.records.message_definitions import (
     MessageDefinitionError,
 )
 from koopman_ros.records.reader import BagSummary, in_log_order, read_messages, summary
+from koopman_ros.records.record import read, Record
 from koopman_ros.records.series import read_series, Series
 from koopman_ros.records.writer import BagWriter
 
@@ -24,12 +25,14 @@ __all__ = [
     'ImportReport',
     'MessageDefinition',
     'MessageDefinitionError',
+    'Record',
     'RecordedInput',
     'RecordedState',
     'Series',
     'in_log_order',
     'loop_episodes',
     'message_definition',
+    'read',
     'read_messages',
     'read_series',
     'stream_episodes',

@@ -61,7 +61,7 @@ def around(times: Times, values: Array, stamps: Times) -> tuple[Times, Array]:
 
 
 def span(applied: Applied) -> tuple[float, float]:
-    """Return from when to when it is known what acted."""
+    """Return from when to when the applied input is known."""
     times, _, linear = applied
     if not len(times):
         return math.inf, math.inf
@@ -69,7 +69,7 @@ def span(applied: Applied) -> tuple[float, float]:
 
 
 def follows_command(times: Times, held: Array, stamps: Times, measured: Array) -> bool:
-    """Tell whether an input is its command wherever it was measured, before or after a change."""
+    """Whether an input is its command wherever it was measured, before or after a change."""
     known = stamps > times[0] if len(times) else np.zeros(len(stamps), dtype=bool)
     if not np.any(known):
         return False

@@ -40,22 +40,22 @@ def locate(path: str | os.PathLike[str], *, recover: bool) -> tuple[tuple[Path, 
         if left_behind := _left_behind(path, files):
             if not recover:
                 raise BagReadError(
-                    f'{str(left_behind[0])!r} is not listed in {METADATA_FILE}, its recorder did '
-                    f'not close it: {RECOVER}')
+                    f'{str(left_behind[0])!r} is not listed in {METADATA_FILE}, because its '
+                    f'recorder did not close it: {RECOVER}')
             files, listed = tuple(sorted({*files, *left_behind}, key=_natural_order)), False
     elif recover:
         files, listed = tuple(_files_with_content(path)), False
         if not files:
-            raise BagReadError(f'{str(path)!r} has neither {METADATA_FILE} nor MCAP files with '
-                               'content: check the path')
+            raise BagReadError(f'{str(path)!r} has neither {METADATA_FILE} nor non-empty MCAP '
+                               'files: check the path')
     else:
-        raise BagReadError(f'{str(path)!r} has no {METADATA_FILE}, its recorder did not close it '
-                           f'or it is no bag: {RECOVER}')
+        raise BagReadError(f'{str(path)!r} has no {METADATA_FILE}: its recorder did not close it, '
+                           f'or it is not a bag: {RECOVER}')
     closed = [is_closed(file) for file in files]
     if not all(closed) and not recover:
         unclosed = files[closed.index(False)]
         raise BagReadError(
-            f'{str(unclosed)!r} is cut short, its recorder did not close it: {RECOVER}')
+            f'{str(unclosed)!r} was not closed by its recorder: {RECOVER}')
     return files, listed and all(closed)
 
 
@@ -70,7 +70,7 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
         # rosbag2 before version 4 lists them with the name of their folder
         names = [PurePath(name).name for name in information['relative_file_paths']]
         if not names or len(set(names)) < len(names) or '' in names:
-            raise ValueError('no file, or one file twice')
+            raise ValueError('no file, or a file twice')
         # `ros2 bag reindex` of Humble leaves it empty
         storage = information.get('storage_identifier') or (
             'sqlite3' if any('.db3' in name for name in names) else 'mcap')
@@ -84,11 +84,11 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     if storage != 'mcap' or compression not in (None, '', 'none', 'zstd'):
         kind = f'{storage} files' + (f' compressed with {compression}' if compression else '')
         raise BagReadError(
-            f'{str(folder)!r} holds {kind}, only mcap is read here, plain or compressed with '
+            f'{str(folder)!r} holds {kind}, but only MCAP is supported, plain or compressed with '
             "zstd: convert it with 'ros2 bag convert'")
     if missing:
         raise BagReadError(
-            f'{str(source)!r} lists {missing[0]!r}, which is not there: put it back')
+            f'{str(source)!r} lists {missing[0]!r}, which is missing: restore it')
     return tuple(folder / name for name in names)
 
 

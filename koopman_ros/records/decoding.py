@@ -65,7 +65,7 @@ def decoded_messages(files: Iterable[Path], topics: frozenset[str] | None, recov
                     decoders[channel.id] = None
                     if channel.topic not in undecoded:
                         undecoded.add(channel.topic)
-                        warnings.warn(f'messages on {channel.topic!r} are given as bytes alone: '
+                        warnings.warn(f'messages on {channel.topic!r} are returned as raw bytes: '
                                       f'{sentence}', stacklevel=2)
             if decode := decoders[channel.id]:
                 try:
@@ -73,25 +73,25 @@ def decoded_messages(files: Iterable[Path], topics: frozenset[str] | None, recov
                 except Exception as error:
                     # the decoder fails in as many ways as bytes of another program can be wrong
                     raise BagReadError(
-                        f'{str(file)!r}: the message on {channel.topic!r} at '
-                        f'{stored.log_time_ns} ns does not decode ({reason(error)}): read the '
-                        'other topics by name') from error
+                        f'{str(file)!r}: the message on {channel.topic!r} at {stored.log_time_ns} '
+                        f'ns cannot be decoded ({reason(error)}): read the other topics by '
+                        'name') from error
             yield BagMessage(channel.topic, type_name(stored), stored.log_time_ns,
                              stored.publish_time_ns, fields, stored.data)
 
 
 def _channel_decoder(stored: StoredMessage) -> _Decode:
-    """Return what decodes a channel; BagReadError for a type or an encoding not decoded here."""
+    """Return the decoder of a channel; BagReadError for a type or an encoding not decoded here."""
     schema, channel = stored.schema, stored.channel
     encodings = channel.message_encoding, schema.encoding if schema else 'no schema'
     if schema is None or encodings != (MessageEncoding.CDR, SchemaEncoding.ROS2):
         raise BagReadError(f'topic {channel.topic!r} is encoded as {encodings[0]!r} with '
-                           f'{encodings[1]!r}, only cdr with ros2msg is decoded here')
+                           f'{encodings[1]!r}, but only cdr with ros2msg is supported')
     try:
         return _decoder(type_name(stored), schema.data)
     except Exception as error:
         # the parser fails in many ways on the definition of another recorder
-        raise BagReadError(f'the definition stored for {channel.topic!r} does not parse '
+        raise BagReadError(f'the message definition stored for {channel.topic!r} is invalid '
                            f'({reason(error)})') from error
 
 
@@ -114,7 +114,7 @@ def _decoder(name: str, definition: bytes) -> _Decode:
     def decode(data: bytes) -> Any:
         message, end = orders[data[1] & 1](data[4:], 0, found.cls, store)
         if end > len(data) - 4:
-            raise EOFError(f'{len(data)} bytes, {end + 4} are needed')
+            raise EOFError(f'{len(data)} bytes instead of {end + 4}')
         return message
 
     return decode

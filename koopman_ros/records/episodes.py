@@ -33,8 +33,10 @@ from koopman_ros.records.segments import Clock, NO_STAMP, Segment, Times
 from koopman_ros.records.series import check_places, outliers_and_steps, stamped_number
 
 # A gap is longer than this many usual periods.
-_GAP_PERIODS = 3.5
-_SHORTEST = 10
+GAP_PERIODS = 3.5
+SHORTEST = 10
+# An input without commands that mostly keeps its value from sample to sample moves in steps.
+_AT_REST = 0.5
 _CHECKED = 1000  # messages between two looks for a complete portion
 # The plant's time, where it is simulated, and how far receipts may differ from it.
 _CLOCK, _CLOCK_TYPE = '/clock', 'rosgraph_msgs/msg/Clock'
@@ -47,7 +49,7 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Recor
                   least_jumps: Sequence[float] | None = None) -> tuple[list[Episode],
                                                                        ImportReport]:
     """
-    Return all episodes of some bags, see :func:`stream_episodes`, and what was made of the bags.
+    Return all episodes of some bags, see :func:`stream_episodes`, and the account of the import.
 
     :raises BagReadError: as it does.
     """
@@ -69,14 +71,15 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
 
     An input that was measured throughout an episode is linear between its measurements. Where it
     was not, or where it is no more than its command within the range that it reaches, it is held
-    from the time on at which it was commanded. A command that answers a measurement carries its
+    from the time on at which it was commanded. Without commands in the bag it is linear, or held
+    if it mostly keeps its value. A command that answers a measurement carries its
     stamp; where the stamps are those of the wall clock, it acts later by the time between the two
     receipts. A command without a stamp acts when it is received.
 
-    Episodes end at gaps, where time is set back, and where a state jumps to another level as
-    after a reset. Spikes of a single sample are dropped, and so are measurements before the first
-    input, since nobody knows what acted on them. A bag that was not closed or is damaged is read
-    as far as it goes. The account tells all that.
+    Episodes end at gaps, where time is set back, and where a state jumps to another level as after
+    a reset. Spikes of a single sample are dropped, and so are measurements before the first input,
+    because the applied input is unknown before. A bag that was not closed or is damaged is read as
+    far as it goes. The account lists all of that.
 
     Memory does not grow with the bags: of a long record some ten thousand measurements are
     put together at a time, at whose ends an episode ends, too.
@@ -84,7 +87,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     :param account: is added to as the episodes come.
     :param tolerance_ns: how far stamps of one sample of several states may lie apart.
     :param least_jumps: smallest change of each state, in its unit, that may be a spike or a jump;
-        by default the record alone tells.
+        by default the one in the record.
     :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there,
         and for states without stamps whose receipts run at another pace than /clock in the bag.
     """
@@ -105,7 +108,7 @@ def distinct(bags: Sequence[str | os.PathLike[str]], account: ImportReport
     read: set[str] = set()
     for bag in bags:
         if (path := os.path.realpath(bag)) in read:
-            account.note(f'{os.fspath(bag)} is named twice: read once')
+            account.note(f'{os.fspath(bag)} is listed twice: read once')
             continue
         read.add(path)
         yield bag
@@ -143,17 +146,25 @@ class _BagImport:
         check_places(self.bag, self.content, self.scales)
 
     def _without_missing(self, signal: RecordedInput) -> RecordedInput:
-        """Return an input without the measured one if the bag lacks that."""
-        if signal.measured is None or signal.measured.topic in self.content.types:
+        """Return an input without its measurements or its commands if the bag lacks them."""
+        if signal.measured is None or signal.command is None:
             return signal
-        self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: {signal.name} is '
-                          'taken from its command')
-        return replace(signal, measured=None)
+        lacks = [found.topic not in self.content.types
+                 for found in (signal.measured, signal.command)]
+        if lacks == [True, False]:
+            self.account.note(f'{self.bag} has no topic {signal.measured.topic!r}: the command is '
+                              f'used as the applied {signal.name}')
+            return replace(signal, measured=None)
+        if lacks == [False, True]:
+            self.account.note(f'{self.bag} has no topic {signal.command.topic!r}: {signal.name} '
+                              'is taken from its measurements')
+            return replace(signal, command=None)
+        return signal
 
     def segments(self) -> Iterator[Segment]:
         """Yield the numbers between resets of time, long ones in portions."""
         if not self.content.complete:
-            self.account.note(f'{self.bag} was not closed or is damaged: read up to its last '
+            self.account.note(f'{self.bag} was not closed or is damaged: read up to the last '
                               'complete record')
         counts, n_x = self.content.counts, len({signal.place for signal in self.states})
         places = list(self.scales)
@@ -179,8 +190,7 @@ class _BagImport:
                 yield segment
                 segment = segment.following()
         if left := sum(counts[topic] for topic in topics) - read:
-            self.account.note(f'{self.bag} is damaged: {left} messages that it counts could not '
-                              'be read')
+            self.account.note(f'{self.bag} is damaged: {left} of its messages could not be read')
         yield segment
 
     def _accepted(self, message: BagMessage, place: MessageField, lowest: float, highest: float
@@ -195,7 +205,7 @@ class _BagImport:
             return None
         if stamp_ns is None:
             self.account.note(f'{self.bag}: messages of {place.topic} ({place.type}) have no '
-                              'stamp: their receipt counts')
+                              'stamp: the time of receipt is used')
             return NO_STAMP, value
         return stamp_ns, value
 
@@ -212,10 +222,10 @@ class _BagImport:
         plant, receipt = np.sum(steps[np.all(steps >= 0.0, axis=1)], axis=0).tolist()
         if abs(plant - receipt) > max(_SAME_PACE * receipt, _SAME_PACE_SECONDS):
             raise BagReadError(
-                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and '
-                f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
-                "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
-                "--use-sim-time'), or use a type with a header")
+                f'bag {self.bag!r}: {self.states[0].name} has no stamps, and its times of receipt '
+                f'are not plant time ({plant:.6g} s on /clock in {receipt:.6g} s): record with '
+                "use_sim_time (of the trainer, or 'ros2 bag record --use-sim-time'), or use a "
+                'message type with a header')
 
     def episodes(self, segment: Segment) -> Iterator[Episode]:
         """Align one segment and cut it at its gaps and jumps."""
@@ -226,7 +236,7 @@ class _BagImport:
         stamps, x = samples.stamps, samples.x
         has_inputs = all(any(len(segment.of(place)) or place in segment.applied
                              for place in places_of(signal)) for signal in self.inputs)
-        if len(stamps) < _SHORTEST or not has_inputs:
+        if len(stamps) < SHORTEST or not has_inputs:
             dropped['too short, or without any input'] += x.size
             return
         spike = self._leaps(x)[0]
@@ -248,15 +258,15 @@ class _BagImport:
             dropped['before the first input'] += n_x * int(np.sum(~started))
             dropped['after the last input'] += n_x * int(np.sum(~within))
             rows = rows[started & within]
-            if len(rows) < _SHORTEST:
-                dropped[f'in a segment of fewer than {_SHORTEST}'] += n_x * len(rows)
+            if len(rows) < SHORTEST:
+                dropped[f'in a segment of fewer than {SHORTEST}'] += n_x * len(rows)
                 continue
             yield self._episode(stamps[rows], x[rows], applied)
 
     def _ends(self, stamps: Times, x: Array, period: float) -> NDArray[np.int64]:
         """Return where episodes end, at gaps and jumps, and note these."""
         jump = self._leaps(x)[1]
-        gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
+        gap = np.diff(stamps, prepend=stamps[0]) > GAP_PERIODS * period
         ends = np.flatnonzero(gap | jump.any(axis=1))
         for end in ends.tolist():
             at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
@@ -296,6 +306,8 @@ class _BagImport:
     def _commands(self, segment: Segment, signal: RecordedInput, samples: AlignedSamples,
                   clock: Clock, period: float) -> tuple[Times, Array]:
         """Return the times at which commands began to act, and these, in the signal's unit."""
+        if signal.command is None:
+            return np.empty(0, dtype=np.int64), np.empty(0)
         times, values = applied_inputs.commanded(segment.of(signal.command), clock,
                                                  samples.received, period)
         if signal.command in segment.applied:
@@ -323,17 +335,21 @@ class _BagImport:
                  stamps: Times, period: float) -> Applied:
         """Return the applied input over the time of some measurements."""
         usual = float(np.median(np.diff(measured[0]))) if len(measured[0]) > 1 else 0.0
-        reach = _GAP_PERIODS * max(period, usual)
+        reach = GAP_PERIODS * max(period, usual)
         near = (measured[0] >= stamps[0] - reach) & (measured[0] <= stamps[-1] + reach)
         times, values = measured[0][near], measured[1][near]
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
                 or np.max(np.diff(times)) > reach):
             if len(measured[0]):
-                self.account.note(f'{self.bag}: {name} was not measured throughout, and is taken '
-                                  'from its command there')
+                self.account.note(f'{self.bag}: {name} was not always measured: the command is '
+                                  'used in between' if len(commands[0]) else
+                                  f'{self.bag}: {name} was not always measured, and has no '
+                                  'commands')
             return *applied_inputs.around(*commands, stamps), False
         for held in (commands[1], np.clip(commands[1], values.min(), values.max())):
             if applied_inputs.follows_command(commands[0], held, times, values):
                 return *applied_inputs.around(commands[0], held, stamps), False
-        self.account.note(f'{self.bag}: {name} is taken as it was measured')
+        if not len(commands[0]) and np.mean(values[1:] == values[:-1]) > _AT_REST:
+            return *applied_inputs.changes(times, values), False
+        self.account.note(f'{self.bag}: {name} is the measured applied input')
         return times, values, True

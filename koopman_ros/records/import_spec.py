@@ -31,7 +31,7 @@ class RecordedInput:
 
     name: str  #: of the signal
     unit: str  #: in the episodes
-    command: MessageField  #: where it is commanded
+    command: MessageField | None  #: where it is commanded, if it is
     measured: MessageField | None = None  #: where it is measured behind its actuator, if it is
     delay: float = 0.0  #: dead time of the actuator, after which a command begins to act, in s
 
@@ -68,7 +68,7 @@ def places_of(signal: RecordedState | RecordedInput) -> list[MessageField]:
     """Return the places of a signal."""
     if isinstance(signal, RecordedState):
         return [signal.place]
-    return [signal.command] if signal.measured is None else [signal.command, signal.measured]
+    return [found for found in (signal.command, signal.measured) if found is not None]
 
 
 #: The ends of episodes in a bag: by reason, each with its amount and this in words.

@@ -87,11 +87,11 @@ def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None
                            if stored.data.startswith(_ZSTD_MAGIC) else stored)
             found = None if recover else summary_section(stream)
             if found and found.statistics and found.statistics.message_count != count:
-                raise EOFError(f'{count} of the {found.statistics.message_count} messages it '
-                               'should hold')
+                raise EOFError(f'{count} of the {found.statistics.message_count} expected '
+                               'messages')
         except MemoryError as error:
-            raise BagReadError(f'memory does not suffice to read {str(file)!r}: free some, or '
-                               'read fewer topics') from error
+            raise BagReadError(f'not enough memory to read {str(file)!r}: free memory, or read '
+                               'fewer topics') from error
         except OSError:
             raise
         except Exception as error:
@@ -117,9 +117,9 @@ def summary_section(stream: BinaryIO) -> Summary | None:
 
 
 def is_closed(file: Path) -> bool:
-    """Tell a closed file from a cut one; raise BagReadError for one that is not MCAP at all."""
+    """Whether a file was closed, not truncated; raise BagReadError for one that is not MCAP."""
     if file.stat().st_size == 0:
-        raise BagReadError(f'{str(file)!r} is empty: its recorder wrote nothing, record again')
+        raise BagReadError(f'{str(file)!r} is empty: its recorder wrote nothing; record again')
     with opened(file) as stream:
         head = stream.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(head):
@@ -152,8 +152,8 @@ def opened(file: Path) -> Iterator[BinaryIO]:
                 reader = zstandard.ZstdDecompressor().stream_reader(stream)
                 while piece := reader.read(_PIECE_BYTES):
                     if plain.tell() > most:
-                        raise BagReadError(f'{str(file)!r} grows to more than {_MOST_GROWTH} '
-                                           'times its size, which no bag does: fetch it again')
+                        raise BagReadError(f'{str(file)!r} expands to more than {_MOST_GROWTH} '
+                                           'times its size: copy it again')
                     plain.write(piece)
             plain.seek(0)
             yield plain
@@ -168,7 +168,7 @@ class _WholeReads:
         stream.seek(0)
 
     def read(self, length: int) -> bytes:
-        """Return so many bytes; raise EndOfFile where there are fewer."""
+        """Return a number of bytes; raise EndOfFile where there are fewer."""
         self._left -= length
         if self._left < 0:
             raise EndOfFile
@@ -191,10 +191,10 @@ def _messages(stream: BinaryIO, topics: Collection[str] | None) -> Iterator[Stor
             end = start + length
             # zeros are the content of a disk that was full
             if end > len(records) or opcode == 0:
-                raise EOFError('bytes that are no record')
+                raise EOFError('bytes that are not a record')
             if opcode == Opcode.MESSAGE:
                 if length < _MESSAGE_HEAD.size:
-                    raise EOFError('a message that is cut short')
+                    raise EOFError('a truncated message')
                 number, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(records, start)
                 found = channels[number]
                 yield None if found is None else StoredMessage(

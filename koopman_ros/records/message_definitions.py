@@ -78,13 +78,13 @@ def _split(type_name: str) -> tuple[str, str]:
     match = _TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise MessageDefinitionError(
-            f'message type {type_name!r} is not of the form package/msg/Name, '
-            'such as sensor_msgs/msg/Temperature')
+            f'message type {type_name!r} is not of the form package/msg/Name, e.g. '
+            'sensor_msgs/msg/Temperature')
     return match[1], match[2]
 
 
 def _read(package: str, file_name: str, type_name: str) -> str:
-    """Return a file of a package's share/<package>/msg from the first prefix that has it."""
+    """Return a file of a package's share/<package>/msg from the first prefix that contains it."""
     listed = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     searched = [Path(prefix) / 'share' / package / 'msg'
                 for prefix in dict.fromkeys((*listed, sys.prefix)) if prefix]

@@ -27,7 +27,7 @@ _BEHIND_NS = 5_000_000_000
 @dataclass(frozen=True)
 class BagSummary:
     """
-    What a bag holds: messages, type and publishers' offers by topic, first and last log time [ns].
+    The content of a bag: messages, type and publishers' offers by topic, log times [ns].
 
     The times are None for a bag without messages. `complete` is False when the recorder did not
     close the bag: the counts are then those of the part that can be read. `offered_qos` has no
@@ -63,7 +63,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     type is not decoded here. Raises TypeError for a single string as `topics`.
     """
     if isinstance(topics, str):
-        raise TypeError(f'topics must be a collection of names: pass [{topics!r}]')
+        raise TypeError(f'topics must be a list of names: pass [{topics!r}]')
     files, _ = locate(path, recover=recover)
     return decoded_messages(files, None if topics is None else frozenset(topics), recover)
 
@@ -72,9 +72,9 @@ def in_log_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
     """
     Yield messages by their log time, as `ros2 bag play` does, within runs of one clock.
 
-    A message goes ahead of those recorded before it when it was received earlier, by at most
-    5 s. One that is earlier by more tells of a clock that was set back: all that came before it
-    stays before it. Messages of one log time keep their order.
+    A message goes ahead of those recorded before it when it was received earlier, by at most 5 s.
+    One that is earlier by more means that a clock was set back: all earlier messages stay before
+    it. Messages of one log time keep their order.
     """
     waiting: list[tuple[int, int, BagMessage]] = []
     newest_ns = 0
@@ -92,7 +92,7 @@ def in_log_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
 
 def summary(path: str | os.PathLike[str]) -> BagSummary:
     """
-    Return what a bag holds, also for one that was not closed (`complete` is then False).
+    Return the content of a bag, also for one that was not closed (`complete` is then False).
 
     `path` is a .mcap file or a bag directory. Raises BagReadError for a bag that is missing,
     empty or not MCAP.

@@ -122,12 +122,12 @@ class Segment:
                               if np.any(entries.stamp_ns != NO_STAMP)), received[0]))
 
     def without_stamps(self) -> bool:
-        """Tell whether states were received, none of them with a stamp."""
+        """Whether states were received, none of them with a stamp."""
         stamps = np.concatenate([self.of(place).stamp_ns for place in self._states])
         return bool(len(stamps) and np.all(stamps == NO_STAMP))
 
     def is_complete(self, size: int) -> bool:
-        """Tell whether a portion of so many measurements of a state is complete; set its end."""
+        """Whether a portion of measurements of a state is complete; set its end."""
         counts = [len(stamps) for stamps, _, _ in self._columns[:len(self._states)]]
         if (count := max(counts)) < size + _MARGIN:
             return False

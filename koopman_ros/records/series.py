@@ -61,9 +61,9 @@ def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iter
     """Raise BagReadError for a topic that a bag does not hold, or that is of another type."""
     for place in places:
         if place.topic not in content.types:
-            known = ', '.join(sorted(content.types)) or 'no topic at all'
-            raise BagReadError(f'bag {os.fspath(path)!r} has no topic {place.topic!r}, it has '
-                               f'{known}: name the right topics, or record them')
+            known = ', '.join(sorted(content.types)) or 'no topics'
+            raise BagReadError(f'bag {os.fspath(path)!r} has no topic {place.topic!r}, its topics '
+                               f'are {known}: correct the topic names, or record them')
         if content.types[place.topic] != place.type:
             raise _other_type(path, place.topic, content.types[place.topic], place.type)
 
@@ -92,8 +92,8 @@ def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Messa
             return stamp_ns, None
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         raise BagReadError(
-            f'topic {entry.topic!r} of bag {os.fspath(path)!r} calls itself {entry.type_name} and '
-            f'is laid out differently ({reason(error)}): read it with read_messages') from error
+            f'topic {entry.topic!r} of bag {os.fspath(path)!r} has type {entry.type_name} with a '
+            f'different definition ({reason(error)}): read it with read_messages') from error
 
 
 def _other_type(path: str | os.PathLike[str], topic: str, found: str, wanted: str) -> BagReadError:

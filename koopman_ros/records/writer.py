@@ -37,7 +37,7 @@ class BagWriter:
     `path` ending in '.mcap' makes one self-describing file; any other path makes a bag directory
     with `<name>_0.mcap` and, at `close`, `metadata.yaml`. An existing path is never overwritten.
 
-    A bag directory is split where asked for: a message that finds `max_file_bytes` written, or
+    A bag directory can be split: a message that finds `max_file_bytes` written, or
     `max_file_duration_s` [s] passed since the first log time of the file, begins the next file
     (`<name>_1.mcap`, ...; 0: never). The file before it is completed in the background, written
     through to the disk and only then listed in `metadata.yaml`: files listed there can be read
@@ -62,7 +62,7 @@ class BagWriter:
         self._is_directory = self.path.suffix != '.mcap'
         if (max_file_bytes or max_file_duration_s) and not self._is_directory:
             raise ValueError(
-                f'{str(self.path)!r} is one file, which is not split: give the name of a folder, '
+                f'{str(self.path)!r} is a single file, which cannot be split: name a folder, '
                 'without .mcap')
         self._compression = CompressionType[compression.upper()]
         self._max_file_bytes = max_file_bytes or math.inf
@@ -83,8 +83,8 @@ class BagWriter:
             self._file = self._next_file()
         except FileExistsError as error:
             raise FileExistsError(
-                f'{str(error.filename)!r} exists already and recordings are never overwritten: '
-                'choose another name, or move the old one away') from error
+                f'{str(error.filename)!r} already exists and recordings are never overwritten: '
+                'choose another name, or move the old one') from error
 
     def add_topic(self, topic: str, definition: MessageDefinition,
                   offered_qos: Sequence[Qos] = ()) -> None:
@@ -253,7 +253,7 @@ class _McapFile:
     def flush(self) -> None:
         """End the open chunk and hand everything to the operating system."""
         if self._is_broken:
-            raise OSError(f'{str(self.path)!r} ends where it could not be written before')
+            raise OSError(f'{str(self.path)!r} ends at an earlier write error')
         try:
             self._mcap.flush()
         except OSError:

@@ -55,10 +55,10 @@ def _parser() -> argparse.ArgumentParser:
         for flag, options in arguments.items():
             command.add_argument(f'--{flag}' if 'default' in options else flag, **options)
         command.add_argument('--timeout', type=float, default=10.0, metavar='S',
-                             help='longest wait, %(default)s s')
+                             help='longest wait (default: %(default)s s)')
 
     message_type = {'default': '', 'metavar': 'TYPE',
-                    'help': 'message type, if no node uses the topic yet'}
+                    'help': 'message type, needed if no node uses the topic yet'}
     add('pub', _publish, 'publish one message', topic={},
         message={'help': "fields in YAML: '{temperature: 45.0}'"}, type=message_type)
     add('echo', _echo, 'print the messages of a topic', topic={}, count={
@@ -93,7 +93,7 @@ def _wait(node: Node, seconds: float, found: Callable[[], T], missing: str) -> T
 
 
 def _answer(node: Node, seconds: float, future: Future, name: str) -> Any:
-    _wait(node, seconds, future.done, f'{name} did not answer within {seconds:g} s')
+    _wait(node, seconds, future.done, f'{name} did not respond within {seconds:g} s')
     return future.result()
 
 
@@ -102,7 +102,7 @@ def _kind(node: Node, options: argparse.Namespace) -> Any:
     topic = node.resolve_topic_name(options.topic)
     name = options.type or _wait(
         node, options.timeout, lambda: dict(node.get_topic_names_and_types()).get(topic, []),
-        f'no node uses {topic}: check its name and the domain, or give --type')[0]
+        f'no node uses {topic}: check its name and the ROS domain, or set --type')[0]
     return _class(name)
 
 
@@ -118,7 +118,7 @@ def _filled(message: Any, text: str | None) -> Any:
     def fill(part: Any, values: Any) -> None:
         kinds = part.get_fields_and_field_types()
         if not isinstance(values, dict) or not set(values) <= set(kinds):
-            raise ValueError(f'fields are {", ".join(kinds)}')
+            raise ValueError(f'the fields are {", ".join(kinds)}')
         for name, value in values.items():
             if '/' in kinds[name] and isinstance(value, dict):
                 fill(getattr(part, name), value)
@@ -131,7 +131,7 @@ def _filled(message: Any, text: str | None) -> Any:
     try:
         fill(message, yaml.safe_load(text or '{}'))
     except (yaml.YAMLError, AssertionError, TypeError, ValueError) as error:
-        raise CommandError(f'{text!r} is no {type(message).__name__}: {error}') from error
+        raise CommandError(f'{text!r} is not a valid {type(message).__name__}: {error}') from error
     return message
 
 
@@ -156,7 +156,7 @@ def _publish(node: Node, options: argparse.Namespace) -> None:
     publisher = node.create_publisher(kind, options.topic, topics.profile(1, reliable=True))
     _wait(node, options.timeout, lambda: (
         0 < node.count_subscribers(options.topic) <= publisher.get_subscription_count()),
-        f'no node listens to {options.topic}: nothing was published')
+        f'no node subscribes to {options.topic}: nothing was published')
     publisher.publish(message)
     publisher.wait_for_all_acked()
 
@@ -176,7 +176,7 @@ def _echo(node: Node, options: argparse.Namespace) -> None:
 
 def _call(node: Node, options: argparse.Namespace) -> None:
     service = node.resolve_service_name(options.service)
-    missing = f'there is no service {service}: check its name and the domain'
+    missing = f'no service {service}: check its name and the ROS domain'
     kind = _class(_wait(
         node, options.timeout, lambda: dict(node.get_service_names_and_types()).get(service, []),
         missing)[0])
@@ -192,7 +192,7 @@ def _call(node: Node, options: argparse.Namespace) -> None:
 def _parameter(node: Node, options: argparse.Namespace) -> None:
     client = AsyncParameterClient(node, options.node)
     _wait(node, options.timeout, client.services_are_ready,
-          f'there is no node {options.node}: check its name and the domain')
+          f'no node {options.node}: check its name and the ROS domain')
 
     def read(names: list[str]) -> list[Any]:
         return [parameter_value_to_python(value) for value in _answer(

@@ -10,7 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from koopman_ros.control import Controller, events, HOLD, Mode, SAFE, Setpoint, State, StepReport
+from koopman_ros.control import (
+    AppliedInputs,
+    Controller,
+    events,
+    HOLD,
+    Mode,
+    SAFE,
+    Setpoint,
+    State,
+    StepReport,
+)
 from koopman_ros.control.events import Event, EventOutcome, Measurement, Silence
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
@@ -57,10 +67,15 @@ class ControlLoop:
         self._held_for: StatusCode | None = None
         self._settling = False
 
-    def begin(self, timing: Timing) -> None:
-        """Forget all but the mode and the requested set-points; the caller holds the lock."""
+    def begin(self, timing: Timing, applied: AppliedInputs) -> None:
+        """
+        Forget all but the mode and the requested set-points; the caller holds the lock.
+
+        :param applied: inputs that may still act.
+        """
         asked = self.state.setpoint
-        self.state = State(self.state.mode, Setpoint(asked.requested, scheduled=asked.scheduled))
+        self.state = State(self.state.mode, Setpoint(asked.requested, scheduled=asked.scheduled),
+                           applied=applied)
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True
 
     def answer(self, event: Measurement, present: Array | None, arrived: tuple[float, int, int],

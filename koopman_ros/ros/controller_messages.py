@@ -99,7 +99,7 @@ def planned(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointTr
     """
     Return the path of the controlled states in a plan, and its inputs, under names with units.
 
-    There is a point for each node; what a point says of an input holds until the next one.
+    There is a point for each node; the inputs of a point hold until the next one.
     """
     names = list(signals.every)
     columns = [(name, signals.states[name], plan.states[:, names.index(name)])
@@ -119,7 +119,7 @@ def planned(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointTr
 
 
 def active_constraints(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointState:
-    """Return which limits are active in a plan, under names that say what -1 and 1 stand for."""
+    """Return which limits are active in a plan, under names that explain -1 and 1."""
     return _named({what.format(name): value for what, of, values in (
         ('at_range_{} [-1 lower, 1 upper]', signals.inputs, plan.at_range),
         ('at_rate_{} [-1 falling, 1 rising]', signals.inputs, plan.at_rate),
@@ -164,7 +164,7 @@ class RecordPublisher:
 
     A replay begins at a snapshot of that state: there is one when the controller begins to act,
     before which nothing is published, one every ten seconds, and two for each new subscriber: it
-    may know this publisher later than this one knows it, and miss what was published meanwhile.
+    may discover this publisher later than it is discovered, and miss messages in between.
     """
 
     def __init__(self, endpoints: topics.EndpointMonitor,

@@ -32,7 +32,7 @@ CONNECTIONS, MEASUREMENTS, REQUESTS, MODEL, SETPOINT, ACTUATORS = CONDITIONS = (
     'connections', 'measurements', 'requests', 'model', 'set-point', 'actuators')
 TASKS = (CONTROL, *CONDITIONS)
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
-_WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
+_WAY_BACK = 'recovering: the {} moves from its safe value towards the nominal one'
 _INACTIVE = 'inactive'
 
 
@@ -109,9 +109,9 @@ def statuses(now: StatusContext) -> dict[str, TaskReport]:
     found = {CONTROL: _control_status(now, warnings)}
     for condition in CONDITIONS:
         sentences = [sentence for of, sentence in warnings if of == condition]
-        found[condition] = TaskReport(Severity.WARN,
-                                      '; '.join(sentences)) if sentences else TaskReport(
-            Severity.OK, 'in order')
+        found[condition] = TaskReport(Severity.WARN, '; '.join(sentences), {
+            f'warning {number}': sentence for number, sentence in enumerate(sentences, 1)
+        }) if sentences else TaskReport(Severity.OK, 'in order')
     return found
 
 
@@ -137,7 +137,7 @@ def _control_status(now: StatusContext, warnings: Sequence[tuple[str, str]]) -> 
 def _in_order(now: StatusContext) -> str:
     mode, command = now.state.mode, now.report.command
     if mode is Mode.AUTOMATIC and not now.setpoint_received:
-        return f'{mode.value}, no set-point yet: what was first measured is held'
+        return f'{mode.value}, no set-point yet: the first measurement is the set-point'
     if command.at_range:
         return f'{mode.value}, {now.input} at a limit'
     return f'{mode.value}, {now.input} at a rate limit' if command.at_rate else mode.value
@@ -150,7 +150,7 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
     if not now.counts.measurements:
         waiting = f'waiting for the first measurement{now.awaited}'
         if mode is Mode.MANUAL and now.state.command is None:
-            waiting += f': the applied {now.input} is not known, and no manual command goes out'
+            waiting += f': the applied {now.input} is unknown, so no manual command is sent'
         return Severity.WARN, now.complaint or waiting
     silence = now.timing.silence
     # /clock is not read meanwhile
@@ -161,13 +161,14 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
         action = 'manual mode' if mode is Mode.MANUAL else (
             _ACTIONS[HOLD] if report.depth == 0 else _action(now))
         if now.timing.busy:
-            return Severity.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
-                                    f'node is busy: {action}{doing}; ask for less at once')
+            return Severity.ERROR, (f'no command for more than {timeout:g} s, because the node is '
+                                    f'busy: {action}{doing}; reduce the load of the node')
         if (why := now.timing.no_news(timeout)) is not None:
             what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
-                    else 'two sources have published the measurement in turn')
+                    else 'two nodes have published the measurement')
             return Severity.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
-                                    'the clock of the sensor, and that it has one publisher')
+                                    'the clock of the sensor, and that the topic has one '
+                                    'publisher')
         return Severity.ERROR, (f'no measurement{now.awaited} for more than {timeout:g} s: '
                                 f'{action}{doing}; check sensor and plant')
     if report.reason is not None and mode is Mode.MANUAL:
@@ -193,11 +194,11 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
     if now.unheard and now.unheard_for > _UNRECEIVED:
         yield CONNECTIONS, (
             f'no subscriber on {", ".join(now.unheard)}: the commands reach no plant; start the '
-            'plant, or check its topic and domain')
+            'plant, or check its topic and ROS domain')
     if now.timing.paused:
         yield MEASUREMENTS, (
-            f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
-            'has ended, and the last command stays')
+            f'/clock has not advanced for more than {PAUSED:g} s: the simulation is paused or has '
+            'ended; the last command remains')
     interval = 0.0 if math.isinf(now.state.interval) else now.state.interval
     overdue = max(_PATIENCE, 3.0 * interval)
     # manual commands are also sent between two measurements
@@ -207,16 +208,16 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
     if report.measurement.arrival is Arrival.REPEATED or (
             now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
         yield MEASUREMENTS, (
-            'the stamp of the measurement does not advance: the last command is held; stamp '
-            'measurements with their time')
+            'the stamp of the measurement does not advance: the last command is held; stamp each '
+            'measurement with its time')
     elif now.timing.silence > overdue or (unmeasured and now.counts.measurements):
         yield MEASUREMENTS, (
-            f'the last measurement is {now.timing.silence:.0f} s old: commands follow from '
-            'the model and from requests alone; check sensor and plant')
+            f'the last measurement is {now.timing.silence:.0f} s old: commands are based on the '
+            'model only; check sensor and plant')
     if now.timing.without_clock:
         yield MEASUREMENTS, (
-            'use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
-            'clock; set use_sim_time to false, or publish_clock of the plant to true')
+            'use_sim_time is set, but /clock is not published: time-outs use the wall clock; set '
+            'use_sim_time to false, or publish_clock of the plant to true')
     if now.request:
         yield REQUESTS, now.request
     if now.model_refused:
@@ -232,20 +233,19 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
                       'the model extrapolates')
     if oldest and abs(age) > oldest:
         yield MEASUREMENTS, (
-            f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
-            'expected: check the connection and the clocks')
+            f'measurements are {age:.1f} s old on receipt, max_measurement_age allows '
+            f'{oldest:g} s: check the connection and the clocks')
     if report.target is not None and (short := _out_of_reach(now, report.target)):
         yield SETPOINT, short
     if not report.measurement.follows:
         yield ACTUATORS, (
             f'the {now.input} does not follow its command within '
-            f'{_listed(now, tuning.tracking_tolerance)}: the observer uses the measured input; '
+            f'{_listed(now, tuning.tracking_tolerance)}: the estimator uses the applied input; '
             'check the actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
         yield MODEL, (
-            'the disturbance estimate is at its bound of '
-            f'{_listed(now, tuning.max_disturbance)} of {now.input}: the plant is far from its '
-            'model; retrain')
+            f'the disturbance estimate is at its bound of {_listed(now, tuning.max_disturbance)} '
+            f'of {now.input}: the plant differs from the model; retrain')
 
 
 def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
@@ -260,15 +260,15 @@ def _out_of_reach(now: StatusContext, target: TargetReport) -> str:
         found, width = float(target.state[place]), 2.0 * states.half_widths[place]
         if abs(found - wanted) > _REACHED * width * states.scale[place]:
             return (f'the set-point {quantity_text(wanted, unit)} of {name} cannot be held within '
-                    f'the range of the {now.input}: {quantity_text(found, unit)} is the nearest')
+                    f'the range of the {now.input}: the nearest is {quantity_text(found, unit)}')
     for (name, unit), wanted, low, high in zip(
             now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
             limits.upper.tolist(), strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
-            return (f'the set-point would need the {base_name(name, unit)} at '
-                    f'{quantity_text(wanted, unit)}, its range is {shown(low, unit):.6g} to '
-                    f'{shown(high, unit):.6g}: it is not reached')
+            return (f'the set-point is not reached: the {base_name(name, unit)} would have to be '
+                    f'{quantity_text(wanted, unit)}, but its range is {shown(low, unit):.6g} to '
+                    f'{shown(high, unit):.6g}')
     return ''
 
 
@@ -341,7 +341,8 @@ def _estimated(now: StatusContext) -> dict[str, object]:
     if estimate.innovation is not None:
         (lower, upper), square = estimate.innovation.expected, estimate.innovation.mean_square
         fits = 'consistent' if lower <= square <= upper else (
-            'more than the noise explains' if square > upper else 'less than the noise said')
+            'larger than the noise explains' if square > upper else
+            'smaller than the noise predicts')
         found['innovations, mean square over expected'] = (
             f'{square:.3g}: {fits} ({lower:.3g} to {upper:.3g})')
     return found

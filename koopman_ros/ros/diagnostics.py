@@ -30,7 +30,7 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class TaskReport:
-    """What a node says of itself: a sentence, and figures with their units in the key."""
+    """The status of a node: a sentence, and figures with their units in the key."""
 
     level: Severity
     message: str

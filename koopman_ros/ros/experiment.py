@@ -25,9 +25,9 @@ class PlantExperiment:
     """
     Drive the plant with random steps on the service ``~/experiment``; reports by diagnostics.
 
-    The steps begin at the present inputs. When they are over, the inputs return to their safe
-    values along the rate limit, or the set-points to what they were, and are held there until the
-    service is called with false once more, or another publisher comes.
+    The steps begin at the present inputs. Afterwards the inputs return to their safe values along
+    the rate limit, or the set-points to their former values, and are held there until the service
+    is called with false again, or another publisher appears.
 
     :param commanded: last command of each input by name, of any node; kept up to date.
     """
@@ -68,7 +68,7 @@ class PlantExperiment:
         elif not request.data:
             response.success, response.message = self._stop()
         elif self._run is not None and self._run.running:
-            response.message = 'an experiment is running: call with false to end it'
+            response.message = 'an experiment is running: call with data: false to end it'
         else:
             reason = self._start()
             if self._run is not None:
@@ -88,13 +88,13 @@ class PlantExperiment:
         for place in stepped(self.settings, self._wiring).values():
             topic = resolve(place.topic)
             if others := other_publishers(self._node, topic):
-                return (f'{others} publishes on {topic}: end it, or choose another '
+                return (f'{others} publishes on {topic}: stop it, or choose another '
                         'experiment_signal')
         if self.settings.experiment_signal in (MANUAL, SETPOINT):
             answers = resolve(next(iter(self._wiring.commands.values())).topic)
             if not self._node.count_publishers(answers):
                 mode = 'manual' if self.settings.experiment_signal == MANUAL else 'automatic'
-                return (f'nobody publishes on {answers}: start the controller and switch it to '
+                return (f'{answers} is not published: start the controller and switch it to '
                         f'{mode} mode')
         try:
             self._run = ExperimentRun(
@@ -110,9 +110,10 @@ class PlantExperiment:
             return False, 'no experiment is running'
         if self._run.running:
             self._run.stop(ExperimentPhase.ENDED)
-            return True, f'ended: {self._run.return_text}; call again to let go'
+            return True, (f'ended: {self._run.return_text}; call again with data: false to '
+                          'release the inputs')
         self._release(self._verdict(self._run))
-        return True, 'the trainer does not command any more'
+        return True, 'the trainer has released the inputs'
 
     def _on_end(self, why: Reason | None) -> None:
         """Report the end of the steps, or stop commanding at once for a reason."""
@@ -124,7 +125,7 @@ class PlantExperiment:
         # an experiment that was over is over as it was
         run.stop(ExperimentPhase.ABORTED, why)
         self._release(self._verdict(run))
-        self._report(f'the trainer does not command any more: {self._words(why)}')
+        self._report(f'the trainer has released the inputs: {self._words(why)}')
 
     def _release(self, outcome: TaskReport) -> None:
         run, self._run = self._run, None

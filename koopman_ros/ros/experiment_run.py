@@ -186,8 +186,8 @@ class ExperimentRun:
             start[i] = next(filter(math.isfinite, found), start[i])
             if not any(map(math.isfinite, found)):
                 self._node.get_logger().warning(
-                    f'experiment: {self._label(name)} is not measured and was not commanded: '
-                    f'the steps begin at its safe value, {quantity_text(start[i], unit)}')
+                    f'experiment: {self._label(name)} is neither measured nor commanded: the '
+                    f'steps begin at its safe value, {quantity_text(start[i], unit)}')
         return start
 
     def _on_applied(self, received: SignalSample) -> None:
@@ -221,10 +221,10 @@ class ExperimentRun:
             publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_TIME))
         if not self._returned:
             self._node.get_logger().warning(
-                'experiment: ended on the way back: '
-                f'{self._values_text("at", self.progress.command)}, held there, in place of '
-                f'{self._values_text("at", self.plan.home)}; command them by hand or start the '
-                'controller')
+                'experiment: ended during the return: '
+                f'{self._values_text("at", self.progress.command)}, held there, instead of '
+                f'{self._values_text("at", self.plan.home)}; command the inputs manually or start '
+                'the controller')
 
     @property
     def _returned(self) -> bool:

@@ -11,21 +11,21 @@ from typing import Any
 
 import rclpy
 
-from koopman_ros.execution.training import JobState, TrainingJob
+from koopman_ros.execution.training import JobState, TrainingJob, TrainingProgress
 from koopman_ros.parameters.signal_topics import SIGNALS, SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.ros.managed import one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import init
-from koopman_ros.ros.training import POLL_PERIOD, present_lift, task_fields, TrainingProgress
+from koopman_ros.ros.training import POLL_PERIOD, present_lift, task_fields
 
 
 def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
     """
     Retrain the plants of a file of loops, each by its trainer's parameters, until a signal.
 
-    A line on the standard output says how each ended. Nothing is written of those that have not
+    A line on standard output gives the result of each. Nothing is written of those that have not
     ended at a signal.
 
     :param arrived: signals, as they come.
@@ -70,7 +70,7 @@ def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
         settings = node.declare_table(trainer_table(present, given))
         bags = list(filter(None, settings.bags))
         if not bags:
-            raise ConfigurationError('there is no bag to train from: name it in bags')
+            raise ConfigurationError('no bag to train from: set bags')
         signals = trainer_signals(present, {name: getattr(settings, name) for name in SIGNALS})
         wiring = SignalTopics(signals, settings.states, settings.inputs)
         return task_fields(node, settings, wiring, bags), settings.executor
@@ -82,8 +82,8 @@ def _one_scheduler(schedulers: Mapping[str, str]) -> str:
     found = sorted(set(schedulers.values()))
     if len(found) > 1:
         raise ConfigurationError(
-            f'executor is {" and ".join(map(repr, found))} in different loops: give all plants '
-            'of one call the same, e.g. under /**')
+            f'executor is {" and ".join(map(repr, found))} in different loops: set the same one '
+            'for all plants of a call, e.g. under /**')
     return found[0] if found else ''
 
 

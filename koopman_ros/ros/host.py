@@ -48,7 +48,7 @@ def read_loops(path: Path) -> tuple[str, ...]:
     """
     Read the namespaces of loops, one a line; blank lines and comments after # do not count.
 
-    :raises ConfigurationError: naming the line and what is wrong with it.
+    :raises ConfigurationError: naming the line and its defect.
     :raises OSError: when the file cannot be read.
     """
     lines: dict[str, int] = {}
@@ -59,14 +59,14 @@ def read_loops(path: Path) -> tuple[str, ...]:
         try:
             validate_namespace(namespace)
         except InvalidNamespaceException as error:
-            raise ConfigurationError(f'{path}, line {number}: {word[:100]!r} is no namespace '
-                                     f'({one_line(error)}): e.g. line_1/reactor_3') from None
+            raise ConfigurationError(f'{path}, line {number}: {word[:100]!r} is not a namespace '
+                                     f'({one_line(error)}): use e.g. line_1/reactor_3') from None
         if namespace in lines:
-            raise ConfigurationError(f'{path}, line {number}: {namespace} is in line '
-                                     f'{lines[namespace]}, too: each loop has its own')
+            raise ConfigurationError(f'{path}, line {number}: {namespace} is also in line '
+                                     f'{lines[namespace]}: each loop needs its own')
         lines[namespace] = number
     if not lines:
-        raise ConfigurationError(f'{path} names no loop: write one namespace a line')
+        raise ConfigurationError(f'{path} lists no loops: write one namespace per line')
     return tuple(lines)
 
 
@@ -87,8 +87,8 @@ class Host:
         self._node = HostedNode(f'{name}_host', None)
         if self._node.get_namespace() != '/':
             raise ConfigurationError(
-                f'-r __ns:={self._node.get_namespace()} would put all loops there: write '
-                'the namespaces into the file of loops')
+                f'-r __ns:={self._node.get_namespace()} would apply to all loops: write the '
+                'namespaces into the file of loops')
         self.executor = events_executor()
         self.executor.add_node(self._node)
         self._diagnostics = Diagnostics(self._node).add('loops', self._status)
@@ -180,7 +180,7 @@ class Host:
 
     def _status(self) -> TaskReport:
         running, failed = len(self._nodes), list(self._failed.items())
-        level, message = Severity.OK, f'{running} of {len(self._loops)} loops run'
+        level, message = Severity.OK, f'{running} of {len(self._loops)} loops are running'
         if failed:
             level, message = Severity.ERROR, f'{message}, {len(failed)} failed: ' + '; '.join(
                 f'{namespace}: {why}' for namespace, why in failed[:_SHOWN]) + (
@@ -188,8 +188,8 @@ class Host:
         delay, self._delay = self._delay, 0.0
         if level is Severity.OK and delay > _LATE and not self._waiting:
             level, message = Severity.WARN, (
-                f'{message}, {delay:.2g} s late: that is more than one process can do; spread the '
-                'loops over several, or measure less often')
+                f'{message}, {delay:.2g} s late: one process cannot keep up; distribute the loops '
+                'over several processes, or increase the sample period')
         return TaskReport(level, message, {
             'loops': len(self._loops), 'running': running, 'failed': len(failed),
             'to be started': len(self._waiting),

@@ -38,7 +38,7 @@ class HostedNode(Node):
     A node that may share its process with others.
 
     :ivar hosting: None where the node is alone.
-    :ivar steady_clock: runs while simulated time stands still.
+    :ivar steady_clock: runs while simulated time is paused.
     """
 
     def __init__(self, name: str, hosting: HostContext | None, **options: Any) -> None:
@@ -115,5 +115,5 @@ class HostedNode(Node):
 
 def wall_timer(node: HostedNode, seconds: float, callback: Callable[[], Any], **options: Any
                ) -> Timer:
-    """Create a timer by the steady clock, which runs while simulated time stands still."""
+    """Create a timer by the steady clock, which runs while simulated time is paused."""
     return node.create_timer(seconds, node.guarded(callback), clock=node.steady_clock, **options)

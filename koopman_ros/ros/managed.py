@@ -57,7 +57,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._state_machine.destroy_when_not_in_use()
 
     def start(self) -> None:
-        """Configure and activate, as without a manager; raises what went wrong."""
+        """Configure and activate, as without a manager; raises the error."""
         self._alone = True
         for transition in (self.trigger_configure, self.trigger_activate):
             if transition() != TransitionCallbackReturn.SUCCESS:
@@ -80,7 +80,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         """Stop acting, and leave the plant safe."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; destroy what was created if that fails."""
+        """Configure; destroy its objects if that fails."""
         done = self._attempt(self.configure)
         if done != TransitionCallbackReturn.SUCCESS:
             self._clean_up()
@@ -100,7 +100,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Destroy what was configured."""
+        """Destroy the configured objects."""
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
@@ -128,7 +128,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
             return change(request, response)
         except RuntimeError as error:
             # in rclpy an invalid transition would end the process
-            self.get_logger().error(f'no such transition now: {one_line(error)}')
+            self.get_logger().error(f'this transition is not possible now: {one_line(error)}')
             response.success = False
             return response
 
@@ -191,5 +191,5 @@ def one_line(error: BaseException) -> str:
     text = str(error).split(', at ./')[0].split(', at /')[0]
     text = ' '.join(text.split()) or type(error).__name__
     if empty := _EMPTY_TEXT.search(text):
-        text += f'; an empty text needs quotes within quotes: -p "{empty[1]}\'\'"'
+        text += f'; an empty string needs nested quotes: -p "{empty[1]}\'\'"'
     return text

@@ -54,8 +54,8 @@ class Measurements:
             node, endpoints.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:
             node.get_logger().warning(
-                f'messages of {", ".join(measured.unstamped)} have no stamp: they are stamped at '
-                'their arrival')
+                f'messages of {", ".join(measured.unstamped)} have no stamp: the time of receipt '
+                'is used')
         self._active = False
 
     def begin(self, timing: Timing, window: Callable[[], float], begun: Callable[[], bool]
@@ -77,10 +77,10 @@ class Measurements:
 
     @property
     def complaint(self) -> str:
-        """What is wrong with the messages, or an empty string."""
+        """The defect of the messages, or an empty string."""
         return '' if self._frame_length <= LONGEST_FRAME_ID else (
-            f'the frame_id of the measurement has {self._frame_length} characters; only '
-            f'the first {LONGEST_FRAME_ID} are passed on: shorten it at the sensor')
+            f'the frame_id of the measurement has {self._frame_length} characters; only the first '
+            f'{LONGEST_FRAME_ID} are forwarded: shorten it at the sensor')
 
     def _on_measurement(self, received: SignalSample) -> None:
         self.frame_id = received.frame_id[:LONGEST_FRAME_ID]

@@ -65,7 +65,7 @@ class _Trial:
         self.end(outcome)
 
     def end(self, outcome: LoadedModel | str) -> None:
-        """Say what became of it: the model, or why there is none."""
+        """Return the result: the model, or why there is none."""
         self.outcome.set_result(outcome)
         executor = self._node.executor
         # in shutdown the middleware may be gone already
@@ -76,12 +76,12 @@ class _Trial:
 
 class ModelReload:
     """
-    Swap the model of a running controller, or keep the old one and say why.
+    Replace the model of a running controller, or keep the current one with a reason.
 
     Files are read and tried in a thread, so that no measurement waits for a disk. The service
-    answers when that is done; a parameter must be answered at once, for only then `ros2 param set`
-    can say why it was refused. A read from a disk that does not answer cannot be ended: no file is
-    read twice at once, and few files together.
+    answers when that is done; a parameter must be answered at once, because only then `ros2 param
+    set` can print why it was rejected. A read from a disk that does not answer cannot be ended: no
+    file is read twice at once, and few files together.
 
     :param reloaded: called in the executor when the service has put another model in force.
     :param refused: called there when a model was refused.
@@ -113,7 +113,7 @@ class ModelReload:
             # nobody is there who would hear the answer
             return response
         if name != self.in_force.name:
-            outcome = f'the model was changed to {self.in_force.name} while {name} was read'
+            outcome = f'{self.in_force.name} became the current model while {name} was read'
         if isinstance(outcome, LoadedModel):
             try:
                 # the operator may have asked for another one meanwhile
@@ -130,7 +130,7 @@ class ModelReload:
         return response
 
     def accept(self, parameters: ControllerParameters, changes: Collection[str]) -> str:
-        """Say why a change of parameters brings no usable model, or keep it for taking over."""
+        """Return why changed parameters give no usable model, or keep the model to activate."""
         self._accepted = None
         if 'model' not in changes:
             return ''
@@ -158,7 +158,7 @@ class ModelReload:
         self._ended = True
 
     def figures(self) -> dict[str, object]:
-        """Return what diagnostics show of the model in force."""
+        """Return the diagnostics of the current model."""
         return {
             'model': self.in_force.name,
             'model file time': self.in_force.file_time,
@@ -186,6 +186,6 @@ class ModelReload:
         self._node.get_logger().info(f'{loaded.about}; {loaded.comparison}')
 
     def _refuse(self, reason: str) -> str:
-        self.refused = f'the old model is kept: {reason}'
+        self.refused = f'the current model is kept: {reason}'
         self._on_refused()
         return self.refused

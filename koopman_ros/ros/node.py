@@ -34,8 +34,8 @@ class LoopNode(HostedNode):
     """
     A node whose parameters are those of a table, and which may complete work before its end.
 
-    Every value that it was given is declared, so that the table finds names it does not know, and
-    the table answers what rclpy would answer less clearly itself.
+    Every given value is declared, so that the table finds unknown names and rejects values with a
+    clearer message than rclpy.
 
     :param hosting: in a process that it shares with others; alone by default.
     :ivar exit_code: ends the process, or the node in a process of many, when a node whose work is
@@ -54,7 +54,7 @@ class LoopNode(HostedNode):
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """What the node says of itself, once a second and on change."""
+        """The status of the node, once a second and on change."""
         return Diagnostics(self)
 
     def given(self) -> dict[str, Any]:
@@ -64,7 +64,7 @@ class LoopNode(HostedNode):
                 if parameter.value is not None}
 
     def complete(self) -> None:
-        """Complete that work, if there is any; what is published here goes out last."""
+        """Complete that work, if there is any; messages published here are sent last."""
 
     def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
                             *args: Any, **options: Any) -> Subscription:
@@ -76,8 +76,8 @@ class LoopNode(HostedNode):
                 return
             self._clocks_refused += 1
             self.get_logger().warning(
-                f'/clock has sec {told.sec}, nanosec {told.nanosec}, which is no valid time: '
-                f'ignored ({self._clocks_refused} so far); check who publishes /clock',
+                f'ignored an invalid /clock message (sec {told.sec}, nanosec {told.nanosec}; '
+                f'{self._clocks_refused} so far): check the publisher of /clock',
                 throttle_duration_sec=10.0)
 
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
@@ -122,7 +122,7 @@ class LoopNode(HostedNode):
         if unknown:
             near = {name: difflib.get_close_matches(name, table.rows, n=1) for name in unknown}
             self.get_logger().warning(
-                'parameters that this node does not have are ignored: ' + ', '.join(
+                'unknown parameters are ignored: ' + ', '.join(
                     f'{name!r}' + ''.join(f' (did you mean {other}?)' for other in near[name])
                     for name in unknown))
         snapshot = table.snapshot({
@@ -143,9 +143,9 @@ class LoopNode(HostedNode):
             other = [] if known is None else [
                 name for name in own_code(change.value or '') if name not in known]
             if other:
-                reason = (f'{change.name}: {other[0]!r} was not given at the start, and a '
-                          f'module:name is fixed at start: restart {self.get_name()} with it')
-                self.get_logger().warning(f'parameter change refused: {reason}')
+                reason = (f'{change.name}: {other[0]!r} is a new module:name, which can be set '
+                          f'only at start-up: restart {self.get_name()} with it')
+                self.get_logger().warning(f'parameter change rejected: {reason}')
                 return msg.SetParametersResult(successful=False, reason=reason)
         return msg.SetParametersResult(successful=True)
 
@@ -171,7 +171,7 @@ class LoopNode(HostedNode):
         Keep a snapshot of a table, all of which is declared, in step with the parameters.
 
         :param apply: called with each new snapshot, after the change took effect.
-        :param accept: called before with a snapshot that fits and the names of what was set;
+        :param accept: called before with a valid snapshot and the names of the changed parameters;
             returns why it cannot be, or an empty string.
         """
         current = snapshot
@@ -188,7 +188,7 @@ class LoopNode(HostedNode):
             merged = table.amended(current, **values)
             reason = table.check(merged, current) or accept(merged, set(values))
             if reason:
-                self.get_logger().warning(f'parameter change refused: {reason}')
+                self.get_logger().warning(f'parameter change rejected: {reason}')
             return msg.SetParametersResult(successful=not reason, reason=reason)
 
         def take_over(changes: list[Parameter]) -> None:

@@ -2,23 +2,39 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What each program does, and the help, parameter files and SROS2 policy that follow from it.
+Description of each program, with the help, parameter files and SROS2 policy made from it.
 
 Run it as ``python -m koopman_ros.ros.node_descriptions`` after a change to a table or in here.
 """
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 import sys
+import textwrap
+from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree
 
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.model import load
 from koopman_ros.parameters import controller, panel, plant, trainer
-from koopman_ros.parameters.signal_topics import DEFAULT_SYSTEM, plant_defaults
-from koopman_ros.parameters.table import ConfigurationError, ParameterTable
+from koopman_ros.parameters.signal_topics import (
+    bundled_plants,
+    DEFAULT_SYSTEM,
+    described,
+    plant_defaults,
+    SIGNALS,
+    SignalTopics,
+    system_of,
+)
+from koopman_ros.parameters.table import (
+    as_yaml,
+    ConfigurationError,
+    ParameterTable,
+    Specification,
+)
 from koopman_ros.ros import topics
 
 POLICY_FILE = 'sros2_policy.xml'
@@ -43,43 +59,68 @@ _BAG_RECORDER_SERVICES = tuple(service.replace('~', '/rosbag2_recorder') for ser
 _TRANSITIONS = '~/transition_event'
 
 
-def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
-    """Return the tables of all programs for a plant that is shipped."""
-    given = {'system': system}
-    name = plant_defaults(system, 'controller').get('model', '')
-    if not name:
+def table_of(name: str, given: Mapping[str, Any]) -> ParameterTable[Any]:
+    """
+    Return the parameter table of a program.
+
+    :param given: `system`, and `model` where it is not that of a bundled plant.
+    :raises ConfigurationError: if nothing names the signals.
+    """
+    system = system_of(given)
+    if name == 'plant':
+        return plant.PlantTable(given)
+    if name == 'player':
+        return trainer.player_table(given)
+    if name == 'replay':
+        return controller.REPLAY_TABLE
+    model = given.get('model', '')
+    if name == 'panel':
+        return panel.panel_table(load(model_path(model)) if model else None, given)
+    model = model or plant_defaults(system, 'controller').get('model', '')
+    present = load(model_path(model)) if model else None
+    if name == 'trainer':
+        return trainer.trainer_table(present, given)
+    if present is None:
         raise ConfigurationError(
-            f'the system {system!r} has no model: name one in config/plants/{system}.yaml')
-    model = load(model_path(name))
-    return {'plant': plant.PlantTable(given), 'controller': controller.table_of(model, given),
-            'trainer': trainer.trainer_table(model, given),
-            'player': trainer.player_table(given), 'replay': controller.REPLAY_TABLE,
-            'panel': panel.panel_table(None, given)}
+            f'the system {system!r} has no model: name one in the parameter model, or in '
+            f'config/plants/{system}.yaml, or choose one of {", ".join(bundled_plants())}')
+    return controller.table_of(present, given)
 
 
-_HOSTS = 'it runs such a node in each'
+def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
+    """Return the tables of all programs for a bundled plant."""
+    return {name: table_of(name, {'system': system}) for name in _NAMES}
+
+
+_NAMES = ('plant', 'controller', 'trainer', 'player', 'replay', 'panel')
+_HOSTS = 'it runs one node in each'
 
 
 @dataclass(frozen=True)
 class Program:
-    """What a program does, and on the network by names as in the node."""
+    """Purpose of a program, and its topics and services by their names in the node."""
 
     does: str = ''  #: a sentence
-    codes: str = '0 after a signal, 1 when it cannot start, 2 for an unknown argument'
+    codes: str = '0 after a signal, 1 if it cannot start, 2 for an unknown argument'
     publishes: tuple[str, ...] = ()  #: topics
     subscribes: tuple[str, ...] = ()  #: topics; /clock where it follows simulated time
     serves: tuple[str, ...] = ()  #: services
     calls: tuple[str, ...] = ()  #: services of others
-    many: str = ''  #: what it does with ``--loops``, a file of namespaces
+    many: str = ''  #: clause about its action with ``--loops``
 
 
-def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
-    """Return all programs, with the topics of a plant that is shipped."""
-    wiring = trainer.preset_wiring(system)
-    if wiring is None:
-        raise ConfigurationError(f'no file says what the signals of the system {system!r} are: '
-                                 f'write config/plants/{system}.yaml')
-    recorded = tables(system)['trainer'].rows['topics'].default
+def _wiring(given: Mapping[str, Any]) -> tuple[SignalTopics, tuple[str, ...]]:
+    """Return the places of the signals, and the recorded topics."""
+    settings = table_of('trainer', given).snapshot({})
+    signals = trainer.trainer_signals(
+        load(model_path(given['model'])) if 'model' in given else None,
+        {**{name: getattr(settings, name) for name in SIGNALS}, **given})
+    return SignalTopics(signals, settings.states, settings.inputs), settings.topics
+
+
+def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Program]:
+    """Return all programs, with the topics of a system; `given` as for :func:`table_of`."""
+    wiring, recorded = _wiring(given)
 
     def topics_of(*kinds: str) -> tuple[str, ...]:
         return tuple(place.topic for kind in kinds for place in getattr(wiring, kind).values())
@@ -97,7 +138,7 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
             subscribes=topics_of('commands'),
             serves=('~/reset', *lifecycle, *STANDARD_SERVICES), many=_HOSTS),
         'controller': Program(
-            'Answers each measurement with a command, by a learned model.',
+            'Commands the inputs at each measurement, with a learned model.',
             publishes=(*topics_of('commands', 'active_setpoints', 'predicted'),
                        topics.CONTROLLER_INTERNALS, topics.PREDICTED_TRAJECTORY,
                        topics.ACTIVE_CONSTRAINTS, topics.EVENT_LOG, topics.DIAGNOSTICS,
@@ -108,30 +149,29 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
         'trainer': Program(
             'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
             f'{Program.codes}; with task:=train or --loops 0 for an accepted model, 2 for a '
-            'refused one, 1 for a failure, of many the worst',
+            'rejected one, 1 for a failure; of several, the worst',
             publishes=(*topics_of('commands', 'manual', 'setpoints'), topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*dict.fromkeys((*wiring.topics, *recorded)), topics.CLOCK),
             serves=('~/record', '~/experiment', '~/train', '~/cancel_training', *lifecycle,
                     *STANDARD_SERVICES),
-            many='it trains the plant of each from its bags, and ends'),
+            many='it trains the plant of each from its bags, and exits'),
         'player': Program(
-            'Publishes the measurements and set-points of a bag again, by the clock or in '
-            'lock-step.',
-            '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
-            'unknown argument',
+            'Plays the measurements and set-points of a bag, in recorded time or in lock-step '
+            'with a controller.',
+            '0 if all messages were played or after a signal, 1 if it cannot start or continue, 2 '
+            'for an unknown argument',
             publishes=(*topics_of('applied', 'measured', 'setpoints', 'manual'), topics.CLOCK,
                        *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
             serves=STANDARD_SERVICES),
         'replay': Program(
-            'Takes the records in bags through the control step again, also with a new model.',
-            '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for '
-            'an unknown argument, 3 when there is nothing to compare in a bag, 130 when '
-            'interrupted',
+            'Re-runs the control step on recorded bags, optionally with a new model.',
+            '0 if the recorded commands are reproduced, 1 if not or if it cannot run, 2 for an '
+            'unknown argument, 3 if a bag holds nothing to compare, 130 after an interrupt',
             publishes=('/parameter_events',), serves=('~/get_type_description',)),
         'panel': Program(
-            'Shows the loop in a browser, and passes on what an operator asks for there.',
+            'Browser HMI: shows the loop and forwards the commands of operators.',
             publishes=(*topics_of('setpoints', 'manual'), topics.AUDIT_LOG,
                        topics.DIAGNOSTICS, *STANDARD_TOPICS),
             subscribes=(*topics_of('measured', 'applied', 'commands', 'active_setpoints',
@@ -148,11 +188,10 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
     }
 
 
-def operator(system: str = DEFAULT_SYSTEM) -> Program:
+def operator(given: Mapping[str, Any] = MappingProxyType({})) -> Program:
     """Return the access of a person or a panel: set-points, services, recording, all topics."""
-    nodes = programs(system)
-    wiring = trainer.preset_wiring(system)
-    assert wiring is not None
+    nodes = programs(given)
+    wiring, _ = _wiring(given)
     asks = (*wiring.setpoints.values(), *wiring.manual.values())
     return Program(
         publishes=(*(place.topic for place in asks), _BAG_RECORDER_TOPIC, *STANDARD_TOPICS),
@@ -170,12 +209,16 @@ OPERATOR = operator()
 
 def policy(system: str = DEFAULT_SYSTEM) -> str:
     """Return the text of the SROS2 policy: one enclave for each node, and one for operators."""
+    if not plant_defaults(system, 'trainer'):
+        raise ConfigurationError(f'the signals of the system {system!r} are not known: write '
+                                 f'config/plants/{system}.yaml')
     root = ElementTree.Element('policy', version='0.2.0')
     root.append(ElementTree.Comment(
         ' Least privilege for each node, written by `make config`: see docs/how-to/secure.md. For '
         'nodes in\n       a namespace replace every ns="/" by it. '))
     enclaves = ElementTree.SubElement(root, 'enclaves')
-    for name, own in {**programs(system), 'operator': operator(system)}.items():
+    given = {'system': system}
+    for name, own in {**programs(given), 'operator': operator(given)}.items():
         enclave = ElementTree.SubElement(enclaves, 'enclave', path=f'/koopman_ros/{name}')
         profiles = ElementTree.SubElement(enclave, 'profiles')
         profile = ElementTree.SubElement(profiles, 'profile', ns='/', node=name)
@@ -191,33 +234,53 @@ def policy(system: str = DEFAULT_SYSTEM) -> str:
             + ElementTree.tostring(root, encoding='unicode') + '\n')
 
 
-def help_text(name: str) -> str:
-    """Return what `--help` prints."""
-    program = PROGRAMS[name]
-    rows = tables()[name].rows.values()
-    width = max(len(row.name) for row in rows)
-    parameters = '\n'.join(
-        f'  {row.name:{width}}  {row.description}' + (f' [{row.unit}]' if row.unit else '')
-        for row in rows)
-    lists = ''.join(
-        f'{title}: {", ".join(own)}\n' for title, names in (
+def help_text(name: str, given: Mapping[str, Any] = MappingProxyType({})) -> str:
+    """
+    Return the text that `--help` prints.
+
+    :param given: as for :func:`table_of`.
+    :raises ConfigurationError: if nothing names the signals.
+    """
+    table, system = table_of(name, given), system_of(given)
+    if isinstance(table, plant.PlantTable) and not plant_defaults(system, 'trainer'):
+        signals = table.described
+        given = {**given, 'states_measured': described(signals.states),
+                 'inputs_commanded': described(signals.inputs)}
+    # these know no signals but those of a bundled plant
+    fixed = name == 'replay' or (name == 'player' and not plant_defaults(system, 'trainer'))
+    program = PROGRAMS[name] if fixed else programs(given)[name]
+    lists = '' if fixed else ''.join(
+        _filled(f'{title}: {", ".join(own)}') + '\n' for title, names in (
             ('subscribes to', program.subscribes), ('publishes', program.publishes),
             ('serves', program.serves))
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
-    file = config_directory() / f'{name}.yaml'
     called = f'{name} [--loops file]' if program.many else name
-    many = (f'\nWith --loops, a file of namespaces, one a line, {program.many}. Parameters are\n'
-            f'given by the full name of a node, e.g. /line_1/reactor_3/{name}.\n'
-            ) if program.many else ''
+    many = '\n' + _filled(
+        f'With --loops, a file of namespaces, one a line, {program.many}. Parameters are given by '
+        f'the full name of a node, e.g. /line_1/reactor_3/{name}.', '') + '\n'
+    other = '' if name == 'replay' else (
+        f'For another system: {name} --help --ros-args -p system:=NAME\n')
+    parameters = '\n'.join(_help_row(row) for row in table.rows.values())
     return f"""\
 usage: ros2 run koopman_ros {called} [--ros-args [-p name:=value ...] [--params-file file] ...]
 
 {program.does}
-{many}
-{lists}exit codes: {program.codes}
+{many * bool(program.many)}
+{lists}{_filled(f'exit codes: {program.codes}')}
 
-Parameters for the system {DEFAULT_SYSTEM}, with defaults and ranges in {file}:
-{parameters}"""
+Parameters, with the defaults of the system {system!r}. A file of those of the {DEFAULT_SYSTEM}:
+{config_directory() / f'{name}.yaml'}
+{other}{parameters}"""
+
+
+def _filled(text: str, indent: str = '  ') -> str:
+    return textwrap.fill(text, 99, subsequent_indent=indent, break_on_hyphens=False)
+
+
+def _help_row(row: Specification) -> str:
+    notes = f' ({"; ".join(row.notes)})' if row.notes else ''
+    return (f'  {row.name}: {as_yaml(row.default)} {row.unit}'.rstrip() + notes + '\n'
+            + _filled(f'      {row.description}', '      '))
 
 
 def parameter_file(node: str, system: str = DEFAULT_SYSTEM) -> str:
@@ -228,7 +291,7 @@ def parameter_file(node: str, system: str = DEFAULT_SYSTEM) -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Write all parameter files and the policy, for a plant that has a file in config/plants."""
+    """Write the parameter files and the policy, for a plant with a file in config/plants."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument('--output', type=Path, default=Path('config'))
     parser.add_argument('--system', default=DEFAULT_SYSTEM)

@@ -25,7 +25,7 @@ _SHOWN = 60.0  # s for which a request that was refused or limited is a warning
 
 class OperatorRequests:
     """
-    Pass requests on to the control loop, and say which were refused or limited.
+    Pass requests on to the control loop, and report which were rejected or limited.
 
     :param applied: measured inputs, from which a first manual command begins.
     :param changed: called after each request.
@@ -61,7 +61,7 @@ class OperatorRequests:
             self.setpoint_received = True
             scheduled = any(entry[0] == received.stamp_ns
                             for entry in self._loop.state.setpoint.scheduled)
-            when = f', holds from {received.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
+            when = f', effective from {received.stamp_ns / NANOSECONDS:.3f} s' if scheduled else ''
             unit = self._signals.states[name]
             self._log.info(
                 f'set-point {quantity_text(value, unit)} of {name} accepted{when}',
@@ -95,7 +95,7 @@ class OperatorRequests:
         refused = self._loop.change(event).refused
         self._note = ''
         if refused is not None:
-            self._warn(f'request refused: {self._words(refused)}')
+            self._warn(f'request rejected: {self._words(refused)}')
         return refused is None
 
     def _warn(self, note: str) -> None:
@@ -103,7 +103,7 @@ class OperatorRequests:
         self._log.warning(note, throttle_duration_sec=1.0)
 
     def _limited(self, requested: Array) -> str:
-        """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
+        """Return the message for a manual command (n_u,) outside the limits, or ''."""
         within = self._loop.controller.tuning.limits.within(requested)
         return ', '.join(
             f'manual {base_name(name, unit)} {quantity_text(wanted, unit, ".2f")} is limited to '

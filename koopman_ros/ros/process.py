@@ -6,6 +6,7 @@
 from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
+import re
 import signal
 import sys
 
@@ -78,10 +79,10 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
 
 def events_executor(context: Context | None = None) -> Executor:
     """
-    Return an executor that is told of each message, for nodes without clients.
+    Return an executor that is notified of each message, for nodes without clients.
 
-    rclpy's others set up their wait anew for each message, which takes longer than a control
-    step. The first releases for Jazzy have no other.
+    rclpy's other executors rebuild their wait set for each message, which takes longer than a
+    control step. The first releases for Jazzy have no other.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -93,7 +94,7 @@ def events_executor(context: Context | None = None) -> Executor:
 def run_task(name: str, prepare: Callable[[], Callable[[], int]],
              args: list[str] | None = None) -> int:
     """
-    Run what needs ROS for its parameters and names alone; an interrupt ends it.
+    Run a task that needs ROS for its parameters and names only; an interrupt ends it.
 
     :param prepare: reads them, and returns a task without ROS that returns the exit code, which
         is 1 when it could not start or complete, 2 for an unknown argument.
@@ -116,11 +117,11 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
 
 def take_down(name: str, node: LoopNode | None, executor: Executor | None,
               patience: float = TAKE_DOWN_PATIENCE) -> None:
-    """Take a node down, and the middleware, by force where that takes longer than so many s."""
+    """Take a node down, and the middleware, by force after `patience` s."""
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see
     # docs/explanation/fast_dds_deadlock.md
     disarm = force_exit_after(patience, 0, (
-        f'{name}: the middleware does not shut down: left to the operating system'))
+        f'{name}: the middleware did not shut down: the process is ended'))
     if executor is not None:
         # its threads would call into the interpreter while that ends
         executor.shutdown()
@@ -142,7 +143,7 @@ def init(args: list[str] | None) -> None:
 
 
 def _loops_file(args: list[str] | None) -> str | None:
-    """Return the file of loops that is given alone beside ROS's arguments, or None."""
+    """Return the file of loops if it is the only argument that is not ROS's, or None."""
     try:
         rest = remove_ros_args(args)[1:]
     except RuntimeError:
@@ -150,27 +151,37 @@ def _loops_file(args: list[str] | None) -> str | None:
     return rest[1] if rest[:1] == [_LOOPS] and len(rest) == 2 else None
 
 
+def _given(args: list[str] | None) -> dict[str, str]:
+    """Return the system and the model among the arguments."""
+    found = (re.fullmatch(r'(?:.*:)?(system|model):=(.*)', arg) for arg in (
+        sys.argv if args is None else args))
+    return {match[1]: match[2].strip('\'"') for match in found if match}
+
+
 def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None:
-    """Print the help, or refuse what is not ROS's; return an exit code, or None to go on."""
-    try:
-        rest = remove_ros_args(args)[1:]
-    except RuntimeError:
-        # the start says what is wrong with them
-        return None
-    if not rest or (hosts and _loops_file(args) is not None):
-        return None
-    if '--help' in rest or '-h' in rest:
+    """Print the help, or refuse an unknown argument; return an exit code, or None to start."""
+    if {'--help', '-h'} & {*(sys.argv if args is None else args)}:
         # the tables of all nodes
         from koopman_ros.ros.node_descriptions import help_text
 
         try:
-            print(help_text(name), flush=True)
+            print(help_text(name, _given(args)), flush=True)
+        except ValueError as error:
+            print(f'{name}: {one_line(error)}', file=sys.stderr)
+            return 1
         except BrokenPipeError:
             # `--help | head` stops half-way; the interpreter flushes once more when it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
-          'name:=value; --help says more', file=sys.stderr)
+    try:
+        rest = remove_ros_args(args)[1:]
+    except RuntimeError:
+        # rclpy.init gives the reason
+        return None
+    if not rest or (hosts and _loops_file(args) is not None):
+        return None
+    print(f'{name}: unknown argument {rest[0][:100]!r}: pass parameters as --ros-args -p '
+          'name:=value; see --help', file=sys.stderr)
     return 2
 
 
@@ -184,6 +195,6 @@ def open_to_the_network(environment: Mapping[str, str]) -> str:
         or (environment.get('ROS_SECURITY_ENABLE', '').lower() == 'true'
             and environment.get('ROS_SECURITY_STRATEGY', '') == 'Enforce'))
     return '' if closed else (
-        'open to the network: whoever is on a network of this machine, in ROS domain '
-        f'{environment.get("ROS_DOMAIN_ID") or 0}, can command this node; '
-        'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it to this machine')
+        'open to the network: any machine on the same network can command this node in ROS domain '
+        f'{environment.get("ROS_DOMAIN_ID") or 0}; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
+        'restricts access to this machine')

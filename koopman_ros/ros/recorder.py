@@ -56,7 +56,7 @@ class Recorder:
     """
     Write every message of some topics to a bag, byte for byte, from now until :meth:`close`.
 
-    `known` has type and quality of service of topics before anybody publishes them.
+    `known` has type and quality of service of topics without a publisher so far.
 
     Messages are logged at their receipt by the node's clock. Where `use_sim_time` is set, that is
     the last /clock received before, and recording begins with the first one, as that of
@@ -90,7 +90,7 @@ class Recorder:
         self.look_for_publishers()
 
     def look_for_publishers(self) -> None:
-        """Subscribe to what has become known, matching what its publishers offer."""
+        """Subscribe to newly discovered topics, with their publishers' quality of service."""
         self._look_for_the_clock()
         for topic in list(self._types):
             publishers = self._node.get_publishers_info_by_topic(topic)
@@ -127,11 +127,11 @@ class Recorder:
         if self.simulated:
             waited = time.monotonic() - self._begun
             said = '' if self._now_ns or waited < _CLOCK_PATIENCE else (
-                'nothing is recorded before the first /clock, as use_sim_time is set: publish '
-                '/clock, or set use_sim_time to false')
+                'nothing is recorded before the first /clock message, because use_sim_time is '
+                'set: publish /clock, or set use_sim_time to false')
         elif unstamped and self._node.count_publishers(topics.CLOCK):
-            said = (f'{unstamped[0]} has no stamps and is logged by the wall clock, while /clock '
-                    'is published: start the trainer with use_sim_time set to true')
+            said = (f'{unstamped[0]} has no stamps and is logged in wall time, although /clock is '
+                    'published: start the trainer with use_sim_time set to true')
             # by which a reader sees how fast the plant ran
             self._types.setdefault(topics.CLOCK, Clock)
             self._names.setdefault(topics.CLOCK, topics.CLOCK)
@@ -143,7 +143,7 @@ class Recorder:
         self.complaint = said
 
     def take(self) -> None:
-        """Record what has arrived."""
+        """Record the received messages."""
         self._record_in_order(self._subscriptions)
 
     def flush(self) -> None:
@@ -226,9 +226,9 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
     """
     Return when a message was received, for its place in the recording.
 
-    rmw_fastrtps tells when it arrived; rmw_cyclonedds when it was taken, just after `take_ns`,
-    which puts all that waited on one topic before the next. The sender's time is what is left
-    then, or the nearest time at which the message can have arrived.
+    rmw_fastrtps gives the time of receipt; rmw_cyclonedds when it was taken, just after `take_ns`,
+    which puts all that waited on one topic before the next. The sender's time is used then, or the
+    nearest possible time of receipt.
 
     :param info: received and source timestamp in ns, 0 where unknown.
     :param empty_ns: when nothing waited on its topic for the last time.

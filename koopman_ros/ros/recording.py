@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recording as the trainer does it: starts and stops, names, room on the disk, what went wrong."""
+"""Recording by the trainer: starts and stops, names, disk space, errors."""
 
 from collections.abc import Callable
 import contextlib
@@ -65,7 +65,7 @@ class Recording:
         if output == wanted:
             self._node.get_logger().info(said)
         else:
-            said += f', because {wanted} exists already'
+            said += f', because {wanted} already exists'
             self._node.get_logger().warning(said)
         return said
 
@@ -84,7 +84,7 @@ class Recording:
         return self._path
 
     def complete(self) -> None:
-        """Complete the bag, if there is one, with all that has arrived, and say what it holds."""
+        """Complete an open bag with all received messages, and report its content."""
         if self._recorder is not None:
             with contextlib.suppress(OSError):
                 self.stop()
@@ -104,7 +104,7 @@ class Recording:
         return recorder
 
     def _attempt(self, work: Callable[[Recorder], None]) -> None:
-        """Do a part of the recording, or else give it up: what was flushed stays readable."""
+        """Run a part of the recording; an error ends it, flushed messages stay readable."""
         if self._recorder is None:
             return
         try:
@@ -148,7 +148,7 @@ class Recording:
         folder = next(parent for parent in output.absolute().parents if parent.is_dir())
         free = shutil.disk_usage(folder).free / _MEGABYTE
         return '' if free >= limit else (
-            f'{free:.0f} MB are free on the disk of {folder}, below min_free_disk = '
+            f'{free:.0f} MB are free on the disk of {folder}, less than min_free_disk = '
             f'{limit:.10g} MB')
 
     def _status(self) -> TaskReport:

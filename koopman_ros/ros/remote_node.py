@@ -31,7 +31,7 @@ class RemoteNode:
     """
     Another node of a fixed name, which may come and go.
 
-    :param services: types of the services that are called, beside those of parameters, by name.
+    :param services: types of the called services, in addition to those of parameters, by name.
     :param on_parameters: called with all parameters when they have changed.
     """
 

@@ -31,7 +31,7 @@ T = TypeVar('T')
 
 @dataclass(frozen=True, slots=True)
 class SignalSample:
-    """What a message says of some signals."""
+    """The values of some signals in a message."""
 
     stamp: Time  #: of the message, or of its arrival where it has none
     frame_id: str  #: of the message, or empty
@@ -57,8 +57,8 @@ def by_topic(places: Mapping[str, MessageField]) -> Iterator[tuple[str, Any, lis
         names = [name for name, place in places.items() if place.topic == topic]
         if len(kinds := dict.fromkeys(places[name].type for name in names)) > 1:
             raise ConfigurationError(
-                f'{" and ".join(names)} share the topic {topic} and differ in the type of its '
-                f'messages, {" and ".join(kinds)}: give them one type, or topics of their own')
+                f'{" and ".join(names)} share the topic {topic} but have different message types, '
+                f'{" and ".join(kinds)}: use one type, or separate topics')
         for name in names:
             try:
                 kind = topics.message_class(places[name].type)
@@ -72,11 +72,11 @@ def _converted(name: str, unit: str, wanted: str) -> Conversion:
     try:
         return conversion(unit, wanted)
     except ValueError as error:
-        raise ConfigurationError(f'{name}: {error}: name another unit') from error
+        raise ConfigurationError(f'{name}: {error}: set another unit') from error
 
 
 def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., None]:
-    """Return a callback to which rclpy hands a message with what the middleware says of it."""
+    """Return a callback to which rclpy passes a message with its middleware information."""
     def hear(*arrived: Any) -> None:
         # rclpy's EventsExecutor of Jazzy hands over both as one tuple
         message, info = arrived if len(arrived) == 2 else arrived[0]
@@ -92,8 +92,8 @@ class SignalSubscriber:
     """
     Subscribe to some signals.
 
-    A number that its type of message cannot mean, as a temperature below absolute zero, is NaN;
-    a message without any of the signals is somebody else's and passed over.
+    A number that its type of message cannot mean, as a temperature below absolute zero, is NaN; a
+    message without any of the signals is ignored.
 
     Both ends raise ConfigurationError for a place that is in no message of its type.
 
@@ -134,7 +134,7 @@ class SignalSubscriber:
                                     info['publication_sequence_number']))
 
     def published(self) -> bool:
-        """Tell whether anybody publishes one of the topics."""
+        """Whether one of the topics is published."""
         return any(self._node.count_publishers(own.topic_name) for own in self.subscriptions)
 
 
@@ -146,7 +146,7 @@ class MeasuredInputs:
         self._last: dict[str, tuple[int, float]] = {}  # stamp in ns and value
 
     def take(self, received: SignalSample) -> None:
-        """Take what a message says."""
+        """Process a message."""
         self._last |= {name: (received.stamp_ns, value) for name, value in received.values.items()}
 
     def get(self, name: str) -> tuple[float, float]:
@@ -244,7 +244,7 @@ class SignalPublisher:
         return [publisher for publisher, *_ in self._parts]
 
     def has_subscribers(self) -> bool:
-        """Tell whether anybody subscribes to one of the topics."""
+        """Whether one of the topics has a subscriber."""
         return any(map(topics.has_subscribers, self.publishers))
 
     def send(self, values: Array, stamp: Time, frame_id: str, variances: Array | None = None,
@@ -252,8 +252,9 @@ class SignalPublisher:
         """
         Publish values (n,), of which NaN stands for none.
 
-        :param variances: (n,) in the squares of their units, for types that tell; 0 for unknown.
-        :param resolutions: (n,) of what measured them, in their units; 0 for every value.
+        :param variances: (n,) in the squares of their units, for types with a variance; 0 for
+            unknown.
+        :param resolutions: (n,) of their sensors, in their units; 0 for every value.
         """
         for publisher, message, header, own in self._parts:
             for i, place, converted in own:

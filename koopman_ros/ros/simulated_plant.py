@@ -48,7 +48,7 @@ class SimulatedPlant:
         self.process = self.process.until(time_ns)
 
     def skip_to(self, time_ns: int) -> None:
-        """Set its time, which stood still."""
+        """Set its time, which did not advance."""
         self.process = replace(self.process, time_ns=max(time_ns, self.process.time_ns))
 
     def command(self, values: Array) -> None:
@@ -83,4 +83,4 @@ class SimulatedPlant:
         """Return states and inputs with their names and units."""
         inputs = {base_name(name, unit): unit for name, unit in self.signals.inputs.items()}
         return {**values_by_name(self.signals.states, self.process.x.tolist()),
-                **values_by_name(inputs, self.process.u.tolist())}
+                **values_by_name(inputs, self.process.applied.tolist())}

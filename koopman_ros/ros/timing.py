@@ -52,7 +52,7 @@ class Timing:
     def arrive(self, stamp_ns: int, at: tuple[float, int, int], window: float,
                two_sources: bool = False) -> Advance:
         """
-        Take down that a measurement has arrived at a time; return what its stamp is.
+        Note the receipt of a measurement; return the relation of its stamp to the last.
 
         :param window: shortest time between two restarts of the stamps, in s; 0 for any.
         :param two_sources: whether two are known otherwise.
@@ -107,24 +107,24 @@ class Timing:
 
     @property
     def without_clock(self) -> bool:
-        """Whether `use_sim_time` is set and nobody publishes the time."""
+        """Whether `use_sim_time` is set and /clock is not published."""
         waited = time.monotonic() - self._begun
         return self._simulated and self._sim_now() == 0 and waited > _CLOCK_PATIENCE
 
     def no_news(self, within: float) -> Advance | None:
-        """Return why the last measurement was no news, if it came within so many seconds."""
+        """Return why the last measurement was not newer, if it was received within `seconds`."""
         if self._ignored is None or self._since(*self._ignored[:2]) > within:
             return None
         return self._ignored[2]
 
     @property
     def paused(self) -> bool:
-        """Whether /clock has stood still for much longer than between two measurements."""
+        """Whether /clock has not advanced for much longer than between two measurements."""
         return self._ticked[0] > 0 and time.monotonic() - self._ticked[1] > max(
             PAUSED, 3.0 * self._spacing)
 
     def busy_silence(self, seconds: float) -> float:
-        """Return the silence of a node that was busy so long, in which nobody read /clock."""
+        """Return the silence of a node that was busy for a time, in which /clock was not read."""
         return max(self.silence, seconds if self._simulated else 0.0)
 
     @property

@@ -73,7 +73,7 @@ def expected_topics(wiring: SignalTopics) -> dict[str, tuple[Any, QoSProfile]]:
 
 
 def unusable(node: Node, names: Collection[str]) -> str:
-    """Say which name a node cannot make a topic of, as with a substitution; '' for none."""
+    """Return which name is not valid for a topic, as with a substitution; '' for none."""
     for name in names:
         try:
             validate_topic_name(name)
@@ -88,7 +88,7 @@ def unusable(node: Node, names: Collection[str]) -> str:
 
 
 def profile(depth: int, *, reliable: bool, latched: bool = False) -> QoSProfile:
-    """Return a quality of service that keeps the last messages, so many of them."""
+    """Return a quality of service that keeps the last `depth` messages."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -97,7 +97,7 @@ def profile(depth: int, *, reliable: bool, latched: bool = False) -> QoSProfile:
 
 def matching_profile(usual: QoSProfile, publishers: Collection[TopicEndpointInfo], depth: int
                      ) -> QoSProfile:
-    """Ask for reliability and history only where every publisher offers them."""
+    """Request reliability and history only where every publisher offers them."""
     offers = [info.qos_profile for info in publishers] or [usual]
     return profile(
         depth,
@@ -112,19 +112,19 @@ def message_class(type_name: str) -> Any:
         return load_plugin(f'{package}.{kind}:{name}', 'message type', {})
     except ValueError as error:
         raise LookupError(
-            f'message type {type_name!r} is not installed here: source its workspace') from error
+            f'message type {type_name!r} is not installed: source its workspace') from error
 
 
 class EndpointMonitor:
     """
-    Make a node's publishers and subscriptions, and say which others conflict or do not match.
+    Make a node's publishers and subscriptions, and report which others conflict or do not match.
 
     That is looked for twice a second, or less often where many loops share the process: each look
     asks the whole graph. The events of the middleware for it cost more than the answer to a
     message.
 
     :param on_change: called when the complaint is another.
-    :param exclusive: what is done on topics on which only one node may publish, in words.
+    :param exclusive: the verb phrase for topics on which only one node may publish.
     """
 
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
@@ -139,11 +139,11 @@ class EndpointMonitor:
 
     @property
     def complaint(self) -> str:
-        """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
+        """Names topic, nodes, problem and remedy; conflicts first; or is empty."""
         return next(filter(None, self._last_complaints), '')
 
     def shared(self, topic: str) -> bool:
-        """Tell whether several nodes publish on a topic on which only one may."""
+        """Whether several nodes publish on a topic on which only one may."""
         return self._shared.get(topic, False)
 
     def subscribe(self, topic: str, callback: Callable[[Any], Any], kind: Any = None,
@@ -195,15 +195,15 @@ class EndpointMonitor:
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
                        if info.topic_type in kinds)
         return '' if len(names) < 2 else (
-            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; end all but one')
+            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; stop all but one')
 
     def _complaints(self, own: Publisher | Subscription) -> list[str]:
         topic, kind = own.topic_name, type_name(own.msg_type)
         subscribes = isinstance(own, Subscription)
         publishers = self._node.get_publishers_info_by_topic(topic)
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)
-        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, here it is '
-                f'{kind}: end that node, or remap its topic'
+        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, this node for '
+                f'{kind}: stop that node, or remap its topic'
                 for other in (*publishers, *subscriptions) if other.topic_type != kind]
         for other in publishers if subscribes else subscriptions:
             offered, requested = _explicit(own.qos_profile), _explicit(other.qos_profile)
@@ -218,7 +218,7 @@ class EndpointMonitor:
                            'reliability:=best_effort')
             said.append(
                 f'{topic}: {node_name(other)} {"publishes" if subscribes else "subscribes"} with '
-                'an incompatible quality of service, so that no message passes: '
+                'an incompatible quality of service, so no messages are received: '
                 f'{reason.replace("ERROR: ", "").strip(";")}; {remedy}')
         return said
 
@@ -235,7 +235,7 @@ def _explicit(profile: QoSProfile) -> QoSProfile:
 
 
 def has_subscribers(publisher: Publisher) -> bool:
-    """Tell whether anybody subscribes: writing for nobody takes as long as for somebody."""
+    """Whether there is a subscriber: publishing without one takes as long."""
     return publisher.get_subscription_count() > 0
 
 

@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 import os
 import sys
-import time
 from typing import Any
 
-import numpy as np
 from std_srvs.srv import Trigger
 
 from koopman_ros.core.message_fields import MessageField
@@ -21,6 +19,7 @@ from koopman_ros.execution.training import (
     JobState,
     scalars,
     TrainingJob,
+    TrainingProgress,
 )
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.signal_topics import plant_defaults, SignalTopics, system_of
@@ -31,8 +30,6 @@ from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode
 
 POLL_PERIOD = 0.1  # s between two looks at a training
-_LINE_PERIOD = 5.0  # s between plain lines of progress
-_BAR_WIDTH = 30
 
 
 def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
@@ -52,8 +49,6 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: SignalTopic
         return os.path.abspath(model_path(model)) if model else ''
 
     states, inputs = wiring.signals.states, wiring.signals.inputs
-    gains = np.reshape(settings.input_matrix, (-1, len(inputs))).tolist() if (
-        settings.input_matrix != (0.0,)) else []
     return {
         'bags': [os.path.abspath(bag) for bag in bags],
         'output': os.path.abspath(settings.model_output),
@@ -68,33 +63,7 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: SignalTopic
                         inputs.items(), settings.delay.tolist(), strict=True)],
         'setpoints': settings.setpoint_ranges(wiring.signals),
         'tolerance': settings.synchronisation_tolerance,
-        'input_gain': {state: dict(zip(inputs, row, strict=True))
-                       for state, row in zip(states, gains, strict=False)},
-        **settings.training()}
-
-
-class TrainingProgress:
-    """
-    How far a training is: a bar on a terminal, else a line every five seconds.
-
-    :param say: prints such a line.
-    """
-
-    def __init__(self, say: Callable[[str], object]) -> None:
-        self._say = say
-        self._last_line = time.monotonic()
-
-    def show(self, state: JobState) -> None:
-        """Show a state of the training."""
-        if sys.stderr.isatty():
-            full = round(_BAR_WIDTH * state.share)
-            bar = '#' * full + '-' * (_BAR_WIDTH - full)
-            text, end = ('', '\n') if state.ended else (state.text, '')
-            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
-                  file=sys.stderr, flush=True)
-        elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
-            self._last_line = time.monotonic()
-            self._say(f'{100.0 * state.share:.0f} %: {state.text}')
+        **settings.training(wiring.signals)}
 
 
 class Training:
@@ -115,12 +84,12 @@ class Training:
         self._timer = wall_timer(node, POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
-        """Start a training and say from what; ValueError without a bag, OSError of the system."""
+        """Start a training, return a message; ValueError without a bag, OSError of the system."""
         settings = self.settings
         bags = [bag for bag in (settings.bags if any(settings.bags) else (self._recorded(),))
                 if bag]
         if not bags:
-            raise ValueError('there is no bag to train from: record one, or name it in bags')
+            raise ValueError('no bag to train from: record one, or set bags')
         self._job = TrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
         self._progress = TrainingProgress(self._node.get_logger().info)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Threads beside a busy executor: one commands in its place, one ends the process in time."""
+"""Threads for a busy executor: one commands in its place, one ends the process in time."""
 
 from collections.abc import Callable
 import os
@@ -19,9 +19,9 @@ _PATIENCE = 5.0  # s from a signal to the end of a callback, or of the start
 
 class Watchdog:
     """
-    Does what the executor's timer would, whenever the executor does not come to it.
+    Acts in place of the executor's timer whenever the executor is too busy.
 
-    It counts its own looks: time in which the whole process stood still does not count.
+    It counts its own looks: time in which the whole process was suspended does not count.
 
     :param act: called in the thread of the watchdog with the seconds for which the executor has
         been busy; its exception is raised again in the executor, by :meth:`beat`.
@@ -65,7 +65,7 @@ class Watchdog:
 
 
 def end_in_time(name: str) -> Callable[[], None]:
-    """End the process by force when it is busy 5 s after a signal; return what takes it back."""
+    """End the process by force if it is busy 5 s after a signal; return a cancel function."""
     # Python's handlers run in the main thread alone, between two instructions of its own; a byte
     # comes through the pipe whatever that thread is doing
     reader, writer = os.pipe()
@@ -80,7 +80,7 @@ def end_in_time(name: str) -> Callable[[], None]:
             # the pipe stays open, for the byte of a second signal
             if number:
                 disarm = force_exit_after(_PATIENCE, 1, (
-                    f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force'))
+                    f'{name}: still busy {_PATIENCE:g} s after a signal: the process is ended'))
                 over.wait()
                 disarm()
 

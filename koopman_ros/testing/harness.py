@@ -35,12 +35,12 @@ T = TypeVar('T')
 
 
 class HarnessError(RuntimeError):
-    """What was waited for did not come, or a process ended otherwise than it should."""
+    """An expected condition was not met, or a process ended with an unexpected code."""
 
 
 class Harness:
     """
-    Start processes in a ROS domain that nobody else uses, and talk to them from a node in here.
+    Start processes in a ROS domain of their own, and communicate with them from a node here.
 
     ::
 
@@ -53,10 +53,10 @@ class Harness:
     Leaving the context ends all processes, by force in the end, and raises HarnessError when one
     of them ends with another code than 0. They end, too, when this process is killed.
 
-    :param folder: for what the processes print, a file each; must exist.
+    :param folder: for the output of the processes, a file each; must exist.
     :param environment: variables for the processes, on top of the present ones.
     :param name: of the node in here.
-    :param timeout: in s, after which what is waited for has failed.
+    :param timeout: in s, after which a wait fails.
     :param lasting: whether no process may end by itself, not even with code 0.
     :param domain: ROS domain to work in, with this process's settings of discovery; by default one
         that no other run uses.
@@ -128,7 +128,7 @@ class Harness:
         return process
 
     def printed(self) -> str:
-        """Return what all processes printed."""
+        """Return the output of all processes."""
         return '\n'.join(f'{process.log.name}: {process.output()}' for process in self.processes)
 
     def wait_for_end(self, process: NodeProcess) -> int:
@@ -145,10 +145,10 @@ class Harness:
     def wait_until(self, condition: Callable[[], T], what: str | Callable[[], str] = '',
                    timeout: float | None = None) -> T:
         """
-        Let the node work until a condition holds, and return what it returned.
+        Let the node work until a condition holds, and return its value.
 
-        :param what: what is waited for, or what there is instead, for the error.
-        :raises HarnessError: after the timeout, or when a process ends that was not told to.
+        :param what: the awaited condition, or the present state, for the error.
+        :raises HarnessError: after the timeout, or when a process ends unexpectedly.
         """
         patience = self._timeout if timeout is None else timeout
         deadline = time.monotonic() + patience
@@ -178,9 +178,9 @@ class Harness:
         """
         Wait until the last status of a task meets a condition.
 
-        A status comes on a topic of its own, later or sooner than what else a node answers with.
-        The condition has to hold for no status from before, e.g. by a count that it carries; what
-        a test asserts of one status belongs into one condition.
+        A status has its own topic, and is received before or after other messages of the node. The
+        condition has to hold for no status from before, e.g. by a count that it carries; all
+        assertions on one status belong into one condition.
         """
         def met() -> DiagnosticStatus | None:
             last = self.last_status(name)
@@ -205,7 +205,7 @@ class Harness:
 
     def speak(self, kind: Any, topic: str, qos: QoSProfile = LOOP_QOS, *,
               to: str, subscribers: int = 1) -> Publisher:
-        """Return a publisher that a node and, with it, so many subscribers hear from the start."""
+        """Return a publisher after a node, and a number of subscribers, have connected."""
         publisher = self.node.create_publisher(kind, topic, qos)
         self.wait_until(lambda: publisher.get_subscription_count() >= subscribers)
         self.meet(to)

@@ -67,7 +67,7 @@ class NodeProcess:
         return self.process.poll() is None
 
     def output(self) -> str:
-        """Return what the process has printed so far."""
+        """Return the output of the process so far."""
         return self.log.read_text(errors='replace')
 
     def send(self, number: int) -> None:
@@ -149,9 +149,9 @@ def isolated_domain() -> Iterator[dict[str, str]]:
     """
     Reserve a ROS domain on loopback that no other run on this machine uses.
 
-    Yields the environment variables of the run, which hold for this process, too, until the end.
-    A middleware that RMW_IMPLEMENTATION names stays, else it is Fast DDS, whose profile keeps
-    everything on 127.0.0.1 and says what else it is for.
+    Yields the environment variables of the run, which hold for this process, too, until the end. A
+    middleware that RMW_IMPLEMENTATION names stays, else it is Fast DDS, whose profile keeps all
+    traffic on 127.0.0.1 and lists its other purposes.
 
     :raises RuntimeError: when all domains are taken.
     """
@@ -229,7 +229,7 @@ def reserved_output(wanted: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _reservation(name: str) -> Iterator[bool]:
-    """Hold a name on this machine; yields whether nobody else holds it."""
+    """Hold a name on this machine; yields whether it was free."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
         mine = True
         try:

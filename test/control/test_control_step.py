@@ -231,7 +231,7 @@ def test_a_full_schedule_refuses_more_but_not_what_holds_at_once():
     state = started(loop, *((316.0, NOW + (n + 1) * SECOND) for n in range(1000)))
     full, refused = loop.request_setpoint(state, np.array([317.0]), NOW + 2000 * SECOND)
     assert full is state
-    assert say(refused).startswith('1000 set-points are scheduled already: wait')
+    assert say(refused).startswith('1000 set-points are already scheduled')
     state, refused = loop.request_setpoint(state, np.array([317.0]))
     assert refused is None
     np.testing.assert_array_equal(state.setpoint.requested, [317.0])

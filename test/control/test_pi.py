@@ -26,7 +26,7 @@ from studies.general.systems import SADDLE
 GAIN, TIME = 2.0, 20.0
 PLANT = ControlAffineSystem(
     'lag', ('x',), ('K',), ('u',), ('K',), 's', lambda x: -0.05 * x,
-    lambda x: np.full((*x.shape, 1), -0.05), np.array([[0.05]]), np.zeros(1), np.zeros(1))
+    np.array([[0.05]]), np.zeros(1), np.zeros(1))
 
 
 def signals_alone(names=('x',), low=-50.0, high=50.0, inputs=('u',)):

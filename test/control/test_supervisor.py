@@ -83,7 +83,7 @@ def test_a_longer_hold_timeout_does_not_revoke_the_safe_input():
 
 def test_reasons_tell_what_is_waited_for():
     recovering = walk([BEST, LINEAR, *[BEST] * 12])
-    assert say(recovering[5].reason) == f'{say(FAR)} (over, waiting for it to stay so)'
+    assert say(recovering[5].reason) == f'{say(FAR)} (cleared; waiting for recovery_time)'
     assert recovering[-1].reason is None
     assert say(walk([HOLD] * 62)[-1].reason) == f'{say(NO_LAW)}; held for longer than 60 s'
     # under the safe input for another reason, a hold is not said to last longer than it does
@@ -313,7 +313,7 @@ def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range
     words = rests_outside(narrowed)
     assert 'under coolant_temperature.safe_value = 5 degC' in words
     assert 'leaves the trained range' in words
-    assert ('record data from there and train again, or set coolant_temperature.safe_value = 25.8'
+    assert ('record data there and train again, or set coolant_temperature.safe_value = 25.8'
             ) in words
     assert rests_outside(controller(narrow(), safe_value=np.array([holding + 0.1]))) == ''
     # and one that drives the reactor up

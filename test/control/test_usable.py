@@ -49,7 +49,7 @@ def test_a_model_loads_where_nothing_is_said_against_it(
 @pytest.mark.parametrize(('ends', 'words'), [
     ([2, 0, 6], '26.85 degC, is outside .* record coolant_temperature down to 26.85 degC'),
     ([2, 7, 6], '54.85 degC, is outside .* record coolant_temperature up to 54.85 degC'),
-    ([-1, 2, 6], 'begins at -5 K, which cannot be')])
+    ([-1, 2, 6], 'begins at -5 K, which is impossible')])
 def test_reason_has_the_figure_and_the_remedy(ends: list[int], words: str) -> None:
     model = replace(SHIPPED, inputs=moved(SHIPPED.inputs, ends, 'coolant_temperature'))
     with pytest.raises(AssertionError, match=words):

@@ -59,12 +59,12 @@ def test_every_code_has_its_words() -> None:
     assert say(reason(StatusCode.HELD_TOO_LONG, timeout=60.0, cause=reason(
         StatusCode.OUTSIDE_SENSOR, signal='T', value=473.15, lower=273.15, upper=373.15))) == (
             'the measured T 200.00 degC is outside the range of the sensor, 0.00 degC to '
-            '100.00 degC: check it; held for longer than 60 s')
+            '100.00 degC: check the sensor; held for longer than 60 s')
 
 
 @pytest.mark.parametrize('unit', ['Kelvin', 'l/mn', 'm/', 'metre metre2'])
 def test_unit_that_there_is_not_is_named(unit):
-    with pytest.raises(ValueError, match=f"there is no unit '{unit}': write one like K"):
+    with pytest.raises(ValueError, match=f"there is no unit '{unit}': use e.g. K"):
         check_unit(unit)
     for one in ('K', 'L/min', 'N m', '%', '%/s', 'ppm', '1', 'm^3/s', '', '(m/s)**2', 'kg/(m*s)',
                 'm^-0.5', '°C', 'ft_H2O', 'm²'):
@@ -77,7 +77,7 @@ def test_unit_that_there_is_not_is_named(unit):
 def test_text_that_the_library_would_skip_or_work_at_for_ever_is_no_unit(unit: str) -> None:
     with pytest.raises(ValueError, match='there is no unit'):
         check_unit(unit)
-    with pytest.raises(ValueError, match='is not written as a unit'):
+    with pytest.raises(ValueError, match='is not a valid unit'):
         conversion('m', unit)
-    with pytest.raises(ValueError, match='is not written as a unit'):
+    with pytest.raises(ValueError, match='is not a valid unit'):
         conversion(unit, 'm')

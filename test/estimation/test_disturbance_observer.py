@@ -213,7 +213,7 @@ def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
 @pytest.mark.parametrize(('value', 'words'), [
     (math.nan, 'the measured temperature is nan, not finite: check the sensor'),
     (math.inf, 'is inf, not finite'),
-    (1e300, 'outside the range of the sensor, 253.15 K to 423.15 K: check it'),
+    (1e300, 'outside the range of the sensor, 253.15 K to 423.15 K: check'),
     (-0.0, 'the measured temperature -0 K is outside the range of the sensor'),
     (START + 30.0, 'to 354.475 K in 1 s, at most 2 K and 2 K/s are possible: check the sensor'),
 ])

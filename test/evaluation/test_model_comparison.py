@@ -128,6 +128,16 @@ def test_models_are_told_apart_by_one_output_of_two(other, accepted):
     assert bool(np.all(found.ratio <= 2.0)) is accepted
 
 
+@pytest.mark.parametrize(('known', 'accepted'), [(4.5, True), (5.0, True), (0.0, False)])
+def test_models_are_told_apart_by_their_dead_time(known, accepted):
+    u = random_steps(301, 1)
+    late = two_lags(np.concatenate((np.tile(u[:1], (5, 1)), u[:-5])))
+    present, candidate = (replace(model(), dead_time=np.array([dead])) for dead in (5.0, known))
+    found = compare(present, candidate, recent(late + 3.0, u + 3.0, 200.0).windows(200.0))
+    assert found.tells
+    assert bool(np.all(found.ratio <= 2.0)) is accepted
+
+
 def test_steady_noise_tells_nothing():
     noise = 0.1 * np.random.default_rng(3).normal(size=(300, 2))
     held = np.full((300, 1), 3.0)

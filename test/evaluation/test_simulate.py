@@ -38,8 +38,8 @@ def random_pair() -> tuple[ControlAffineSystem, LiftedModel]:
     A, B = rng.normal(size=(2, 2)) + 0.3 * np.eye(2), rng.normal(size=(2, 2)) + 2.0 * np.eye(2)
     system = ControlAffineSystem(
         'random pair', ('x1', 'x2'), ('1', '1'), ('u1', 'u2'), ('1/min', '1/min'), 'min',
-        lambda x: x @ A.T, lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)), B, np.zeros(2),
-        np.zeros(2))
+        lambda x: x @ A.T, B, np.zeros(2), np.zeros(2),
+        drift_jacobian=lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)))
     scale = np.array([1.0, 2.0])
     states, inputs = (
         Coordinates(names, units, np.zeros(2), scale, -10.0 * scale, 10.0 * scale)
@@ -358,8 +358,8 @@ PUSHING = failing(lambda x: 1.8 * SCALE * x / (0.6 * INPUTS.scale))
 
 @pytest.mark.parametrize(('start', 'others', 'failure', 'earliest', 'latest'), [
     # noticed at the end of a step
-    (0.4, {'law': PUSHING, 'escape': 2.0}, 'the state escaped', np.log(5.0) - 10.0 / 300, 4.0),
-    (3.0, {'escape': 2.0}, 'the state escaped', 0.0, 1.0),
+    (0.4, {'law': PUSHING, 'escape': 2.0}, 'the state diverged', np.log(5.0) - 10.0 / 300, 4.0),
+    (3.0, {'escape': 2.0}, 'the state diverged', 0.0, 1.0),
     # a law with a jump at the set-point keeps the steps tiny
     (0.1, {'law': failing(lambda x: -5.0 * np.sign(x)), 'max_evaluations': 500},
      'the law was evaluated 500 times before the end', 0.0, 10.0),
@@ -412,8 +412,8 @@ SHAFT = linear_model()
     ({'x_ref': 3.0}, 'incompatible set-point: expected one number for each of x0, x1, got 3.0'),
     ({'x_ref': [3.0], 'controlled': ()}, 'incompatible set-point: expected one number for each'),
     # 0 = 0.4 a + b + 0.2 v and 0 = -0.3 a - 0.5 b + 1.5 v hold a and b on a line
-    ({'x_ref': [3.4, 2.0]}, r'no input of the model holds x0, x1 at \[3\.4, 2\.0\]; the nearest '
-                            r'steady state is \[.*\]: choose another set-point, or name in contr'),
+    ({'x_ref': [3.4, 2.0]},
+     r'no input of the model holds x0, x1 at \[3\.4, 2\.0\]; the nearest steady state is'),
     ({'x0': 3.0}, r'incompatible x0: expected \(2,\), got \(\)'),
     ({'x0': [3.0, np.nan]}, 'x0 must be finite'),
     ({'weights': Weights(np.eye(1), np.eye(1))}, r'incompatible Q: expected \(2, 2\), got \(1,'),
@@ -431,7 +431,7 @@ def test_a_loop_of_what_does_not_fit(change, message):
     ([[1.0, 2.0], [0.0, 1.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
     ([[1.0, 2.0], [2.0, 1.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
     ([[0.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
-    ([[np.nan]], [[1.0]], r'Q must be finite: entry \[0, 0\] is nan'),
+    ([[np.nan]], [[1.0]], r'Q must be finite, but entry \[0, 0\] is nan'),
     ([[1.0]], [[0.0]], r'R must be symmetric, positive definite, got \[\[0\.0\]\]'),
     ([[1.0]], [[-1.0]], 'R must be symmetric, positive definite')])
 def test_weights_that_are_none(Q, R, message):

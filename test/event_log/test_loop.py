@@ -186,14 +186,14 @@ def test_own_model_is_found_where_it_lies_now(tmp_path: Path) -> None:
     name = str(tmp_path / 'gone' / 'own.safetensors')
     for place in (tmp_path, path):
         assert find_model([place], name, digest).provenance == model.provenance
-    with pytest.raises(records.RecordError, match=r'own.safetensors \(SHA-256 .* neither shipped'):
+    with pytest.raises(records.RecordError, match=r'own.safetensors \(SHA-256 .* neither bundled'):
         find_model([config_directory() / 'models'], name, digest)
 
 
 @pytest.mark.parametrize(('text', 'words'), [
-    *((text, 'is no record of a controller') for text in (
+    *((text, 'is not a record of a controller') for text in (
         '', '[]', '{}', '{"version":1,"run":"a","number":"x","event":"start"}', '[' * 100_000)),
-    ('{"version":2}', 'are of version 2, this package')])
+    ('{"version":2}', 'version 2, this package')])
 def test_text_that_is_no_record(text: str, words: str) -> None:
     with pytest.raises(records.RecordError, match=words):
         records.parse(text)
@@ -205,21 +205,21 @@ def event(measured: object) -> dict[str, object]:
 
 @pytest.mark.parametrize(('place', 'change', 'words'), [
     (0, lambda fields: fields.pop('state'), 'record 0 of run a cannot be replayed'),
-    (0, lambda fields: fields['state'].update({'@': 'os:system'}), "'os:system' is not known"),
+    (0, lambda fields: fields['state'].update({'@': 'os:system'}), "unknown class 'os:system'"),
     (0, lambda fields: fields['state'].update(extra=1), 'unexpected keyword'),
     (0, lambda fields: fields['state'].update(command={
         '@': 'array', 'dtype': '<f8', 'shape': [3], 'values': [1.0, 2.0, 3.0]}), 'record 0'),
-    (0, lambda fields: fields['model'].update(digest='0' * 64), 'neither shipped nor found'),
+    (0, lambda fields: fields['model'].update(digest='0' * 64), 'neither bundled nor found'),
     (0, lambda fields: fields['parameters'].update({'coolant_temperature.weight': -1.0}),
-     r'refuses .coolant_temperature\.weight = -1\.0'),
+     r'rejects .coolant_temperature\.weight = -1\.0'),
     (0, lambda fields: fields['parameters'].update(other=1.0), 'parameters other, which this'),
     # what has a default may be missing, as in a later version
     (0, lambda fields: fields['state'].pop('mode'), ''),
-    (1, {'event': 'unheard'}, "the event 'unheard' is not known"),
-    (1, {'fields': event({})}, 'is no list of numbers'),
+    (1, {'event': 'unheard'}, "unknown event 'unheard'"),
+    (1, {'fields': event({})}, 'is not a list of numbers'),
     (1, {'fields': event([])}, 'record 1 of run a cannot be replayed'),
     (1, {'fields': {}}, 'record 1 of run a cannot be replayed'),
-    (1, {'number': 0}, 'record 0 of run a comes again, or after record 0'),
+    (1, {'number': 0}, 'record 0 of run a is repeated'),
 ])
 def test_record_that_does_not_fit(place: int, change: Any, words: str) -> None:
     controller = Recorded()

@@ -156,14 +156,14 @@ def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
 
     with cluster(1) as lost, Cluster(lost.scheduler_address) as place:
         work = place.run(until_lost, {'a': 0}, watch=lambda name, _: bool(name) and lost.close())
-        with pytest.raises(SchedulerLost, match='is lost: start it'):
+        with pytest.raises(SchedulerLost, match='lost the connection'):
             list(work)
 
 
 @pytest.mark.parametrize('text', [
     'joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
 def test_other_names_are_refused(text):
-    with pytest.raises(ValueError, match=f'executor is {text!r}, must be empty for this process'):
+    with pytest.raises(ValueError, match=f'executor is {text!r}, must be empty'):
         backend_of(text)
     table = trainer_table(None, {
         'system': 'own', 'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})

@@ -49,9 +49,9 @@ def follow(job: TrainingJob) -> Iterator[JobState]:
 
 
 @pytest.mark.parametrize(('step', 'number', 'code', 'words'), [
-    ('starting', signal.SIGKILL, -signal.SIGKILL, 'the training process was killed by SIGKILL: '
-     'see whether the memory suffices, and train again'),
-    ('estimating', signal.SIGTERM, 1, 'cancelled, nothing was written')])
+    ('starting', signal.SIGKILL, -signal.SIGKILL,
+     'the training process was killed by SIGKILL: check the free memory, and train again'),
+    ('estimating', signal.SIGTERM, 1, 'cancelled; nothing was written')])
 def test_process_that_gets_a_signal(
         task: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str,
         number: int, code: int, words: str) -> None:
@@ -75,7 +75,7 @@ def test_process_that_gets_a_signal(
      'print(\'{"progress": 0.25, "text": "learning"}\', flush=True); '
      'raise RuntimeError("the core melts")', 0.25, 'code 1: RuntimeError: the core melts'),
     ('import no_such_torch', 0.0, "No module named 'no_such_torch'): pip install torch"),
-    ('import os, signal; os.kill(os.getpid(), signal.SIGXCPU)', 0.0, 'a day of processor time'),
+    ('import os, signal; os.kill(os.getpid(), signal.SIGXCPU)', 0.0, 'day of processor'),
     # before it has read its task
     ('raise SystemExit("no time")', 0.0, 'code 1: no time')])
 def test_process_that_breaks_down(
@@ -116,7 +116,7 @@ def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) ->
     next(follow(job))
     job.close()
     assert job.process.returncode == -signal.SIGKILL
-    assert job.poll().text == 'cancelled, nothing was written'
+    assert job.poll().text == 'cancelled; nothing was written'
 
 
 def test_figures_of_signals_are_told_one_by_one() -> None:
@@ -127,8 +127,8 @@ def test_figures_of_signals_are_told_one_by_one() -> None:
     summary = {'accepted': True, 'model_class': 'free lift', 'model_file': 'new',
                'units': {'low': 'm', 'high': 'Pa'}, 'heldout_error': {'low': 0.25, 'high': 3.0},
                'heldout_error_of_present_lift': {'low': 1.0, 'high': 3.0}}
-    words = training._in_words(summary)
-    assert 'accepted: error on held-out records 0.25 m in low, 3 Pa in high, that' in words
+    words = training.outcome_text(summary)
+    assert '0.25 m in low, 3 Pa in high, that' in words
     assert '1 m in low, 3 Pa in high' in words
     summary['heldout_error_of_present_lift']['low'] = None
-    assert 'infinite, as it diverges' in training._in_words(summary)
+    assert 'infinite (diverges)' in training.outcome_text(summary)

@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import Stopped
-from koopman_ros.learning.record import read_record
-from support.long_records import bags_of, drift_error, source, task
+from koopman_ros.learning.record import read_record, reduced
+from koopman_ros.plants import describe
+from koopman_ros.records import loop_episodes, read, Record
+from support.long_records import bags_of, drift_error, source, SYSTEM, task
 from support.long_records import SAMPLES as LENGTH
 from support.quick_retraining import page_of, quick_retraining
 
@@ -62,8 +65,33 @@ def test_a_short_record_is_taken_whole(bags: list[Path]) -> None:
     assert [len(one) for one in found.episodes] == [LENGTH, LENGTH]
     # a bag that is named twice is read once, here and there
     twice = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH - 1000, 0)
-    assert twice.account.notes[0] == f'{bags[0]} is named twice: read once'
+    assert twice.account.notes[0] == f'{bags[0]} is listed twice: read once'
     assert twice.account.used == 2 * LENGTH
+
+
+def test_a_record_in_memory_is_reduced_to_the_same_segments(bags: list[Path]) -> None:
+    one = source(bags[:1])
+    episodes, account = loop_episodes(one.bags, one.states, one.inputs)
+    record = Record(describe(SYSTEM), tuple(episodes), account, one.bags)
+    streamed, found = read_record(one, 1000, 5), reduced(record, 1000, 5)
+    assert found.reduction == streamed.reduction
+    for own, other in zip(found.episodes, streamed.episodes, strict=True):
+        assert np.array_equal(own.x, other.x)
+
+
+def test_a_record_with_missing_values_is_reduced_without_averages() -> None:
+    time = 0.1 * np.arange(4000)
+    lab = np.where(np.arange(4000) % 20 == 0, np.cos(0.01 * time), np.nan)
+    record = read({'time': time, 'level': np.sin(0.01 * time), 'lab': lab, 'pump': time},
+                  ['level', 'lab'], 'pump')
+    found = reduced(record, 1000, 0)
+    assert found.reduction is not None
+    assert (found.reduction.group, found.reduction.samples) == (1, 4000)
+    assert found.reduction.used <= 1000
+    every = np.concatenate([one.x for one in found.episodes])
+    # the extremes are among them
+    assert np.nanmax(every, axis=0) == pytest.approx(np.nanmax(record.episodes[0].x, axis=0))
+    assert np.isnan(every[:, 1]).mean() == pytest.approx(0.95, abs=0.01)
 
 
 def test_reading_can_be_stopped(bags: list[Path], tmp_path: Path) -> None:

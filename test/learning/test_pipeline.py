@@ -133,7 +133,8 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
 def test_report(accepted):
     retrained, _, _ = accepted
     files = write_report(retrained)
-    assert [path.name for path in files] == ['new.json', 'new.md', 'new.png']
+    assert [path.name for path in files] == [
+        'new.json', 'new.md', 'new.png', 'new.free_run.png']
     figures = json.loads(files[0].read_text())
     assert figures == retrained.summary()
     assert figures['accepted'] is True
@@ -146,6 +147,7 @@ def test_report(accepted):
                   f'| the present model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
+    assert figures['free_runs']['record']['fit_percent']['temperature'] > 95.0
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
     assert diverging.summary()['heldout_error_of_present_lift'] == {'temperature': None}

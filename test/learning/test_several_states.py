@@ -120,7 +120,7 @@ def test_summary_and_report_name_the_signals(retrained):
     assert 0.25 < figures['coverage']['pump_1, pump_2'] < 0.5
     metrics = load(retrained.model_file).provenance.metrics
     assert metrics['noise_level_2'] == figures['noise']['level_2']
-    page, picture = write_report(retrained)[1:]
+    page, picture, _ = write_report(retrained)[1:]
     assert '| prediction by | error of level_1 [m] | error of level_2 [m] |' in page.read_text()
     assert picture.read_bytes().startswith(b'\x89PNG')
 
@@ -184,7 +184,7 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
     assert np.sort(modes) == pytest.approx(np.sort(truth), rel=0.25)
     assert found.decision.rmse[0] < 2.0 * LEVEL_NOISE
     page = page_of(found)
-    assert 'of the next measurement foreseen' in page
+    assert 'Errors of simulations, at samples left out of the fit' in page
     assert ', 1 state not measured' in page
 
 
@@ -215,7 +215,7 @@ def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
         assert scalars(figures)[f'constant {name}'] == one['text'] == constant_lines(figures)[name]
     page = page_of(by_equations)
     for words in ('| constant | unit | estimate | standard error |', '| pump_gain | m^3/(s V) |',
-                  'of the next measurement foreseen'):
+                  'of the predicted next measurement'):
         assert words in page
 
 
@@ -223,7 +223,7 @@ def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
     ({'physical_model': 'two_tanks', 'unmeasured_states': 1}, 'set unmeasured_states to 0'),
     ({'physical_model': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
     ({'constants': {'orifice_1': None}},
-     'constants name orifice_1, but there is no physical_model')])
+     'constants name orifice_1, but no physical_model is given')])
 def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
         resolve_signals(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)

@@ -64,6 +64,7 @@ MODELS = {
         with_origin(plant='R\xfchrkessel \u53cd\u5fdc', method='m' * 200, seed=2 ** 128 - 1),
         states=replace(PLAIN.states, units=('\N{DEGREE SIGN}C', 'K'))),
     'untrained': with_origin(seed=None, metrics={}),
+    'dead time': replace(random_lift(n_u=2), dead_time=np.array([0.0, 12.3])),
     'largest': random_lift(32, 32, identity=False, n_free=32, n_u=32),
     'linear': linearised_model(np.diag([-1.0, -2.0]), np.ones((2, 1)), PLAIN.states,
                                PLAIN.inputs, 's', PLAIN.provenance),
@@ -174,6 +175,10 @@ HUGE, INFINITE = 10 ** 400, float('inf')
 # Changes of a part of the description, and words of the refusal.
 DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
     ('', {'identity': 1}, 'identity must be a bool'), ('', {'identity': False}, 'incompatible A'),
+    *(('', {'dead_time': value}, words) for value, words in (
+        (3.0, 'dead_time must be a list'), ([1.0, 2.0], 'incompatible dead_time'),
+        ([-0.1], 'dead time of u0 must be 0 to 3600 s'), ([9e4], 'got 90000 s'),
+        ([INFINITE], 'dead_time must be finite'), ([None], ''))),
     ('', {'time_unit': 'h'}, 'time_unit'), ('', {'states': []}, ''), ('', {'provenance': 3}, ''),
     ('states', {'units': ['K']}, 'incompatible units'),
     ('states', {'names': ['T'], 'units': ['K']}, 'incompatible center'),
@@ -182,26 +187,26 @@ DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
         [None, 1.0], [INFINITE, 1], [[1], [1, 2]], {'x': 1}, [HUGE, 1], [[1, 2], [3, 4]])),
     ('states', {'scale': [0.0, 1.0]}, 'scale must be positive'),
     ('inputs', {'lower': [4.0]}, 'the box is empty'),
-    ('states', {'names': ['x\ud800', 'x1']}, 'cannot be shown'),
-    ('states', {'units': ['K', 'K\n']}, 'cannot be shown'),
+    ('states', {'names': ['x\ud800', 'x1']}, 'unprintable'),
+    ('states', {'units': ['K', 'K\n']}, 'unprintable'),
     ('states', {'units': ['K', 'm" :title="(alert(1))" a="']}, 'no unit'),
     ('states', {'units': ['K', 'm # a']}, 'no unit'),
     ('states', {'units': ['9**9**9', 'K']}, 'no unit'),
-    ('states', {'names': ['x' * 900_000, 'x1']}, 'at most 100'),
-    ('states', {'names': [7, 'x1']}, 'must be a text'),
+    ('states', {'names': ['x' * 900_000, 'x1']}, 'maximum is 100'),
+    ('states', {'names': [7, 'x1']}, 'must be a string'),
     *(('provenance', change, word) for change, word in (
         ({'seed': '1'}, 'seed'), ({'seed': -1}, 'seed'), ({'seed': True}, 'seed'),
         ({'seed': HUGE}, 'seed'), ({'metrics': []}, ''), ({'metrics': {'rw': HUGE}}, ''),
         ({'metrics': {'rw': 'good'}}, ''), ({'metrics': {'rw': np.nan}}, 'not finite'),
-        ({'metrics': {'\ud800': 1.0}}, 'cannot be shown'),
-        ({'metrics': {f'm{i}': 1.0 for i in range(101)}}, 'at most 100'),
-        ({'data_digest': '\ud800'}, 'cannot be shown'), ({'plant': ['a']}, 'must be a text'),
-        ({'method': '\x1b[2J'}, 'cannot be shown'), ({'method': 'm' * 4001}, 'at most 4000'),
-        ({'package_version': '0\0'}, 'cannot be shown'), ({'magic': 1}, 'magic'),
+        ({'metrics': {'\ud800': 1.0}}, 'unprintable'),
+        ({'metrics': {f'm{i}': 1.0 for i in range(101)}}, 'maximum is 100'),
+        ({'data_digest': '\ud800'}, 'unprintable'), ({'plant': ['a']}, 'must be a string'),
+        ({'method': '\x1b[2J'}, 'unprintable'), ({'method': 'm' * 4001}, 'maximum is 4000'),
+        ({'package_version': '0\0'}, 'unprintable'), ({'magic': 1}, 'magic'),
         ({'model_class': 'magic'}, 'model_class must be one of'),
         ({'accepted': 'yes'}, 'accepted must be a bool'), ({'accepted': False}, 'reasons'),
         ({'reasons': ['too large']}, 'reasons'), ({'accepted': False, 'reasons': 'x'}, 'list'),
-        ({'accepted': False, 'reasons': ['a\nb']}, 'cannot be shown')))]
+        ({'accepted': False, 'reasons': ['a\nb']}, 'unprintable')))]
 ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     *(('network', {name: np.full_like(value, number)}, 'must be finite')
       for number in (np.nan, np.inf)
@@ -259,11 +264,11 @@ def test_metadata_of_another_format_is_refused(path, sound, metadata, words):
 
 
 LARGE = {
-    'n_z is 33, at most 32': random_lift(n_free=31),
-    'n_x is 33, at most 32': random_lift(33, identity=False),
-    'n_u is 33, at most 32': random_lift(n_u=33),
-    'must be a text': with_origin(plant=3),
-    'cannot be shown': with_origin(method='a\nb'),
+    'n_z is 33': random_lift(n_free=31),
+    'n_x is 33': random_lift(33, identity=False),
+    'n_u is 33': random_lift(n_u=33),
+    'must be a string': with_origin(plant=3),
+    'unprintable': with_origin(method='a\nb'),
     'not finite': with_origin(metrics={'rw': np.inf}),
 }
 

@@ -237,7 +237,7 @@ def test_monomials_of_a_total_degree(n_x, degree, exponents):
     ([[0, 1], [1, 0]], ValueError, 'must be the states'),
     ([[1, 0]], ValueError, 'must be the states'),
     ([[1], [2], [0]], ValueError, 'constant'),
-    ([[1], [3], [2], [3]], ValueError, r'the row \[3\] of exponents comes 2 times'),
+    ([[1], [3], [2], [3]], ValueError, r'the row \[3\] of exponents'),
 ])
 def test_exponents_that_do_not_fit_are_refused(exponents, error, message):
     with pytest.raises(error, match=message):

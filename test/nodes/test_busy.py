@@ -103,7 +103,7 @@ def test_watchdog_commands_while_the_control_step_is_busy(ros: Harness, tmp_path
     busy = bench.get_busy(2.03)
     ros.wait_until(lambda: bench.commands[-1].temperature == SAFE)
     ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR and (
-        'as the node is busy: the safe coolant is commanded' in s.message))
+        'because the node is busy: the safe coolant is commanded' in s.message))
     assert not bench.answered(2.03)
     own = bench.commands[1:]
     stamps = np.array([seconds(message) for message in bench.commands[:-1]])
@@ -136,7 +136,7 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
     bench.wait_for_watchdog()
     bench.pipe.unlink()
     busy.close()
-    ros.wait_until(lambda: 'a measurement is not answered' in bench.process.output())
+    ros.wait_until(lambda: 'no command for a measurement' in bench.process.output())
     assert not bench.answered(2.03)
     bench.thermometer.publish(temperature(STEADY, 3.03))
     ros.wait_until(lambda: bench.answered(3.03))
@@ -146,7 +146,7 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
     code = bench.process.stop()
     busy.close()
     assert code == 1
-    assert 'controller: busy for 0.2 s after a signal: ended by force' in bench.process.output()
+    assert 'controller: still busy 0.2 s after a signal' in bench.process.output()
 
 
 def test_watchdog_acts_only_without_a_beat_and_tells_its_errors() -> None:

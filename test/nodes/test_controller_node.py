@@ -64,7 +64,7 @@ def test_odd_stamps_are_answered_with_themselves_and_a_long_frame_id_is_cut(
     assert bench.answer_to(message).header.frame_id == 'x' * 256
     status = bench.ros.wait_for_status(STATUS, lambda s: 'frame_id' in s.message)
     assert status.level == DiagnosticStatus.WARN
-    assert 'has 100000 characters; only the first 256 are passed on' in status.message
+    assert 'has 100000 characters; only the first 256 are forwarded' in status.message
     assert bench.measure(STEADY, 3.0).header.frame_id == ''
     bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
 
@@ -108,7 +108,7 @@ def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
     status = bench.status(lambda s: 'set-point' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert 'set-point 80.00 degC is outside the trained range' in status.message
-    assert 'the old one is kept' in status.message
+    assert 'the previous one is kept' in status.message
     # a plotting tool that does not match hides it no more than it hides that
     latched = bench.ros.node.create_subscription(
         Temperature, reactor.PREDICTED_TEMPERATURE, lambda _: None, topics.LATCHED_QOS)
@@ -192,10 +192,10 @@ def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
     for k in range(60):
         # a thermometer that does not follow: the observer takes it for a plant that is cooled
         bench.measure(STEADY - 8.0 - 0.01 * (k % 2), 2.0 + k)
-    status = bench.status(lambda s: 'would need' in s.message)
+    status = bench.status(lambda s: 'would have to be' in s.message)
     assert status.level == DiagnosticStatus.WARN
-    needed = re.search(r'the set-point would need the coolant at ([\d.]+) degC, its range is 5 to '
-                       r'32: it is not reached', status.message)
+    needed = re.search(r'the set-point is not reached: the coolant would have to be ([\d.]+) '
+                       r'degC, but its range is 5 to 32', status.message)
     assert needed, status.message
     assert float(needed[1]) > 32.0
 
@@ -229,9 +229,9 @@ def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
     bench.measure(STEADY, last + 4.0)
     assert value(bench.status(), 'missed measurements') == str(missed + 3)
     bench.ros.set_parameters('controller', max_measurement_age=1.0)
-    status = bench.status(lambda s: 'old when they arrive' in s.message)
+    status = bench.status(lambda s: 'old on receipt' in s.message)
     assert status.level == DiagnosticStatus.WARN
-    assert 'at most 1 s are expected' in status.message
+    assert 'max_measurement_age allows 1 s' in status.message
 
 
 def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are_reported(
@@ -341,10 +341,10 @@ def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
     for name in ('controller', 'controller_2'):
         # names come a moment after their topics
         status = ros.wait_for_status(f'{name}: control', lambda s: (
-            'end all but one' in s.message and 'UNKNOWN' not in s.message))
+            'stop all but one' in s.message and 'UNKNOWN' not in s.message))
         assert status.level == DiagnosticStatus.WARN
         assert status.message == (
-            '2 nodes command the coolant: /controller, /controller_2; end all but one')
+            '2 nodes command the coolant: /controller, /controller_2; stop all but one')
     assert '2 nodes command the coolant' in second.output()
     assert second.stop() == 0
     ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)

@@ -51,7 +51,7 @@ def test_demo_says_in_one_line_why_it_cannot_run(
     (tmp_path / 'taken').write_text('a file, not a folder')
     for options, words in ((['--output', str(tmp_path / 'taken')], str(tmp_path / 'taken')),
                            (['--plant', 'volcano', '--output', str(tmp_path)],
-                            "no demo of 'volcano': choose one of fed_reactor, pendulum")):
+                            "no demo for the plant 'volcano': choose one of fed_reactor,")):
         assert setpoint_demo.main(options) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith('demo: ')
@@ -108,7 +108,7 @@ def test_demo_interrupted_in_its_loop_keeps_what_it_recorded(tmp_path: Path) -> 
         assert taken == wanted
         assert demo.stdout is not None
         assert demo.stdout.readline() == (
-            f'another run writes to {wanted}: this one writes to {wanted}-2\n')
+            f'another run is writing to {wanted}: writing to {wanted}-2\n')
         assert any(said.lstrip().startswith('1.0 ') for said in demo.stdout)
         demo.send_signal(signal.SIGINT)
         # a second one while the first is handled

@@ -36,7 +36,7 @@ SIGNALS = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperat
 SAFE = round(to_celsius(float(TABLE.snapshot({}).safe_value[0])), 9)
 PRESENT = PlantTable().system(PlantTable().snapshot({})).nominal_input[0]  # K
 IDLE = {'record_at_start': False}
-LOST = 'the trainer does not command any more'
+LOST = 'the trainer has released the inputs'
 
 
 class Bench:
@@ -160,7 +160,8 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     assert bench.answer() != pytest.approx(SAFE, abs=0.5)
     assert value(bench.status('running'), 'topic') == JACKET
 
-    assert bench.ask(False)[1] == 'ended: coolant to 18.85 degC, held there; call again to let go'
+    assert bench.ask(False)[1] == ('ended: coolant to 18.85 degC, held there; call again with '
+                                   'data: false to release the inputs')
     bench.status('ended; coolant to 18.85 degC')
     for _ in range(20):
         bench.answer()
@@ -209,12 +210,12 @@ def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Be
     assert status.level == DiagnosticStatus.ERROR
     # found, perhaps, before its name is
     assert status.message.removeprefix('aborted: ') in (
-        '/bench publishes on /unit_1/jacket, too',
-        'another node publishes on /unit_1/jacket, too')
+        '/bench also publishes on /unit_1/jacket',
+        'another node also publishes on /unit_1/jacket')
     ros.wait_until(lambda: ros.node.count_publishers(JACKET) == 1)
     assert ros.wait_until(lambda: '/bench publishes' in (answer := bench.start())[1]
                           and answer) == (
-        False, 'refused: /bench publishes on /unit_1/jacket: end it, or choose another '
+        False, 'refused: /bench publishes on /unit_1/jacket: stop it, or choose another '
         'experiment_signal')
     ros.node.destroy_publisher(other)
 

@@ -116,7 +116,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
     ros.meet('trainer')
     # who asks for set-points beside the experiment is in its way; its name may be known later
     said = ros.set_bool(SERVICE, True).message
-    assert re.match('refused: (/bench|another node) publishes on /level_1/setpoint: end it, or '
+    assert re.match('refused: (/bench|another node) publishes on /level_1/setpoint: stop it, or '
                     'choose', said)
     for name, publisher, level in zip(LEVELS, asked, before, strict=True):
         publisher.publish(JointState(name=[name], position=[float(level)]))
@@ -154,8 +154,8 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
     assert result.successful, result.reason
     assert ros.set_bool(SERVICE, True).success
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
-    assert re.fullmatch(r'aborted: the controller tracks [0-9.]+ m where [0-9.]+ m is requested: '
-                        'choose set-points that it can hold', status.message)
+    assert re.fullmatch(r'aborted: the controller tracks [0-9.]+ m instead of the requested [0-9.]'
+                        '+ m: choose set-points that it can hold', status.message)
     ros.wait_until(lambda: ros.node.count_publishers(f'{LEVELS[0]}/setpoint') == 0)
 
     # in manual mode it moves nothing
@@ -185,13 +185,13 @@ def test_setpoints_that_nobody_tracks_refuse_the_start(ros: Harness, tmp_path: P
         f'{name}.setpoint_{end}': bound for name in LEVELS
         for end, bound in (('min', 0.1), ('max', 0.2))})
     assert bench.start(0.15, 0.25)[1] == (
-        'refused: nobody publishes on /pump_1_setpoint: start the controller and switch it to '
+        'refused: /pump_1_setpoint is not published: start the controller and switch it to '
         'automatic mode')
     ros.node.create_publisher(JointState, 'pump_1_setpoint', topics.LOOP_QOS)
     # until the graph tells the trainer
-    said = ros.wait_until(lambda: 'tracked' in (said := bench.start(0.15, 0.25)[1]) and said)
+    said = ros.wait_until(lambda: 'unknown' in (said := bench.start(0.15, 0.25)[1]) and said)
     assert said == (
-        'refused: for 1 s it is not known which set-points are tracked: switch the controller to '
+        'refused: the active set-points have been unknown for 1 s: switch the controller to '
         'automatic mode, and check sensor and plant')
 
 

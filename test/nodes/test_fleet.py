@@ -36,8 +36,7 @@ def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
     assert 'is accepted' in lines['/a']
     assert lines['/lost'] == (
         f"training failed: bag '{tmp_path}/none.mcap' does not exist: check the path")
-    assert lines['/bare'] == ('cannot be retrained: there is no bag to train from: name it in '
-                              'bags')
+    assert lines['/bare'] == 'cannot be retrained: no bag to train from: set bags'
     assert lines['trainer'] == '1 of 2 new models are accepted'
     assert load(tmp_path / 'a.safetensors').states.names == ('temperature',)
     assert not (tmp_path / 'lost.safetensors').exists()

@@ -182,5 +182,5 @@ def test_process_of_which_no_loop_is_left_ends(ros: Harness, tmp_path: Path) -> 
     assert process.output().count('cannot start: no model file at nowhere.safetensors') == 2
     process = start(ros, 'controller', ('a', 'b'), '-r', '__ns:=/elsewhere')
     assert ros.wait_for_end(process) == 1
-    assert 'controller: cannot start: -r __ns:=/elsewhere would put all loops there' in (
+    assert 'controller: cannot start: -r __ns:=/elsewhere would apply to all loops' in (
         process.output())

@@ -16,6 +16,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo import reactor
+from koopman_ros.event_log.records import parse, state_of
 from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
@@ -185,7 +186,7 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     # code that was not named at the start
     for name, code in (('fallback_order', ['sdre', 'json:dumps']), ('estimator', 'this:s')):
         (result,) = ros.set_parameters('controller', **{name: code})
-        assert 'fixed at start' in result.reason
+        assert 'at start-up: restart' in result.reason
     bad = tmp_path / 'bad.safetensors'
     bad.write_text('nonsense')
     for model, words in ((str(bad), str(bad)),
@@ -239,6 +240,17 @@ def test_controller_goes_on_from_the_last_command(ros: Harness) -> None:
         assert loop.commands[count].temperature == pytest.approx(8.0, abs=1.0 + 1e-9)
         assert ros.set_bool('controller/set_automatic', False).success
         ros.wait_until(loop.answered)
+    # what was commanded before may still act
+    assert ros.set_parameters(
+        'controller', **{'coolant_temperature.dead_time': 600.0})[0].successful
+    for _ in range(3):
+        ros.wait_until(loop.answered)
+    assert change(ros, 'controller', 'deactivate')
+    records.clear()
+    assert change(ros, 'controller', 'activate')
+    ros.wait_until(lambda: records)
+    assert len(state_of(parse(records[0].data)).applied.times_ns) > 3
+    ros.wait_until(loop.answered)
     # a measured input is where it starts from, also one that is not what was commanded
     assert change(ros, 'controller', 'deactivate')
     count = len(loop.commands)
@@ -299,7 +311,7 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT))
     assert change(ros, 'trainer', 'deactivate')
     ros.wait_until(asked.done)
-    assert asked.result().message == 'refused: it was ended before the first measurement'
+    assert asked.result().message == 'refused: it was stopped before the first measurement'
 
     record = ros.node.create_client(SetBool, 'trainer/record')
     ros.wait_until(record.service_is_ready)
@@ -309,7 +321,7 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     assert not [s for s in ros.statuses if s.name.startswith('trainer')]
     assert len(loop.commands) == count
     (result,) = ros.set_parameters('trainer', physical_model='this:s')
-    assert 'fixed at start' in result.reason
+    assert 'at start-up: restart' in result.reason
     assert ros.set_parameters('trainer', **{'coolant_temperature.safe_value': 10.0})[0].successful
     assert change(ros, 'trainer', 'configure')
     assert change(ros, 'trainer', 'activate')

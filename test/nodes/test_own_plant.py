@@ -32,7 +32,7 @@ PAGE = (ROOT / 'docs' / 'tutorials' / 'own_plant.md').read_text()
 RECORD, SIMULATE, TRAIN, CONTROL, RUN, *_ = (
     (node, tuple(shlex.split(text))) for node, text in re.findall(
         r'^ros2 run koopman_ros (\w+) --ros-args (--params-file .*)$', PAGE, re.MULTILINE))
-ACCEPTED = r'the new model \(.+?\) is accepted: error on held-out records ([\d.]+) K, ' \
+ACCEPTED = r'the new model \(.+?\) is accepted: its error on held-out data is ([\d.]+) K, ' \
     r'that of the best linear model ([\d.]+) K; written to (\S+\.safetensors)'
 
 
@@ -125,13 +125,14 @@ class Failing:
 
 
 @pytest.mark.parametrize(('program', 'given', 'words'), [
-    (plant, {'system': 'ovn'}, ("there is no plant 'ovn': choose one of", 'workspace sourced')),
-    (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check module')),
+    (plant, {'system': 'ovn'}, ("plant 'ovn': choose one of", 'workspace sourced')),
+    (plant, {'system': 'no_oven:Oven'},
+     ('cannot be loaded (ModuleNotFoundError', 'check the name')),
     (plant, {'system': 'bad_oven:Empty'}, ('must be a ControlAffineSystem', 'method system')),
-    (plant, {'system': 'bad_oven:Failing'}, ('cannot be built (ZeroDivisionError', 'its class')),
+    (plant, {'system': 'bad_oven:Failing'}, ('cannot be constructed', 'correct the class')),
     (trainer, {}, ('the measured signals and inputs of the system', "like ['level [m]']")),
     (trainer, {**SIGNALS, 'states_measured': '["temperature [Kelvin]"]'},
-     ("there is no unit 'Kelvin'", 'write one like K')),
+     ("there is no unit 'Kelvin'", 'use e.g. K')),
     (controller, {**SIGNALS, 'model': 'reactor_nz4'},
      ('has states temperature [K] and inputs power [W]', 'choose a model of that system',
       '-p "system:=\'\'"')),

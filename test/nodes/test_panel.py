@@ -105,13 +105,14 @@ def opened(url: str, *headers: str) -> str:
 
 
 @pytest.mark.parametrize(('parameters', 'words'), [
-    ({'host': '0.0.0.0'}, "'0.0.0.0' without passwords"), ({'users': 'nowhere'}, 'No such file'),
+    ({'host': '0.0.0.0'}, "'0.0.0.0' without passwords"),
+    ({'users': 'nowhere'}, "users = 'nowhere' cannot be read"),
     ({'alarm_file': '/proc/alarms'}, "alarm_file = '/proc/alarms'"),
     ({'trusted_proxy': '[proxy.example]'}, "trusted_proxy = 'proxy.example' must be an address"),
     ({'trusted_proxy': '[127.0.0.1]'}, 'trusted_proxy needs users'),
     ({'tls_certificate': 'here.pem'}, 'tls_certificate and tls_key'),
     ({'tls_certificate': 'a.pem', 'tls_key': 'b.pem'}, "tls_certificate = 'a.pem'"),
-    ({'temperature.shown_unit': 'm'}, "temperature.shown_unit = 'm' must be a unit"),
+    ({'temperature.shown_unit': 'm'}, "temperature.shown_unit = 'm' must have the dimension"),
     ({'controlled': '[nothing]'}, "controlled = ['nothing'] must name"),
 ])
 def test_a_bad_parameter_is_named_in_one_line(
@@ -292,7 +293,7 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     # services of the trainer
     assert desk.ask('record', TRAINER, False).accepted
     assert desk.ask('cancel', TRAINER) == Answer(False, 'not training')
-    desk.wait(lambda: {'setpoint', 'mode', 'parameter'} <= {
+    desk.wait(lambda: {'set-point', 'mode', 'parameter'} <= {
         mark.kind for mark in node.view.trends.marks(0.0, 1e12)})
     assert controller.stop() == 0
     desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))

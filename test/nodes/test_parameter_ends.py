@@ -83,7 +83,7 @@ def cases(table: str) -> list[dict[str, Any]]:
 def usable_for_itself(reason: str) -> bool:
     """Tell whether a value is refused that its range has: next to nothing, or the only weight."""
     return ' = 5e-324' in reason or (
-        'temperature.weight = 0.0 1/K^2' in reason and ' cannot be used: ' in reason)
+        'temperature.weight = 0.0 1/K^2' in reason and ' is not usable:  ' in reason)
 
 
 @contextlib.contextmanager

@@ -158,7 +158,7 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
     ros.set_parameters('plant', **{'constants.heat_transfer_coefficient': reactor.constant(
         'heat_transfer_coefficient')})
     # also where none ever came
-    status = ros.wait_for_status(STATUS, lambda s: 'no command arrives' in s.message)
+    status = ros.wait_for_status(STATUS, lambda s: 'no command is received' in s.message)
     assert status.level == DiagnosticStatus.WARN
     command = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
     command.publish(temperature(26.0))
@@ -170,7 +170,7 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
     """Of the two-state reactor, which stays at its steady state."""
     def wait() -> None:
         status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
-        assert status.message == 'waiting for the loop: no controller yet'
+        assert status.message == 'waiting for a controller or trainer to subscribe'
 
     concentrations = ros.listen(JointState, reactor.CONCENTRATION)
     bench = Bench(ros, wait, system='two_state', speed=20.0, sample_period=0.5, start_time=7.0)
@@ -199,7 +199,7 @@ def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> 
         f'reset to temperature {initial:.6g} degC, coolant {NOMINAL_COOLANT:.6g} degC')
     bench.resume()
     assert bench.wait_for_more(1)[0].temperature == pytest.approx(initial, abs=0.5)
-    bench.status(lambda s: s.message == 'finished: the duration is over')
+    bench.status(lambda s: s.message == 'finished: simulated duration reached')
     ros.wait_until(lambda: len(bench.measured) >= 301)
     assert [seconds(message) for message in bench.measured] == pytest.approx(
         [10.0 + 0.7 * k for k in range(301)], abs=1e-9)
@@ -222,7 +222,7 @@ def test_stamps_and_frames_that_a_message_can_hold() -> None:
     for parameters, words in (
             ({'start_time': 2147483648.0}, 'must be in [0.001, 2147483647] s'),
             ({'start_time': 2e9, 'duration': 1e9}, 'start_time + duration = 3000000000 s must be'),
-            ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, must have at most 256')):
+            ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, the maximum is 256')):
         assert words in TABLE.check(TABLE.snapshot(parameters))
 
 
@@ -336,11 +336,11 @@ def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
         intruder.create_publisher(Temperature, f'/{topic}', topics.LOOP_QOS)
     # names come a moment after their topics
     status = bench.ros.wait_for_status(STATUS, lambda s: (
-        s.message.count('end all but one') == 2 and 'UNKNOWN' not in s.message))
+        s.message.count('stop all but one') == 2 and 'UNKNOWN' not in s.message))
     assert status.level == DiagnosticStatus.WARN
     assert status.message == (
-        '2 nodes command the coolant: /bench, /elsewhere/intruder; end all but one; '
-        '2 nodes publish the temperature: /elsewhere/intruder, /plant; end all but one')
+        '2 nodes command the coolant: /bench, /elsewhere/intruder; stop all but one; '
+        '2 nodes publish the temperature: /elsewhere/intruder, /plant; stop all but one')
     intruder.destroy_node()
     status = bench.status(lambda s: s.level == DiagnosticStatus.OK)
     assert status.message == 'running'

@@ -234,11 +234,11 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
 
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'bag': 'none.mcap'}, "cannot start: bag 'none.mcap' does not exist"),
-    ({'topics': ['pressure']}, 'no message on /pressure: choose topics among /temperature'),
+    ({'topics': ['pressure']}, 'no message on /pressure: choose from /temperature'),
     ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
-    ({'wait_timeout': 0.1}, '/temperature found no counterpart within 0.1 s: start the'),
+    ({'wait_timeout': 0.1}, '/temperature found no subscriber or publisher within 0.1 s'),
     ({'wait_for_subscribers': 0, 'rate': 0.0, 'answer_timeout': 0.1},
-     'no command for the measurement at 1.000 s within 0.1 s: is the controller alive?'),
+     'no command for the measurement at 1.000 s within 0.1 s: check that the controller'),
     ({'bag': 'damaged.mcap', 'rate': 1000.0, 'wait_for_subscribers': 0}, 'is damaged'),
 ])
 def test_what_cannot_be_played_is_refused_in_one_line(

@@ -165,7 +165,7 @@ def test_best_effort_publisher_is_recorded_under_the_next_free_name(
     assert values(recorded(second)) == list(range(20))
     shared.node.destroy_publisher(publisher)
     assert [path.read_text() for path in bag.iterdir()] == ['precious']
-    assert f'recording to {second}, because {bag} exists already' in shared.printed()
+    assert f'recording to {second}, because {bag} already exists' in shared.printed()
 
 
 def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Path) -> None:
@@ -175,13 +175,13 @@ def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Pa
     (result,) = ros.set_parameters('trainer', min_free_disk=1e9)
     assert result.successful
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
-    assert 'below min_free_disk = 1000000000 MB; free some space and call' in status.message
+    assert 'less than min_free_disk = 1000000000 MB; free some space and call' in status.message
     assert values(recorded(bag)) == list(range(900))
     ros.node.destroy_publisher(publisher)
 
     refused = ros.set_bool('trainer/record', True)
     assert not refused.success
-    assert 'below min_free_disk = 1000000000 MB: free some space' in refused.message
+    assert 'less than min_free_disk = 1000000000 MB: free some space' in refused.message
     ros.set_parameters('trainer', min_free_disk=0.0)
     again = ros.set_bool('trainer/record', True)
     assert again.success

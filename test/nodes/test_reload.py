@@ -119,7 +119,7 @@ def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None
             put(next(bad), file)
             for done, reason in (bench.reload(), bench.set(file)):
                 assert not done
-                assert reason.startswith(f'the old model is kept: {file}')
+                assert reason.startswith(f'the current model is kept: {file}')
         put(contents[name], file)
         done, reason = bench.reload() if k % 2 else bench.set(file)
         assert done, reason
@@ -163,7 +163,7 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
     before = measure()
     done, reason = bench.set(file)
     assert not done
-    assert reason.startswith('the old model is kept: ')
+    assert reason.startswith('the current model is kept: ')
     assert 'load_refused_model' in reason
     status = ros.wait_for_status(STATUS, lambda s: s.message == reason)
     assert status.level == DiagnosticStatus.WARN
@@ -228,9 +228,9 @@ def test_model_that_predicts_what_was_measured_much_worse_is_refused(
     assert bench.set(file)[0]
 
     save(replace(SHIPPED, B=-SHIPPED.B), file)
-    why = (r'the old model is kept: the model predicts temperature of the last 400 s with an '
+    why = (r'the current model is kept: the model predicts temperature of the last 400 s with an '
            r'error of (\S+) K, the present one with (\S+) K, at most (\S+) K are allowed: train '
-           r'it again with more data, or set model_check_factor = 0 to load it all the same')
+           r'it again with more data, or set model_check_factor = 0 to load it anyway')
     for done, reason in (bench.reload(), bench.set(f'{file.parent}/./{file.name}')):
         assert not done
         found = re.fullmatch(why, reason)
@@ -286,7 +286,7 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     # closing it lets the reader go on
     slow = opened(ros, disk(file))
     (result,) = ros.set_parameters('controller', model=str(dead))
-    assert result.reason.startswith(f'the old model is kept: {dead} is still being read')
+    assert result.reason.startswith(f'the current model is kept: {dead} is still being read')
     for _ in range(50):
         bench.measure()
     ros.wait_until(lambda: len(bench.commands) == 50)
@@ -314,7 +314,7 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     slow.close()
     ros.wait_until(reloaded.done)
     assert not reloaded.result().success
-    assert 'the model was changed to reactor_linear' in reloaded.result().message
+    assert 'reactor_linear became the current model' in reloaded.result().message
     ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_linear')
     # the other is still being read when the process is told to end
     assert ros.processes[0].stop() == 0
@@ -329,9 +329,10 @@ def test_dead_disk_does_not_pile_up_readers(
     for path in (file, *others):
         os.mkfifo(disk(path))
     assert bench.reload() == (
-        False, f'the old model is kept: {file} was not read within 0.02 s: check its disk')
+        False, f'the current model is kept: {file} was not read within 0.02 s: check its disk')
     assert bench.reload() == (
-        False, f'the old model is kept: {file} is still being read: check its disk, or try again')
+        False, f'the current model is kept: {file} is still being read: check its disk, or try '
+        'again')
     request = SetParameters.Request(parameters=[
         Parameter('model', value=str(path)).to_parameter_msg() for path in others])
     results = ros.call(SetParameters, 'controller/set_parameters', request).results

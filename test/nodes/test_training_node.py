@@ -39,11 +39,12 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
     assert len(shares) > 3
     assert shares[-1] == 100
     assert 'estimating: drift of degree' in printed
-    assert re.search(r'the new model \(.+\) is accepted: error on held-out records 0\.\d+ K, '
-                     rf'that of the present one \d\.\d+ K; written to {tmp_path}/new\.safetensors',
+    assert re.search(r'the new model \(.+\) is accepted: its error on held-out data is 0\.\d+ '
+                     r'K, that of the present one \d\.\d+ K; written to '
+                     rf'{tmp_path}/new\.safetensors',
                      printed)
     assert sorted(path.name for path in tmp_path.glob('new.*')) == [
-        'new.json', 'new.md', 'new.png', 'new.safetensors']
+        'new.free_run.png', 'new.json', 'new.md', 'new.png', 'new.safetensors']
     assert load(tmp_path / 'new.safetensors').n_z == 2
     # no bag is recorded meanwhile
     assert not list(tmp_path.glob('koopman_ros_*'))
@@ -66,7 +67,7 @@ def test_class_is_passed_on_and_each_that_was_learned_is_shown(
     ))
     assert run_here(trainer, task='train', bags='[run]', model_class=name) == 2
     said = capfd.readouterr().err
-    assert re.search(rf'\[WARN\].*the new model \(.+\) is refused: {name}\n', said)
+    assert re.search(rf'\[WARN\].*the new model \(.+\) is rejected: {name}\n', said)
     assert ('linear: chosen: drift rx 2.0e-02, roll-out 0.5 K, law fails in 1 of 128 closed '
             'loops, 0.0 s\n') in said
     assert 'free lift: 2.0 s; refused: it has lost a state\n' in said
@@ -74,7 +75,7 @@ def test_class_is_passed_on_and_each_that_was_learned_is_shown(
 
 @pytest.mark.parametrize(('given', 'words'), [
     ({'bags': '[run]', 'model_class': 'lift'}, "model_class = 'lift' must be one of linear, "),
-    ({}, 'cannot train: there is no bag to train from')])
+    ({}, 'no bag to train from')])
 def test_task_that_cannot_start(
         capfd: pytest.CaptureFixture[str], given: dict[str, str], words: str) -> None:
     assert run_here(trainer, task='train', **given) == 1
@@ -90,7 +91,7 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(ros: Harness, tmp_path: Pat
     assert process.stop() == 1
     ros.wait_until(lambda: ended(child))
     assert not list(tmp_path.glob('new*'))
-    assert 'training: cancelled, nothing was written' in process.output()
+    assert 'training: cancelled; nothing was written' in process.output()
     assert 'Traceback' not in process.output()
 
 
@@ -124,7 +125,7 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     response = ros.trigger('trainer/cancel_training')
     assert (response.success, response.message) == (True, 'the training is being cancelled')
     ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.ERROR
-                        and status.message == 'cancelled, nothing was written')
+                        and status.message == 'cancelled; nothing was written')
     assert ended(child)
     response = ros.trigger('trainer/cancel_training')
     assert (response.success, response.message) == (False, 'not training')
@@ -143,7 +144,7 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     gain = 60.0 * figures['input_gain']['temperature']['coolant_temperature']
     assert gain == pytest.approx(0.8 * 2.0921, rel=0.15)
     assert (status.level, figures['accepted']) == (DiagnosticStatus.WARN, False)
-    assert re.match(r'the new model \(.+\) is refused: ', status.message)
+    assert re.match(r'the new model \(.+\) is rejected: ', status.message)
     assert not (tmp_path / 'new.safetensors').exists()
 
     # the recording was the task, and it is complete

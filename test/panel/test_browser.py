@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Iterator
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 import re
@@ -22,6 +22,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from koopman_ros.demo import reactor
+from koopman_ros.model import load, save
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.browser import ADDRESS, opened_browser, Pages, PATIENCE
@@ -64,10 +65,9 @@ class Site:
         try:
             if self.desk.url != f'{self.url}{path}':
                 self.desk.goto(f'{self.url}{path}')
-            if self.desk.url.endswith('/login'):
+            if '/login' in self.desk.url:
                 log_in(self.desk, 'anna')
-                if path != '/':
-                    self.desk.goto(f'{self.url}{path}')
+            assert self.desk.url == f'{self.url}{path}'
             yield self.desk
         except BaseException:
             # the next test begins anew
@@ -147,14 +147,17 @@ def confirmed(page: Page, yes: str, where: Locator, answer: str | re.Pattern[str
     expect(where.locator('.answer')).to_have_text(answer)
 
 
-def activated(page: Page, button: str | re.Pattern[str]) -> None:
+def activated(page: Page, button: str | re.Pattern[str], *shown: str, yes: str = 'Activate'
+              ) -> None:
     """Activate a model; again if a busy machine did not read it in time."""
     model = card(page, 'Model')
     for _ in range(TRIES):
         # not to take the answer to the button before for one to this
         page.reload()
         press(model, button)
-        confirmed(page, 'Activate', model, re.compile('^set$|is still being read after'))
+        for text in shown:
+            expect(page.get_by_role('dialog')).to_contain_text(text)
+        confirmed(page, yes, model, re.compile('^set$|is still being read after'))
         if model.locator('.answer').inner_text() == 'set':
             return
     raise AssertionError(f'the model was not read in {TRIES} tries')
@@ -201,7 +204,9 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         assert picture.body() == site.model.with_suffix('.png').read_bytes()
         for other in ('secret', '..%2f..%2fetc%2fpasswd', ''):
             assert page.request.get(f'{site.url}/picture/{other}').status == 404
+        assert '_' not in training.inner_text().replace(str(site.model), '')
         comparison = card(page, 'Comparison')
+        expect(comparison).not_to_contain_text('compared at')
         press(comparison, 'Compare on the last hour')
         press(comparison, 'Cancel')
         expect(comparison).to_contain_text('✖ cancelled')
@@ -210,11 +215,23 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
                                            timeout=5.0 * PATIENCE)
         expect(comparison.locator('img.picture')).to_be_visible()
         model = card(page, 'Model')
-        activated(page, 'Activate the new model …')
+        activated(page, 'Activate the new model …', 'Training range, temperature [°C]',
+                  'identity lift, n_z = 4', 'polynomial', 'accepted', 'Held-out roll-out error')
         expect(model.locator('.value')).to_have_text(str(site.model))
         expect(model).to_contain_text('polynomial')
         activated(page, re.compile('Back to reactor'))
         expect(model.locator('.value')).to_have_text(re.compile('^reactor'))
+        # one that training rejected needs force, which ends with it
+        bad = site.model.with_name('bad.safetensors')
+        accepted = load(site.model)
+        save(replace(accepted, provenance=replace(
+            accepted.provenance, accepted=False, reasons=('too inaccurate',))), bad)
+        ros.set_parameters_atomically('controller', load_refused_model=True, model=str(bad))
+        ros.set_parameters_atomically('controller', load_refused_model=False, model='reactor_nz4')
+        activated(page, re.compile('Back to .*bad'), 'rejected this model: too inaccurate',
+                  'refused', yes='Activate by force')
+        ros.wait_until(lambda: ros.get_parameters('controller', 'load_refused_model') == [False])
+        activated(page, re.compile('Back to reactor'))
         press(recording, 'Record')
         expect(recording).to_contain_text('recording to')
         # of the pictures that there are not
@@ -239,8 +256,7 @@ def test_the_reason_of_a_refusal_is_next_to_its_control(site: Site) -> None:
         own = asked(page)
         before = float(own.input_value())
         expect(ask_setpoint(page, '80')).to_have_text(
-            re.compile(r'✖ refused: outside 31\.85 to 53\.85 degC'))
-        own.press('Escape')
+            re.compile(r'✖ refused: outside 31\.85 to 53\.85 °C'))
         expect(own).to_have_value(re.compile(rf'^{before:g}(\.0)?$'))
 
 
@@ -284,8 +300,21 @@ def test_manual_mode_is_confirmed_and_left_again(site: Site) -> None:
         own = face(page, 'coolant_temperature')
         expect(own.locator('.answer')).to_have_text('accepted')
         expect(own.locator('.big')).to_have_text('21.5')
+        by_hand.fill('45')
+        by_hand.press('Enter')
+        expect(own.locator('.answer')).to_have_text('limited to 32 °C')
+        expect(by_hand).to_have_value('32.0')
+        expect(own.get_by_role('slider')).to_have_attribute('aria-valuenow', '32')
+        expect(ask_setpoint(page, '47')).to_contain_text('only in automatic mode')
         page.get_by_role('button', name='Switch to automatic mode').click()
         expect(page.locator('header')).to_contain_text('AUTOMATIC')
+
+
+AXIS = """() => {{
+    const chart = document.querySelector('.nicegui-echart');
+    const own = getElement(parseInt(chart.id.slice(1))).chart.getOption().xAxis[0];
+    return own.{0};
+}}"""
 
 
 def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
@@ -300,9 +329,19 @@ def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
         expect(ask_setpoint(page, '46')).to_have_text('accepted')
     with site.page('/trends') as page:
         page.wait_for_function(f'() => ({points})()[0] > 20')
-        expect(page.get_by_label('Events')).to_contain_text('setpoint: temperature 46 °C')
+        expect(page.get_by_label('Events')).to_contain_text('set-point: temperature 46 °C')
         page.get_by_role('button', name='1 h').click()
         page.wait_for_function(f'() => ({points})().every(count => count > 20)')
+        expect(page.locator('header')).to_contain_text('wall time')
+        page.wait_for_function(AXIS.format("name === 'plant time' && own.max > 0"))
+        page.get_by_label('Until, h:mm:ss').fill('0:05')
+        page.wait_for_function(AXIS.format('max === 300e3'))
+        page.get_by_role('button', name='Now').click()
+        page.wait_for_function(AXIS.format('max > 300e3'))
+        page.get_by_role('button', name='Earlier').click()
+        expect(page.get_by_label('Until, h:mm:ss')).to_have_value(re.compile(r'\d+:\d\d:\d\d'))
+        page.get_by_role('button', name='Now').click()
+        expect(page.get_by_label('Until, h:mm:ss')).to_have_value('')
 
 
 def test_a_plan_is_drawn_ahead_of_now_while_there_is_one(site: Site) -> None:
@@ -313,7 +352,8 @@ def test_a_plan_is_drawn_ahead_of_now_while_there_is_one(site: Site) -> None:
         const last = name => series.find(one => one.name.startsWith(name)).data.at(-1)?.[0];
         return [last('temperature planned') > last('temperature [') + 10_000
                     && xAxis[0].max >= last('coolant temperature planned'),
-                legend[0].data.filter(name => name.includes('planned')).length];
+                legend.flatMap(own => own.data).filter(
+                    name => name.includes('planned')).length];
     }"""
     node = site.ros.node
     # as a controller with MPC publishes them
@@ -387,17 +427,29 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
         own = page.get_by_label('Parameters of the controller')
         own.get_by_text('coolant temperature', exact=True).click()
         row = own.locator('[data-parameter="coolant_temperature.max"]')
-        expect(row).to_contain_text('max [degC]')
+        expect(row).to_contain_text('max [°C]')
         given = row.get_by_role('textbox')
         expect(given).to_have_value('32')
         for text, said in (('31', 'set'), ('x', "✖ refused: 'x' is not a number"),
-                           ('-300', '✖ refused: must be [-273.15, 1000000000] degC'),
-                           ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 degC must '
+                           ('-300', '✖ refused: must be [-273.15, 1000000000] °C'),
+                           ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 °C must '
                                             'be below')),
                            ('32', 'set')):
             given.fill(text)
             given.press('Enter')
             expect(row.locator('.answer')).to_have_text(said)
+        # parameters with a few possible values are lists
+        for node, name, choices in (('trainer', 'experiment_signal', ('manual', 'setpoint')),
+                                    ('controller', 'load_refused_model', ('true', 'false'))):
+            page.get_by_label(f'Parameters of the {node}').get_by_text(
+                'general', exact=True).click()
+            row = page.locator(f'[data-parameter="{name}"]')
+            for choice in choices:
+                row.get_by_role('combobox').click()
+                page.get_by_role('option', name=choice, exact=True).click()
+                press(row, f'Set {name}')
+                expect(row.locator('.answer')).to_have_text('set')
+                expect(row.get_by_role('combobox')).to_have_value(choice)
 
         def exported() -> str:
             with page.expect_download() as download:
@@ -430,6 +482,7 @@ def test_a_viewer_on_a_phone_sees_what_the_operator_does_and_cannot_act(site: Si
         ready(desk)
         expect(ask_setpoint(desk, '48')).to_have_text('accepted')
         expect(face(page, 'temperature').locator('.value')).to_have_text('48.0 °C')
+        expect(asked(page)).to_have_value('48.0')
         for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
             if path != '/':
                 page.goto(f'{site.url}{path}')
@@ -445,7 +498,32 @@ def test_a_viewer_on_a_phone_sees_what_the_operator_does_and_cannot_act(site: Si
                 assert controls.evaluate_all(USABLE) == []
         # logged out in another page
         assert phone.request.get(f'{site.url}/logout').ok
-        page.wait_for_url('**/login')
+        page.wait_for_url(re.compile(r'/login\?page=/tuning$'))
+
+
+# Whether each row of cards ends at the right edge, and the mode is on one line.
+FILLED = """() => {
+    const cards = document.querySelector('.cards');
+    const end = cards.getBoundingClientRect().right, ends = new Map();
+    for (const own of cards.children) {
+        const box = own.getBoundingClientRect();
+        ends.set(box.top, Math.max(ends.get(box.top) ?? 0, box.right));
+    }
+    return [...ends.values()].every(right => Math.abs(right - end) < 2)
+        && document.querySelector('.mode').clientHeight < 60;
+}"""
+
+
+def test_cards_fill_their_rows_and_a_simulated_plant_is_reset(site: Site) -> None:
+    with site.page() as page:
+        ready(page)
+        for width in (1400, 1024, 375):
+            page.set_viewport_size({'width': width, 'height': 900})
+            page.wait_for_function(FILLED)
+        page.set_viewport_size(dict(zip(('width', 'height'), DESK, strict=True)))
+        press(page.locator('.page'), 'Reset the simulated plant …')
+        press(page.get_by_role('dialog'), 'Reset the simulated plant')
+        expect(page.get_by_text('reset to temperature')).to_be_visible()
 
 
 def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> None:
@@ -458,9 +536,15 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
         expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
         expect(ask_setpoint(page, '45')).to_have_text(
             '✖ refused: the controller is not running: start it')
+        for path, name in (('/', 'Controller'), ('/model', 'Model'),
+                           ('/tuning', 'Parameters of the controller')):
+            page.goto(f'{site.url}{path}')
+            expect(card(page, name)).to_have_attribute('inert', '')
+        page.goto(site.url)
         site.controller = site.ros.start('controller')
         expect(banner).to_be_hidden()
         expect(page.locator('header')).to_contain_text('AUTOMATIC')
+        expect(card(page, 'Controller')).not_to_have_attribute('inert', '')
 
 
 def test_a_page_finds_its_panel_again(site: Site) -> None:

@@ -17,7 +17,7 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.model import load
 from koopman_ros.panel.files import read_bounded
 from koopman_ros.panel.learning_watch import LearningWatch
-from koopman_ros.panel.model_card import model_card, status_card, training_ranges
+from koopman_ros.panel.model_card import model_card, status_card, training_card, training_ranges
 from koopman_ros.panel.training_report import (
     Learning,
     read_comparison,
@@ -156,10 +156,14 @@ def test_a_model_is_described_in_words() -> None:
     assert {'Condition number', 'Held-out roll-out error (RMS), level 1 [m]'} <= set(found)
     assert not any('_' in name for name in found)
     assert training_ranges(model)['level_1'] == (model.states.lower[0], model.states.upper[0])
+    assert training_card({
+        'accepted': 'False', 'done [%]': '100', 'heldout_rw': '1e-4', 'units: level_1': 'm',
+        'heldout_error: level_1': '0.01', 'model_class': 'linear', 'class linear': 'chosen'}) == {
+        'Held-out error, level 1 [m]': '0.01', 'Model class': 'linear', 'Class linear': 'chosen'}
     assert status_card({
         'model': 'x', 'model file time': '2026-11-25T15:10:08.000+00:00', 'law': 'none',
         'distance outside training box [half-ranges]': '0.5', 'gain norm': 'nan',
-        'coolant outside training box [half-ranges]': '0'}) == {
+        'pump_1 and pump_2 outside training box [half-ranges]': '0'}) == {
         'File written': '2026-11-25 15:10:08',
         'State outside the training range [half-ranges]': '0.5',
-        'Coolant outside the training range [half-ranges]': '0'}
+        'Pump 1 and pump 2 outside the training range [half-ranges]': '0'}

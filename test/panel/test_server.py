@@ -26,10 +26,11 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from koopman_ros.panel import trend_page
+from koopman_ros.panel import trend_chart
 from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
-from koopman_ros.panel.trend_page import axis_ends, zoomed
+from koopman_ros.panel.trend_chart import axis_ends, ink, zoomed
+from koopman_ros.panel.trend_page import time_of_day
 from support.browser import opened_browser, Pages
 from support.hostile import HostileSource, NOW, TEXTS
 from support.users import PASSWORDS, write_users
@@ -386,7 +387,7 @@ ZOOM = """() => {
 
 def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
         site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trend_page, '_BUCKETS', 20)
+    monkeypatch.setattr(trend_chart, '_BUCKETS', 20)
     for k in range(36_000):
         site.source.view.trends.add('level', NOW + 0.1 * k, {
             12_345: 70.0, 23_456: -30.0}.get(k, math.sin(0.01 * k)))
@@ -436,3 +437,19 @@ def test_an_axis_shows_a_share_of_the_range_of_its_signals(
     assert ends[0] <= low <= 46.03 < 46.1 <= high <= ends[1]
     assert high - low >= 2.0
     assert axis_ends([(30.0, 40.0), (35.0, 50.0)], ()) == {'min': 30.0, 'max': 50.0}
+
+
+def test_pens_of_a_chart_have_colours_of_their_own() -> None:
+    assert len({ink(number) for number in range(40)}) == 40
+
+
+@pytest.mark.parametrize(('text', 'latest', 'found'), [
+    ('0:03:20', 500.0, 200.0), ('1:00', 500.0, 3600.0), ('30:00:01', 500.0, 108_001.0),
+    ('', 500.0, None), ('now', 500.0, None), ('1', 500.0, None)])
+def test_times_are_those_of_the_plant(text: str, latest: float, found: float | None) -> None:
+    assert time_of_day(text, latest) == found
+
+
+def test_a_wall_time_is_the_last_before_now() -> None:
+    for seconds in (NOW - 60.0, NOW - 80_000.0):
+        assert time_of_day(time.strftime('%H:%M:%S', time.localtime(seconds)), NOW) == seconds

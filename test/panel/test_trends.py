@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.panel.trends import MAX_MARKS, Trends
+from koopman_ros.panel.trends import grouped, MAX_MARKS, TrendMark, Trends
 
 NAN = math.nan
 
@@ -201,3 +201,12 @@ def test_threads_read_while_others_add() -> None:
     for thread in threads:
         thread.join()
     assert not failed
+
+
+def test_events_that_are_near_are_one_mark() -> None:
+    marks = [TrendMark(float(second), kind, f'text {second}') for second, kind in (
+        *((second, 'setpoint') for second in range(9)), (9, 'alarm'), (30, 'mode'))]
+    assert [(mark.time, mark.label, mark.text, mark.alarm) for mark in grouped(marks, 10.0)] == [
+        (0.0, 'setpoint ×9, alarm',
+         '7 earlier; setpoint: text 7; setpoint: text 8; alarm: text 9', True),
+        (30.0, 'mode', 'mode: text 30', False)]

@@ -13,7 +13,8 @@ import pytest
 
 from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
-from koopman_ros.panel.faceplates import pen
+from koopman_ros.panel.faceplates import pen, span_text
+from koopman_ros.panel.model_page import experiment_obstacle
 from koopman_ros.panel.requests import (
     Action,
     action_text,
@@ -27,7 +28,9 @@ from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
     ERROR,
+    EXPERIMENT,
     LOST,
+    MEASUREMENTS,
     OK,
     PLANT,
     REQUESTS,
@@ -206,6 +209,20 @@ def test_bars_hold_ranges_and_values() -> None:
     assert state.abnormal == 'above the trained range'
 
 
+@pytest.mark.parametrize(('bounds', 'text'), [
+    ((31.85, 53.85), '31.9 to 53.8'), ((5.0 + 1e-9, 32.0 - 1e-9), '5.0 to 32.0'),
+    ((-1.23, math.inf), '-1.2 to –')])
+def test_limits_are_written_within_the_limits(bounds: tuple[float, float], text: str) -> None:
+    assert span_text(bounds, 1) == text
+
+
+def test_the_scale_of_an_input_without_negative_values_begins_at_zero() -> None:
+    own = view(TANKS)
+    own.take_parameters(CONTROLLER, {f'pump_1.{end}': parameter(f'pump_1.{end}', value)
+                                     for end, value in (('min', 0.0), ('max', 12.0))})
+    assert own.snapshot(NOW).inputs[0].span == pytest.approx((0.0, 13.2))
+
+
 def test_the_target_of_a_ramp_is_shown() -> None:
     own = view(TANKS)
     for name, value in (('level_1', 0.10), ('level_2', 0.15)):
@@ -216,6 +233,20 @@ def test_the_target_of_a_ramp_is_shown() -> None:
                                  'reason': ['setpoint_outside']}, NOW)
     first, second = own.snapshot(NOW).states
     assert (first.setpoint, first.target, second.setpoint, second.target) == (0.1, 0.1, 0.15, 0.2)
+    # a controller that starts again has no target
+    own.take_record('start', {'state': {'mode': {'name': 'AUTOMATIC'}}, 'model': {}}, NOW)
+    assert own.snapshot(NOW).states[1].target == 0.15
+
+
+def test_a_manual_command_is_shown_within_the_limits_until_the_mode_changes() -> None:
+    own = view()
+    own.take_parameters(CONTROLLER, {f'coolant_temperature.{end}': parameter(
+        f'coolant_temperature.{end}', value) for end, value in (('min', 5.0), ('max', 32.0))})
+    own.take_signals('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
+    own.take_record('manual_command', {'accepted': True, 'value': [to_kelvin(45.0)]}, NOW)
+    assert own.snapshot(NOW).inputs[0].manual == 32.0
+    own.take_record('mode', {'mode': 'automatic'}, NOW)
+    assert own.snapshot(NOW).inputs[0].manual == pytest.approx(20.0)
 
 
 def test_a_snapshot_stays_what_it_was() -> None:
@@ -294,7 +325,8 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
         status(own, 'other', ERROR, 'is down', {}, NOW + second)
         own.advance(NOW + second)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 3.0).standing] == [
-        ('other', Priority.HIGH), (CONTROL, Priority.MEDIUM), ('trainer: recording', Priority.LOW)]
+        ('other', Priority.HIGH), (f'{CONTROL}: extrapolates', Priority.MEDIUM),
+        ('trainer: recording', Priority.LOW)]
     # raised at once, in any order
     assert sorted(mark.text for mark in own.trends.marks(0.0, 10.0) if mark.kind == 'alarm') == [
         f'{CONTROL}: extrapolates', 'other: is down', 'trainer: recording: disk is filling']
@@ -345,7 +377,7 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     now = own.snapshot(NOW + 2.0)
-    assert {alarm.key for alarm in now.standing} == {CONTROL, 'controller: actuators'}
+    assert {alarm.key for alarm in now.standing} == {f'{CONTROL}: held', 'controller: actuators'}
     assert len(now.statuses) < 100
 
 
@@ -356,12 +388,55 @@ def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
-        ('controller: actuators', Priority.MEDIUM), (REQUESTS, Priority.LOW)]
-    status(own, REQUESTS, OK, 'in order', {}, NOW + 3.0)
-    own.advance(NOW + 9.0)
-    assert [alarm.key for alarm in own.snapshot(NOW + 9.0).standing
-            if alarm.state is not AlarmState.RETURNED and 'silence' not in alarm.key] == [
-        'controller: actuators']
+        ('controller: actuators', Priority.MEDIUM)]
+    # also seen by the plant
+    status(own, 'plant: simulation', WARN, 'stuck', {}, NOW + 2.0)
+    own.advance(NOW + 3.4)
+    assert [alarm.key for alarm in own.snapshot(NOW + 3.4).standing] == ['controller: actuators']
+
+
+WAITING = {'measurements': '0'}
+LATE = {'measurements': '9', 'since last measurement [s]': '40'}
+
+
+@pytest.mark.parametrize(('task', 'level', 'message', 'values', 'plant', 'expected'), [
+    # the nodes of a loop start one after the other; later it is a fault
+    (CONTROL, WARN, 'waiting', WAITING, None, {5.0: '', 40.0: 'silence of plant: waiting'}),
+    (CONTROL, WARN, 'waiting', WAITING, 99.0, {
+        5.0: '', 40.0: f'{CONTROL}: waiting: {CONTROL}: waiting'}),
+    ('', OK, '', {}, None, {5.0: '', 40.0: 'silence of controller: no message from the controller'
+                                           '; silence of plant: no measurement'}),
+    # the silence of a plant is one alarm, in the words of the controller
+    (CONTROL, ERROR, 'held', LATE, 2.0, {20.0: 'silence of plant: held'}),
+    (MEASUREMENTS, WARN, 'late', {}, 2.0, {
+        20.0: 'silence of plant: no measurement; '
+              f'{MEASUREMENTS}: {MEASUREMENTS}: late (returned)'}),
+    (CONTROL, OK, 'automatic', LATE, 2.0, {20.0: 'silence of plant: no measurement'}),
+    # the operator who made a request reads the answer
+    (REQUESTS, WARN, 'request refused: outside', {}, 99.0, {5.0: '', 40.0: ''}),
+    (EXPERIMENT, WARN, 'refused: another node commands', {}, 99.0, {5.0: '', 40.0: ''}),
+    # what has ended stands until it is acknowledged, and no longer
+    (EXPERIMENT, ERROR, 'aborted: too hot', {}, 99.0, {
+        5.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot',
+        40.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot (returned)'}),
+    ('other: io', ERROR, '', {}, 99.0, {5.0: 'other: io: other: io: no reason was given'})])
+def test_a_condition_has_one_alarm(
+        task: str, level: int, message: str, values: Mapping[str, str], plant: float | None,
+        expected: Mapping[float, str]) -> None:
+    own = view()
+    for step in range(1, 401):
+        seconds = 0.1 * step
+        if plant is not None and seconds < plant:
+            measure(own, 50.0, seconds)
+        if task:
+            answered(own, wall=NOW + seconds)
+            status(own, task, level, message, values, NOW + seconds)
+        own.advance(NOW + seconds)
+        for moment in (moment for moment in expected if math.isclose(moment, seconds)):
+            assert '; '.join(
+                f'{alarm.key}: {alarm.text}' + (
+                    ' (returned)' if alarm.state is AlarmState.RETURNED else '')
+                for alarm in own.snapshot(NOW).standing) == expected[moment]
 
 
 def test_many_short_errors_are_an_alarm() -> None:
@@ -389,6 +464,55 @@ def test_a_manual_command_is_limited_as_the_controller_does() -> None:
         'coolant_temperature.max': parameter('coolant_temperature.max', 32.0)})
     assert own.limited('coolant_temperature', 60.0) == 32.0
     assert own.limited('coolant_temperature', 20.0) == 20.0
+
+
+@pytest.mark.parametrize(('signal', 'mode', 'left', 'words'), [
+    ('command', '', '0', ''), ('command', 'automatic', '0', 'stop it, or set experiment_signal'),
+    ('setpoint', 'automatic', '0', ''), ('setpoint', 'manual', '0', 'in automatic mode'),
+    ('manual', 'automatic', '0', 'in manual mode'), (None, 'automatic', '0', ''),
+    ('setpoint', 'automatic', '12.5', 'is running')])
+def test_an_experiment_that_cannot_start_has_a_reason(
+        signal: str | None, mode: str, left: str, words: str) -> None:
+    own = view()
+    if mode:
+        answered(own, mode=mode)
+    if signal:
+        own.take_parameters(TRAINER, {'experiment_signal': parameter('experiment_signal', signal)})
+    status(own, EXPERIMENT, OK, 'finished', {'left [s]': left}, NOW)
+    found = experiment_obstacle(own.snapshot(NOW))
+    assert words in found
+    assert bool(found) is bool(words)
+
+
+def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
+    own = view()
+
+    def standing(second: float, *warnings: str) -> list[tuple[str, AlarmState]]:
+        values = {f'warning {number}': text for number, text in enumerate(warnings, 1)}
+        status(own, 'controller: model', WARN if warnings else OK, '; '.join(warnings), values,
+               NOW + second)
+        measure(own, 50.0, second + 1.0)
+        own.advance(NOW + second)
+        return [(alarm.text.partition(': model: ')[2], alarm.state)
+                for alarm in own.snapshot(NOW + second).standing]
+
+    up, back = AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED
+    standing(0.0, 'level_1 at 4.5 m')
+    assert standing(2.0, 'level_1 at 4.6 m', 'retrain') == [('level_1 at 4.6 m', up)]
+    assert standing(4.0, 'retrain', 'level_1 at 4.7 m') == [
+        ('retrain', up), ('level_1 at 4.7 m', up)]
+    standing(6.0, 'retrain')
+    assert standing(12.0, 'retrain') == [('retrain', up), ('level_1 at 4.7 m', back)]
+    standing(13.0)
+    assert [state for _, state in standing(19.0)] == [back, back]
+    # so has each reason for a control level, whose numbers may change
+    for second, message in enumerate(('held: stuck for 5 s', 'held: stuck for 6 s', 'held: late')):
+        for part in (0.0, 1.5):
+            measure(own, 50.0, 20.0 + 2 * second + part)
+            status(own, CONTROL, ERROR, message, {}, NOW + 20.0 + 2 * second + part)
+    assert sorted(alarm.text for alarm in own.snapshot(NOW + 26.0).standing
+                  if alarm.text.startswith(CONTROL)) == [
+        f'{CONTROL}: held: late', f'{CONTROL}: held: stuck for 6 s']
 
 
 # Trends.

@@ -97,5 +97,5 @@ def test_a_steady_state_is_found_by_some_of_its_states_or_refused():
     np.testing.assert_allclose(u, [-0.5 * 9.81 * np.sin(0.3)], rtol=1e-12)
     with pytest.raises(EquilibriumError, match=r'no input holds .*rate = 1 rad/s: angle still'):
         steady_state(pendulum, {'rate': 1.0})
-    with pytest.raises(ValueError, match='level is no state of pendulum: choose of angle, rate'):
+    with pytest.raises(ValueError, match='state of pendulum: choose'):
         steady_state(pendulum, {'level': 1.0})

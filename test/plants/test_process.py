@@ -125,6 +125,22 @@ def test_a_delay_takes_effect_in_the_middle_of_a_hold_and_the_lag_follows(
         analytic(0.0, 0.0, 2.0, max(lag, 1e-12), 1.0 - delay), abs=1e-9)
 
 
+@pytest.mark.parametrize(('delay', 'lag', 'dead_time'), [
+    (0.0, 0.0, 0.4), (0.1, 0.0, 0.3), (0.25, 0.3, 0.35)])
+def test_an_input_acts_a_dead_time_after_it_is_applied(
+        delay: float, lag: float, dead_time: float) -> None:
+    plant = given(actuated(Actuator(delay=delay, lag=lag, dead_time=dead_time)), 2.0)
+    same = given(actuated(Actuator(delay=delay, lag=lag)), 2.0)
+    for n in range(1, 9):
+        plant, same = (one.until(n * 17 * SECOND // 100) for one in (plant, same))
+        assert plant.applied[0] == pytest.approx(same.u[0], abs=1e-9)
+        late = 0.17 * n - delay - dead_time
+        assert (plant.x[0], plant.u[0]) == pytest.approx(
+            (0.0, 0.0) if late <= 0.0 else analytic(0.0, 0.0, 2.0, max(lag, 1e-12), late),
+            abs=1e-9)
+    assert plant.x[0] != 0.0
+
+
 def test_a_command_supersedes_those_that_would_act_later() -> None:
     plant = given(given(actuated(Actuator(delay=5.0)), 1.0).until(SECOND), 2.0)
     plant = given(replace(plant, actuator=Actuator(delay=4.5)), 3.0)

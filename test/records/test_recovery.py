@@ -93,7 +93,7 @@ def test_cut_file_reads_up_to_its_last_whole_chunk(
     for cut in sorted(cut for cut in cuts if 0 < cut < len(content)):
         cut_file.write_bytes(content[:cut])
         expected = max((total for end, total in chunks if end <= cut), default=0)
-        with pytest.raises(BagReadError, match=r'is cut short.*: set recover to true'):
+        with pytest.raises(BagReadError, match='set recover to true'):
             read_messages(cut_file)
         found = [m.data for m in read_messages(cut_file, recover=True)]
         assert found == [s.data for s in samples[:expected]], cut
@@ -134,7 +134,7 @@ def test_lost_chunk_is_noticed_without_checksums(path: Path, samples: list[Sampl
     (data_end, _), = records(content, Opcode.DATA_END)
     changed(path, data_end + 9, bytes(4))  # no checksum of the data section
     changed(path, records(content, Opcode.CHUNK)[1][0], b'\x46')
-    with pytest.raises(BagReadError, match=f'of the {len(samples)} messages it should hold'):
+    with pytest.raises(BagReadError, match=f'of the {len(samples)} expected messages'):
         list(read_messages(path))
     assert 0 < len(list(read_messages(path, recover=True))) < len(samples)
 

@@ -36,6 +36,34 @@ def jacket(*values: float) -> list[Sent]:
     return [Sent('/jacket_setpoint', k, value) for k, value in enumerate(values, 1)]
 
 
+@pytest.mark.parametrize(('values', 'linear', 'acting'), [
+    ([20.0] * 5 + [30.0] * 10, (), [20.0, 20.0, 30.0]),
+    (list(20.0 + np.arange(15)), (True,), [20.0, 20.5, 25.0])])
+def test_an_input_without_commands_is_taken_from_its_measurements(
+    write: Callable[..., Path], values: list[float], linear: tuple[bool, ...], acting: list[float]
+) -> None:
+    path = write([s for k, value in enumerate(values, 1) for s in (
+        Sent('/warm', k, 50.0 + k), Sent('/jacket', k, value))])
+    (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
+    assert (len(episode), episode.linear) == (15, linear)
+    assert episode.inputs_at(np.array([0.0, 0.5, 5.0]))[:, 0] == pytest.approx(
+        273.15 + np.array(acting))
+    assert "no topic '/jacket_setpoint': jacket is taken from its measurements" in account.notes[0]
+    # the same by names alone
+    assert np.array_equal(records.read(path, 'warm [K]', 'jacket [K]').episodes[0].u, episode.u)
+    with pytest.raises(ValueError, match='warm has no unit, and bags have none'):
+        records.read(path, 'warm', 'jacket [K]')
+
+
+def test_an_input_without_commands_that_is_not_measured_throughout(write: Callable[..., Path]
+                                                                   ) -> None:
+    path = write([*(Sent('/warm', k, 50.0 + k) for k in range(1, 31)),
+                  *(Sent('/jacket', k, 20.0) for k in range(1, 16))])
+    episodes, account = records.loop_episodes([path], [WARM], [JACKET])
+    assert not episodes
+    assert 'jacket was not measured throughout, and has no commands' in account.notes[-1]
+
+
 def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., Path]) -> None:
     path = write([s for k in range(1, 16) for s in (
         # the order of the names changes, as joint states may
@@ -186,7 +214,7 @@ def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callab
     (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
     assert episode.linear == ()
     assert episode.u[:, 0] == pytest.approx(np.array([293.15, 303.15, 283.15]))
-    assert noted(account, 'jacket', 'not measured throughout')
+    assert noted(account, 'jacket', 'not always measured')
     path.unlink()
     write([s for s in run if s.topic != '/jacket'])
     (again,), account = records.loop_episodes([path], [WARM], [JACKET])

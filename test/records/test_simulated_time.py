@@ -53,10 +53,10 @@ def test_receipts_in_plant_time_count(
 
 
 @pytest.mark.parametrize(('clock_time', 'words'), [
-    (lambda t: 20.0 * t, r'x has no stamps, and 1990 s passed on /clock in 99.5 s'),
-    (lambda t: 0.1 * t, r'9.95 s passed on /clock in 99.5 s'),
-    (lambda t: min(t, 60.0), r'60 s passed on /clock in 99.5 s'),  # a pause
-    (lambda t: 20.0 * (t % 50.0), r'1980 s passed on /clock in 99 s'),  # started again
+    (lambda t: 20.0 * t, r'x has no stamps.*1990 s on /clock in 99.5 s'),
+    (lambda t: 0.1 * t, r'9.95 s on /clock in 99.5 s'),
+    (lambda t: min(t, 60.0), r'60 s on /clock in 99.5 s'),  # a pause
+    (lambda t: 20.0 * (t % 50.0), r'1980 s on /clock in 99 s'),  # started again
 ])
 def test_receipts_in_another_time_are_refused(
         tmp_path: Path, clock_time: Clock, words: str) -> None:
@@ -68,4 +68,4 @@ def test_receipts_in_another_time_are_refused(
 def test_receipts_without_a_clock_are_noted(tmp_path: Path) -> None:
     path = write(tmp_path / 'run.mcap', lambda t: WALL + t, lambda t: t, clock=False)
     _, account = records.loop_episodes([path], [STATE], [INPUT])
-    assert any('have no stamp: their receipt counts' in note for note in account.notes)
+    assert any('have no stamp: the time of receipt' in note for note in account.notes)

@@ -40,7 +40,7 @@ def running(shared_ros: Harness) -> Harness:
     ({'coolant_temperature.weight': 1}, "expected 'Type.DOUBLE' got 'Type.INTEGER'"),
     ({'coolant_temperature.min': 40.0}, 'coolant_temperature.min = 40.0 degC must be below '
      'coolant_temperature.max = 32.0 degC: change the other one first'),
-    ({'model': 'reactor_nz5'}, 'the old model is kept: no model file at '),
+    ({'model': 'reactor_nz5'}, 'model is kept: no model file at'),
     ({'no_such_thing': 1.0}, 'undeclared parameter'),
     ({'temperature.topic': 'elsewhere'}, 'read-only'),
     ({'learned_model_margin': 2.0}, 'learned_model_margin = 2.0 must be at most '),
@@ -77,7 +77,7 @@ def test_atomic_change_is_refused_as_a_whole(
     assert result.reason.startswith(words)
     assert running.get_parameters(CONTROLLER, *changes) == [
         TABLE.rows[name].default for name in changes]
-    running.wait_until(lambda: f'parameter change refused: {words}' in running.printed())
+    running.wait_until(lambda: f'parameter change rejected: {words}' in running.printed())
 
 
 def test_every_parameter_is_described_with_unit_and_range(running: Harness) -> None:
@@ -125,8 +125,8 @@ def test_bursts_of_nonsense_hold_the_coolant_which_goes_on_smoothly(bench: Bench
             (math.nan, 5, 'the measured temperature is nan, not finite: check the sensor'),
             # which is no temperature
             (-300.0, 5, 'the measured temperature is nan, not finite: check the sensor'),
-            (400.0, 5, 'the measured temperature 400.00 degC is outside the range of the sensor, '
-             '-20.00 degC to 150.00 degC: check it'),
+            (400.0, 5, 'the measured temperature 400.00 degC is outside the range of the '
+                       'sensor, -20.00 degC to 150.00 degC: check'),
             (30.0, 2, 'to 30.00 degC in 2 s, at most 2 K and 2 K/s are possible: check the '
              'sensor')):
         held = bench.commands[-1].temperature
@@ -171,7 +171,7 @@ def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros
         commands += measured(bench, first, 5)
     assert np.max(np.abs(np.diff(commands))) < 0.05
     assert np.ptp(commands) > 0.0
-    ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
+    ros.wait_until(lambda: 'controller time is reset' in bench.process.output())
     status = bench.status()
     assert value(status, 'measurements') == '16'
     assert status.level == DiagnosticStatus.OK
@@ -195,7 +195,7 @@ def test_simulated_time_that_nobody_publishes_is_told_and_silence_in_it_ends_at_
     def told() -> DiagnosticStatus | None:
         # measurements come all the time
         bench.measure(STEADY, float(next(times)))
-        return next((s for s in ros.statuses if 'nobody publishes /clock' in s.message), None)
+        return next((s for s in ros.statuses if '/clock is not published' in s.message), None)
 
     status = ros.wait_until(told)
     assert status.level == DiagnosticStatus.WARN
@@ -337,7 +337,7 @@ def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(
     manual = running.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
     manual.publish(temperature(20.0))
     running.wait_for_status('controller: control', lambda s: (
-        'the applied coolant is not known' in s.message))
+        'the applied coolant is unknown' in s.message))
     # before the first measurement, from what is applied
     commands = running.listen(Temperature, reactor.COOLANT_SETPOINT)
     coolant = running.speak(

@@ -76,7 +76,7 @@ def watch(ros: Harness, node: str, seen: Seen, **wanted: set[str]) -> None:
 
 def check(ros: Harness, node: str, seen: Seen, system: str = 'reactor') -> None:
     """Compare what a node does, and did, with what is granted."""
-    granted = resolved(programs(system)[node], node)
+    granted = resolved(programs({'system': system})[node], node)
     watch(ros, node, seen, **granted)
     assert seen == granted
 

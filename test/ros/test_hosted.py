@@ -38,10 +38,10 @@ def test_file_of_loops(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('text', 'words'), [
-    ('a\nb//c\n', "line 2: 'b//c' is no namespace"),
-    ('a\n2b\n', "line 2: '2b' is no namespace"),
+    ('a\nb//c\n', "line 2: 'b//c' is not a namespace"),
+    ('a\n2b\n', "line 2: '2b' is not a namespace"),
     ('a\nb\n/a\n', 'line 3: /a is in line 1, too'),
-    ('# none yet\n', 'names no loop: write one namespace a line'),
+    ('# none yet\n', 'lists no loops: write one namespace per line'),
 ])
 def test_file_of_loops_that_cannot_be(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / 'loops.txt'

@@ -19,7 +19,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.signal_topics import plant_defaults
+from koopman_ros.parameters.signal_topics import plant_defaults, Signals
 from koopman_ros.parameters.table import (
     ConfigurationError,
     group,
@@ -119,12 +119,12 @@ BUILT = ParameterTable(Odd, build=_reciprocal)
 
 @pytest.mark.parametrize(('before', 'now', 'reason'), [
     (Odd(), Odd(), ''),
-    (Odd(), Odd(count=3), 'count = 3 cannot be used: float division by zero'),
+    (Odd(), Odd(count=3), 'count = 3 is not usable:  float division by zero'),
     (Odd(), Odd(count=4, whole=-4.0, tiny=0.5),
-     'whole = -4.0 and count = 4 cannot be used: float division by zero'),
+     'whole = -4.0 and count = 4 is not usable:  float division by zero'),
     (Odd(count=4), Odd(count=4, whole=-4.0),
-     'whole = -4.0 cannot be used: float division by zero'),
-    (Odd(), Odd(whole=-1.0), 'whole = -1.0 cannot be used: whole and count are no pair'),
+     'whole = -4.0 is not usable:  float division by zero'),
+    (Odd(), Odd(whole=-1.0), 'whole = -1.0 is not usable:  whole and count are no pair'),
 ])
 def test_what_cannot_be_built_is_refused_with_the_error_and_what_was_changed(
         before: Odd, now: Odd, reason: str) -> None:
@@ -191,7 +191,7 @@ def test_concentration_too_small_to_integrate_is_refused() -> None:
 
     assert check(one, 1e-312) == ''
     assert check(two, 1e-312).startswith(
-        'constants.feed_concentration = 1e-312 mol/m^3 cannot be used: atol is ')
+        'constants.feed_concentration = 1e-312 mol/m^3 is not usable:  atol is ')
     assert [check(two, harmless) for harmless in (0.0, 1e-97)] == ['', '']
 
 
@@ -322,13 +322,13 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
         ({'physical_model': 'two_state', 'estimated_constants': ['volumes']},
          'volumes is no constant of TwoStateReactor: it has flow_rate, volume'),
         ({'physical_model': 'two_state', 'estimated_constants': ['volume [2, 1]']},
-         r'the range of volume is \[2, 1\] m\^3, must rise and lie in \[0.001, 100\] m\^3'),
+         r'the range of volume is \[2, 1\] m\^3, must increase and lie in \[0.001, 100\] m\^3'),
         ({'physical_model': 'two_state', 'estimated_constants': ['volume 2 1']},
          'must be a name, or one'),
         ({'physical_model': 'two_state', 'estimated_constants': ['volume', 'volume']},
          'each name once'),
         ({'physical_model': 'quadruple_tank'},
-         'does not say which of its constants are to be estimated'),
+         'marks no constants as estimated'),
         ({'estimated_constants': ['volume']}, 'estimated_constants names volume, must be empty'),
         ({'physical_model': 'two_state', 'unmeasured_states': 1},
          'unmeasured_states is 1, must be 0'),
@@ -343,7 +343,8 @@ def test_values_that_do_not_fit_together_are_refused(
 def test_equations_of_a_trainer_are_those_of_its_task() -> None:
     table = trainer_table(load(model_path(reactor.MODEL)))
     fields = table.snapshot({'physical_model': 'two_state', 'estimated_constants': [
-        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training()
+        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training(
+            Signals({'T': 'K'}, {'u': '1'}))
     assert fields['physical_model'] == 'two_state'
     assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
                                    'reaction_enthalpy': None}

@@ -20,6 +20,7 @@ from rosgraph_msgs.msg import Clock
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.nodes import controller, plant, player, trainer
+from koopman_ros.parameters.table import as_yaml
 from koopman_ros.records import summary
 from koopman_ros.ros import topics
 from koopman_ros.ros.node_descriptions import tables
@@ -159,7 +160,7 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
         message.clock.sec, message.clock.nanosec = sec, nanosec
         clock.publish(message)
         ros.meet('controller')
-    ros.wait_until(lambda: '/clock has sec -5, nanosec 0, which is no valid time: ignored' in (
+    ros.wait_until(lambda: 'ignored an invalid /clock message (sec -5, nanosec 0; ' in (
         process.output()))
     # the true time is taken still
     clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))
@@ -174,13 +175,36 @@ def test_help_and_unknown_arguments(name: str, capsys: pytest.CaptureFixture[str
     assert said.startswith(f'usage: ros2 run koopman_ros {name} ')
     assert 'exit codes: 0 ' in said
     assert f'config/{name}.yaml' in said
-    assert all(f'\n  {row} ' in said for row in TABLES[name].rows)
+    assert all(f'\n  {row.name}: {as_yaml(row.default)}' in said and row.range_text in said
+               for row in TABLES[name].rows.values())
     # rules as in ROS 1, which rcl still takes
     assert answer(name, [name, '__ns:=/unit']) is None
     assert answer(name, [name, 'speed:=2.0', 'more']) == 2
     assert capsys.readouterr().err == (
-        f"{name}: unknown argument 'speed:=2.0': parameters are given as --ros-args -p "
-        'name:=value; --help says more\n')
+        f"{name}: unknown argument 'speed:=2.0': pass parameters as --ros-args -p "
+        'name:=value; see --help\n')
+
+
+@pytest.mark.parametrize(('name', 'given', 'code', 'said'), [
+    ('controller', ['system:=two_tanks'], 0, 'subscribes to: level_1, level_2, '),
+    ('plant', ['system:=two_tanks'], 0, '\n  level_1.measurement_noise: 0.0 m'),
+    # the plant of a class of one's own, and a model of a system that has no file
+    ('plant', ['system:=koopman_ros.plants.library.two_tanks:TwoTanks'], 0,
+     'publishes: level_1, level_2, '),
+    ('controller', ["system:=''", 'model:=two_tanks'], 0, 'publishes: pump_1_setpoint, '),
+    ('panel', ["system:=''", 'model:=two_tanks'], 0, '\n  level_2.shown_unit: '),
+    ('player', ['system:=none'], 0, '\n  bag: '),
+    ('plant', ['system:=none'], 1, "plant 'none': choose"),
+    ('controller', ['system:=none'], 1, "'none' has no model: name one"),
+    ('trainer', ['system:=none'], 1, 'states_measured and inputs_commanded'),
+])
+def test_help_for_a_system(name: str, given: list[str], code: int, said: str,
+                           capsys: pytest.CaptureFixture[str]) -> None:
+    parameters = [part for value in given for part in ('-p', value)]
+    for args in ([name, '--help', '--ros-args', *parameters],
+                 [name, '--ros-args', *parameters, '--help']):
+        assert answer(name, args) == code
+        assert said in ''.join(capsys.readouterr())
 
 
 def test_help_is_read_as_far_as_somebody_wants_to() -> None:

@@ -15,7 +15,7 @@ from koopman_ros.control.laws.riccati import (
     StateDependentRiccati,
 )
 
-#: by name; what is a text is imported when it is used
+#: by name; a text is imported on first use
 LAWS: dict[str, type[Law] | str] = {
     'mpc': 'koopman_ros.control.mpc:RecedingHorizon',
     'sdre': StateDependentRiccati, 'linear': Linear, 'pi': ProportionalIntegral}

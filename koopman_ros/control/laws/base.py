@@ -30,7 +30,7 @@ class Target:
     z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
     drift: Array  #: (n_x,) the model's drift there
     u: Array  #: (n_u,) input that balances drift and disturbance
-    forcing: Array  #: (n_x,) B(x_ref) u_ref + w, what acts on the state beside the drift
+    forcing: Array  #: (n_x,) B(x_ref) u_ref + w, added to the drift
     residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
@@ -67,7 +67,7 @@ class Weights:
             shape = np.shape(getattr(self, name))
             if len(shape) != 2 or shape[0] != shape[1]:
                 raise ValueError(f'incompatible {name}: expected a square matrix, got {shape}; '
-                                 'Weights.physical takes one weight a signal')
+                                 'Weights.physical takes one weight per signal')
             M = frozen(getattr(self, name), name, shape)
             values = np.linalg.eigvalsh(M)
             size = float(np.max(np.abs(values), initial=0.0))
@@ -100,7 +100,7 @@ class Weights:
 
 @dataclass(frozen=True, slots=True)
 class SolutionInfo:
-    """What a law says of its solution; NaN and '' for what it does not have."""
+    """Figures of a law's solution; NaN and '' for those that it does not have."""
 
     form: str = ''  #: which form of the law was used, for the operator
     residual: float = math.nan  #: relative residual of the Riccati equation
@@ -115,9 +115,9 @@ NO_SOLUTION = SolutionInfo()
 @dataclass(frozen=True, slots=True)
 class Plan:
     """
-    What a law with a horizon expects, in units of states and inputs, and which limits it meets.
+    The plan of a law with a horizon, in units of states and inputs, and its active limits.
 
-    Of a limit -1 says that the lower one is active, 1 the upper one, and 0 none.
+    A limit is -1 if the lower one is active, 1 for the upper one, and 0 for none.
     """
 
     times: Array  #: (N + 1,) of the nodes in s, from 0, when the plan was made
@@ -130,28 +130,36 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class LawResult:
-    """What a law gives, or why it gives nothing."""
+    """The result of a law: an input, or the reason of its failure."""
 
     #: (n_u,) in input units, which the controller brings within the limits; None with a failure
     u: Array | None
     failure: Reason | None = None  #: why it may not be used; None when it may
     info: SolutionInfo = NO_SOLUTION  #: about the solution, as far as there is one
-    memory: object = None  #: what the law wants to be given at the next sample
+    memory: object = None  #: passed to the law at the next sample
     plan: Plan | None = None  #: of a law with a horizon
     clipped: bool = False  #: whether the range cut it
     #: whether a failure is of this sample alone, so that the law acts again at the next
     passing: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class LaterInputs:
+    """Commands of some inputs act later than those of others; until then earlier ones act."""
+
+    seconds: Array  #: (n_u,) until a command of now acts; 0 for the first that does
+    #: durations in s and inputs (n_u,), in their units, that act one after another until then
+    pieces: list[tuple[float, Array]]
+
+
 class Law(ABC):
     """
     A control law on a model: from an estimate and a target to an input.
 
-    To add one, derive a class in any module and name it in `fallback_order` as
-    ``module:Class``. It is
-    constructed when the controller is configured, and then called once a sample. What it has to
-    remember it returns as `memory` and is given at the next sample; it keeps nothing itself, so
-    that a replay finds the same commands. An exception is a failure: the next level acts.
+    To add one, derive a class in any module and name it in `fallback_order` as ``module:Class``.
+    It is constructed when the controller is configured, and then called at each sample. Its memory
+    is returned as `memory` and passed in at the next sample; the law itself has no state, so a
+    replay gives the same commands. An exception is a failure: the next level acts.
 
     Example::
 
@@ -216,3 +224,15 @@ class Law(ABC):
         :param previous: (n_u,) the command before, in input units, as far as it was the law's;
             None at first.
         """
+
+    def compute_later(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                      previous: Array | None, later: LaterInputs) -> LawResult | None:
+        """
+        Find the input where some inputs act later than the others.
+
+        A law that plans ahead does so; of another one, which returns None, each input is computed
+        for the state that is predicted for the time at which it acts.
+
+        :param estimate: when the first input acts; otherwise as in :meth:`compute`.
+        """
+        return None

@@ -24,8 +24,9 @@ class PIParameters:
     """Gains and integral times; the first state with a gain moves the first input, and so on."""
 
     gain: Array = column(
-        'states', 0.0, 'Change of the command per error; the first signal with a gain moves the '
-        'first input, and so on; 0: not controlled.', 'of input/({unit})', -UNBOUNDED)
+        'states', 0.0, 'Proportional gain: change of the command per error. The first signal with '
+                       'a gain acts on the first input, and so on; 0: not '
+                       'controlled.', 'of input/({unit})', -UNBOUNDED)
     integral_time: Array = column(
         'states', 60.0, 'Integral time.', 's', maximum=86400.0, open_minimum=True)
 
@@ -51,8 +52,8 @@ class ProportionalIntegral(Law):
         self._states = np.flatnonzero(self.parameters.gain)
         if len(self._states) > model.n_u:
             names = ', '.join(model.states.names[i] for i in self._states)
-            raise ValueError(f'{model.n_u} inputs for the PI laws of {names}: set the gain to 0 '
-                             'for those that are not controlled')
+            raise ValueError(f'{model.n_u} inputs for the PI laws of {names}: set the gain of the '
+                             'other signals to 0')
 
     def unusable(self) -> Reason | None:
         """Return that there is no gain."""

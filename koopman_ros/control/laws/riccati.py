@@ -79,7 +79,7 @@ class Feedback:
 
 
 def closed(model: LiftedModel) -> bool:
-    """Tell whether the re-centred law suits a model."""
+    """Whether the re-centred law suits a model."""
     return model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes
 
 
@@ -90,8 +90,8 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     Re-centred with identity coordinates if the lift is closed, so that z goes as it predicts, and
     A has no unstable modes but those of the linearised plant, which its input moves. Averaged
-    otherwise, and when the re-centred law's equation cannot be solved: M^+ e, which the weight of
-    a free lift goes by, is a poor factorisation of the drift away from its nominal point.
+    otherwise, and when the re-centred law's equation cannot be solved: M^+ e, which weights a free
+    lift, is a poor factorisation of the drift away from its nominal point.
 
     :param x: (n_x,) scaled deviation of the measured state.
     :param interval: for which the input will be held, in the model's time unit: the gain is that
@@ -116,12 +116,12 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
 
-    e' = A e + J(x) B v + (J(x) - J(x_ref)) (B u_ref + w), and the last term is H C e with C e
-    the error of the state, so that A + H C takes the place of A. Only with identity coordinates
-    is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift. Where B
-    depends on the state it is B(x) with v and B(x_ref) with u_ref, and (B(x) - B(x_ref)) u_ref
-    = D (x - x_ref) adds J(x) D to H. Where A holds under a pre-feedback K it takes J(x) B K from
-    H, and B K x_ref from B u_ref + w, so that v and its weight R stay those of the input itself.
+    e' = A e + J(x) B v + (J(x) - J(x_ref)) (B u_ref + w), and the last term is H C e with C e the
+    error of the state, so that A + H C takes the place of A. Only with identity coordinates is C e
+    linear in e; a free lift uses M^+ e, exact on the manifold of the lift. Where B depends on the
+    state it is B(x) with v and B(x_ref) with u_ref, and (B(x) - B(x_ref)) u_ref = D (x - x_ref)
+    adds J(x) D to H. Where A holds under a pre-feedback K it takes J(x) B K from H, and B K x_ref
+    from B u_ref + w, so that v and its weight R stay those of the input itself.
 
     Arguments and result as in :func:`feedback`; of use where the input moves every mode of A that
     does not decay.
@@ -157,9 +157,9 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 
-    e' = f(x) - f(x_ref) + B v = A(x) e + B v, A the mean of df/dx from x_ref to x, and of
-    d(f + B(x) u_ref)/dx where B depends on the state. Of all A with that property it is the one
-    that says where the drift goes beside e, too. It needs no more than that (A(x), B) be
+    e' = f(x) - f(x_ref) + B v = A(x) e + B v, A the mean of df/dx from x_ref to x, and of d(f +
+    B(x) u_ref)/dx where B depends on the state. Of all A with that property it is the one that
+    also gives the drift in directions other than e. It needs no more than that (A(x), B) be
     stabilisable, so unstable modes of the lift and their products do no harm.
 
     Arguments and result as in :func:`feedback`.

@@ -18,7 +18,13 @@ from koopman_ros.core.arrays import Array, frozen
 class HorizonGrid:
     """Intervals from the present on, each with one input that is held."""
 
-    lengths: Array  #: (N,) in the model's time unit, the first that of a sample
+    lengths: Array  #: (N,) in the model's time unit
+    first: float = 0.0  #: time from a sample to the next; 0 for the first interval
+
+    @property
+    def sample(self) -> float:
+        """Time from a sample to the next."""
+        return self.first or float(self.lengths[0])
 
     @classmethod
     def growing(cls, horizon: float, first: float, count: int, longest: float) -> HorizonGrid:
@@ -43,6 +49,14 @@ class HorizonGrid:
             factor = brentq(lambda g: np.sum(g ** powers) - total, 1.0, total, xtol=1e-14)
         return cls(frozen(np.minimum(first * factor ** powers, longest), 'intervals', (count,)))
 
+    def with_nodes(self, times: Array) -> HorizonGrid:
+        """Return the grid with further nodes, as far as it reaches."""
+        every = np.unique(np.concatenate((self.times, times)))
+        # what rounding has moved from a node is that node
+        apart = np.diff(every) > 1e-9 * self.sample
+        lengths = np.diff(every[np.concatenate(([True], apart))])
+        return HorizonGrid(frozen(lengths, 'intervals', lengths.shape), self.sample)
+
     @cached_property
     def times(self) -> Array:
         """The nodes (N + 1,) between the intervals, from 0."""
@@ -51,7 +65,7 @@ class HorizonGrid:
     @property
     def since_change(self) -> Array:
         """Time (N, 1) from the input before to each input; before the first one, a sample."""
-        return np.concatenate((self.lengths[:1], self.lengths[:-1]))[:, None]
+        return np.concatenate(([self.sample], self.lengths[:-1]))[:, None]
 
     def shift(self, u: Array, x: Array, lengths: Array) -> tuple[Array, Array]:
         """
@@ -70,7 +84,7 @@ class HorizonGrid:
             (N + 1, n_x), interpolated linearly. Beyond the end of the plan its last values hold.
 
         """
-        old, new = np.concatenate(([0.0], np.cumsum(lengths))), self.lengths[0] + self.times
+        old, new = np.concatenate(([0.0], np.cumsum(lengths))), self.sample + self.times
         middle = np.searchsorted(old[1:], 0.5 * (new[1:] + new[:-1]))
         nodes = np.column_stack([np.interp(new, old, column) for column in x.T])
         return u[np.minimum(middle, len(u) - 1)], nodes

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The receding-horizon law; what it computes a plan with is loaded when it is constructed."""
+"""The receding-horizon law; numba and the solver are loaded when it is constructed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
+from koopman_ros.control.laws.base import LaterInputs, Law, LawResult, SolutionInfo, Target
 from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
@@ -41,7 +41,8 @@ class MPCParameters:
     upper: Array = value_column(
         'states', UNBOUNDED, 'Soft upper limit of this state.', name='max', none=NO_UPPER)
     time_limit: float = parameter(
-        0.0, 'Computing time of a plan after which the next law acts; 0: any.', 's', 0.0, 3600.0)
+        0.0, 'Computing time of a plan above which the next law takes over; 0: no '
+             'limit.', 's', 0.0, 3600.0)
 
 
 class RecedingHorizon(Law):
@@ -68,7 +69,7 @@ class RecedingHorizon(Law):
                              f'{np.asarray(parameters.lower).tolist()} and '
                              f'{np.asarray(parameters.upper).tolist()}')
         self._riccati = StateDependentRiccati(model, tuning, None)
-        #: what computes the plans; None where it cannot be loaded
+        #: computes the plans; None where it cannot be loaded
         self.planner: Planner | None = None
         self._unusable: Reason | None = None
         try:
@@ -95,6 +96,16 @@ class RecedingHorizon(Law):
 
         At the first sample, whose interval is not known, it is that of the Riccati equation.
         """
+        return self._planned(estimate, target, memory, interval, previous, None)
+
+    def compute_later(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                      previous: Array | None, later: LaterInputs) -> LawResult | None:
+        """Plan each input from the time on at which its command acts."""
+        return None if previous is None or not interval > 0.0 else (
+            self._planned(estimate, target, memory, interval, previous, later))
+
+    def _planned(self, estimate: Estimate, target: Target, memory: object, interval: float,
+                 previous: Array | None, later: LaterInputs | None) -> LawResult:
         planner = self.planner
         if planner is None:
             return LawResult(None, self._unusable)
@@ -102,7 +113,7 @@ class RecedingHorizon(Law):
             return self._riccati.compute(estimate, target, None, interval, previous)
         began, limit = time.perf_counter(), self.parameters.time_limit or math.inf
         try:
-            problem = planner.problem(estimate, target, interval, previous)
+            problem = planner.problem(estimate, target, interval, previous, later)
             u, x = planner.first_guess(problem, memory)
             for iteration in range(1, _MAX_ITERATIONS + 1):
                 found = planner.improve(problem, u, x)
@@ -127,5 +138,5 @@ class RecedingHorizon(Law):
                 StatusCode.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
         plan = planner.plan(problem, u, x)
         return LawResult(
-            plan.inputs[0], info=SolutionInfo('planned'), memory=(u, x, problem.grid.lengths),
-            plan=plan, clipped=bool(plan.at_range.any()))
+            self.model.inputs.to_physical(problem.commanded(u)), info=SolutionInfo('planned'),
+            memory=(u, x, problem.grid.lengths), plan=plan, clipped=bool(plan.at_range.any()))

@@ -13,7 +13,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control.laws.base import Plan, Target, Weights
+from koopman_ros.control.laws.base import LaterInputs, Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
 from koopman_ros.control.mpc import own_drift
 from koopman_ros.control.mpc.condensing import condense, drift, roll_out
@@ -59,6 +59,18 @@ class PlanningProblem:
     steps: int  #: of the integration in each interval
     terminal: Array  #: (n_x, n_x) weight of the error at the end
     change: Array  #: (N, n_u) largest change of an input from one interval to the next
+    #: (n_u,) interval in which the command of each input acts first
+    begins: NDArray[np.intp]
+    under_way: Array  #: (N, n_u) inputs that act until then; anything from there on
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which inputs (N, n_u) of a plan are to be found."""
+        return np.arange(len(self.change))[:, None] >= self.begins
+
+    def commanded(self, u: Array) -> Array:
+        """Return the inputs (n_u,) of a plan (N, n_u) that are commanded now."""
+        return u[self.begins, np.arange(u.shape[1])]
 
 
 class Planner:
@@ -90,31 +102,55 @@ class Planner:
     # The problem of a sample.
 
     def problem(self, estimate: Estimate, target: Target, interval: float,
-                previous: Array | None) -> PlanningProblem:
+                previous: Array | None, later: LaterInputs | None = None) -> PlanningProblem:
         """
         Return the problem of an estimate and a target.
 
         :param interval: seconds between samples.
         :param previous: (n_u,) last command, in input units, or None.
+        :param later: which inputs act later than others, or None.
         """
-        model, grid = self._model, self.grid(interval)
+        model = self._model
+        after = np.zeros(model.n_u) if later is None else (
+            later.seconds / model.seconds_per_time_unit)
+        grid = self.grid(interval, float(np.max(after, initial=0.0)))
+        if later is not None:
+            grid = grid.with_nodes(after)
+        begins = np.searchsorted(grid.times, after - 1e-6 * grid.sample)
+        change = grid.since_change * self._rate
+        change[begins, np.arange(model.n_u)] = grid.sample * self._rate
         # B(x) changes the slope with the input
         fastest, terminal = self._cost_to_go(
             tuple(target.x.tolist()),
             () if model.input_terms is None else tuple(target.u.tolist()),
-            float(grid.lengths[0]))
+            grid.sample)
         rate = max(_fastest(self._slope), fastest, _fastest(self._jacobian(estimate.x)))
         steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
         return PlanningProblem(
             estimate.x, estimate.w, target,
             None if previous is None else model.inputs.to_deviation(previous), grid, steps,
-            terminal, grid.since_change * self._rate)
+            terminal, change, begins, np.zeros_like(change) if later is None else (
+                self._under_way(grid, later.pieces)))
 
-    def grid(self, interval: float) -> HorizonGrid:
-        """Return the horizon for samples so many seconds apart."""
-        return self._grid(interval / self._model.seconds_per_time_unit)
+    def grid(self, interval: float, after: float = 0.0) -> HorizonGrid:
+        """
+        Return the horizon for a sample interval in s.
 
-    def _new_grid(self, sample: float) -> HorizonGrid:
+        :param after: time until all inputs act, by which it is longer.
+        """
+        return self._grid(interval / self._model.seconds_per_time_unit, after)
+
+    def _under_way(self, grid: HorizonGrid, pieces: list[tuple[float, Array]]) -> Array:
+        """Return the means (N, n_u) of inputs that act one after another."""
+        model = self._model
+        durations = np.array([seconds for seconds, _ in pieces]) / model.seconds_per_time_unit
+        impulse = np.vstack((np.zeros((1, model.n_u)), np.cumsum(durations[:, None] * [
+            model.inputs.to_deviation(u) for _, u in pieces], axis=0)))
+        times = np.concatenate(([0.0], np.cumsum(durations)))
+        return np.diff(np.column_stack([np.interp(grid.times, times, one) for one in impulse.T]),
+                       axis=0) / grid.lengths[:, None]
+
+    def _new_grid(self, sample: float, after: float) -> HorizonGrid:
         A, B = self._slope, self._model.B
         found = self._regulator(A, B, sample)
         horizon = _MAX_INTERVALS * sample
@@ -124,6 +160,7 @@ class Planner:
         growing = float(np.max(np.linalg.eigvals(A).real))
         if growing > 0.0:
             horizon = min(horizon, _UNSTABLE / growing)
+        horizon += after
         count = int(min(max(math.ceil(horizon / sample), _MIN_INTERVALS), _MAX_INTERVALS))
         # modes much faster than those of the closed loop end it sooner
         fastest = _fastest(A)
@@ -141,7 +178,7 @@ class Planner:
         found = self._regulator(A, model.input_matrix(x), sample)
         # without a regulator the horizon alone counts
         return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
-            self._weights.Q * float(self._grid(sample).lengths[-1]))
+            self._weights.Q * float(self._grid(sample, 0.0).lengths[-1]))
 
     def _jacobian(self, x: Array) -> Array:
         if self._own_drift:
@@ -164,6 +201,7 @@ class Planner:
                     u.shape == (len(lengths), self._model.n_u)
                     and x.shape == (len(lengths) + 1, self._model.n_x)):
                 inputs, nodes = problem.grid.shift(u, x, lengths)
+                inputs = np.where(problem.free, inputs, problem.under_way)
                 nodes[0] = problem.start
                 return inputs, nodes
         return self._under_feedback(problem)
@@ -172,13 +210,17 @@ class Planner:
         """Simulate the model under the state-dependent Riccati law with its limits."""
         model, target, x, last = self._model, problem.target, problem.start, problem.previous
         inputs, nodes = [], [x]
-        for length, change in zip(problem.grid.lengths.tolist(), problem.change, strict=True):
+        for length, change, free, known in zip(
+                problem.grid.lengths.tolist(), problem.change, problem.free, problem.under_way,
+                strict=True):
             found = feedback(model, x, target, self._weights, interval=length,
                              max_gain=self._tuning.max_gain,
                              max_residual=self._tuning.max_riccati_residual)
             u = found.u if found.solved and np.isfinite(found.u).all() else target.u
             u = np.clip(u, self._lower, self._upper)
-            last = u = u if last is None else np.clip(u, last - change, last + change)
+            u = u if last is None else np.clip(u, last - change, last + change)
+            last = u if last is None else np.where(free, u, last)
+            u = np.where(free, u, known)
             rate = model.rate_under(u, problem.w)
             for _ in range(problem.steps):
                 x = runge_kutta_step(rate, x, length / problem.steps)
@@ -206,37 +248,44 @@ class Planner:
         ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
                       roll_out(self._arrays, *given))
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
-            return reason(StatusCode.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
+            return reason(StatusCode.PLAN_NOT_SOLVED, flag='the trajectory is not finite')
         nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
+        free = problem.free.ravel()
+        if not free.all():
+            by_inputs, H, f = by_inputs[..., free], H[np.ix_(free, free)], f[free]
         A, lower, upper, sense = self._constraints(problem, u, nodes, by_inputs)
         v, _, flag, _ = daqp.solve(H, f, A, upper, lower, sense)
         v = np.asarray(v, dtype=np.float64)
         change = float(np.abs(v).max())
         if flag not in _SOLVED or not math.isfinite(change):
             return reason(StatusCode.PLAN_NOT_SOLVED, flag=f'daqp returns {flag}')
-        return change, u + v.reshape(u.shape), nodes + by_inputs @ v
+        moved = np.zeros(u.size)
+        moved[free] = v
+        return change, u + moved.reshape(u.shape), nodes + by_inputs @ v
 
     def _constraints(self, problem: PlanningProblem, u: Array, nodes: Array, by_inputs: Array
                      ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
         """Return A with lower <= (v, A v) <= upper for a change v, and which rows are soft."""
-        last, lower, upper = problem.previous, self._lower, self._upper
-        limited = np.isfinite(problem.change)
+        last, lower, upper, free = problem.previous, self._lower, self._upper, problem.free
+        limited = np.isfinite(problem.change) & free
         steps = np.diff(u, axis=0, prepend=u[:1] if last is None else last[None])
+        if last is not None:
+            steps[problem.begins, np.arange(u.shape[1])] = problem.commanded(u) - last
         if last is None:
             limited[0] = False
         else:
             # an input outside a range that was narrowed returns at its rate
             reach = np.cumsum(problem.change, axis=0)
             lower, upper = np.minimum(lower, last + reach), np.maximum(upper, last - reach)
-        count, n_u = u.size, u.shape[1]
-        differences = (np.eye(count) - np.eye(count, k=-n_u))[limited.ravel()]
+        count, n_u = int(np.count_nonzero(free)), u.shape[1]
+        differences = (np.eye(u.size) - np.eye(u.size, k=-n_u))[limited.ravel()][:, free.ravel()]
         change, steps = problem.change[limited], steps[limited]
         bounded = np.isfinite(self._state_lower) | np.isfinite(self._state_upper)
         states = nodes[1:, bounded].ravel()
         low, high = (np.tile(bound[bounded], len(u))
                      for bound in (self._state_lower, self._state_upper))
-        lower = np.concatenate(((lower - u).ravel(), -change - steps, low - states))
-        upper = np.concatenate(((upper - u).ravel(), change - steps, high - states))
+        lower = np.concatenate(((lower - u)[free], -change - steps, low - states))
+        upper = np.concatenate(((upper - u)[free], change - steps, high - states))
         sense = np.zeros(len(lower), dtype=np.int32)
         sense[count + len(change):] = _SOFT
         return (np.concatenate((differences, by_inputs[1:, bounded].reshape(-1, count))),
@@ -246,13 +295,14 @@ class Planner:
 
     def plan(self, problem: PlanningProblem, u: Array, x: Array) -> Plan:
         """Return a plan in the units of the signals, and its active limits."""
-        model, first = self._model, u[0]
+        model, first = self._model, problem.commanded(u)
         step = np.zeros(model.n_u) if problem.previous is None else first - problem.previous
         return Plan(
             problem.grid.times * model.seconds_per_time_unit, model.states.to_physical(x),
             model.inputs.to_physical(u),
             _active(first, first, self._lower, self._upper, _AT_INPUT),
-            _active(step, step, -problem.change[0], problem.change[0], _AT_INPUT),
+            _active(step, step, -problem.commanded(problem.change),
+                    problem.commanded(problem.change), _AT_INPUT),
             _active(x[1:].min(axis=0), x[1:].max(axis=0), self._state_lower, self._state_upper,
                     _AT_STATE))
 

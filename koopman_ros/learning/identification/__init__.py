@@ -14,6 +14,7 @@ from koopman_ros.learning.identification.base import (
     DriftProblem,
     IdentificationMethod,
 )
+from koopman_ros.learning.identification.dead_time import DeadTimes, find_dead_times
 from koopman_ros.learning.identification.drift import (
     box_of,
     Drift,
@@ -43,6 +44,7 @@ from koopman_ros.learning.identification.unmeasured_states import identify_unmea
 from koopman_ros.learning.identification.weak_form import weak_form, WeakForm
 
 __all__ = [
+    'DeadTimes',
     'Drift',
     'DriftEstimate',
     'DriftModel',
@@ -59,6 +61,7 @@ __all__ = [
     'WeakFormParameters',
     'box_of',
     'estimate_parameters',
+    'find_dead_times',
     'fitted_starts',
     'identify',
     'identify_unmeasured',

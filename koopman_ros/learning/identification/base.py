@@ -44,8 +44,8 @@ class IdentificationMethod(ABC):
     """
     An estimate of a drift from noisy samples.
 
-    A class of one's own is named as ``module:Class`` in the parameter `identification_methods`;
-    its own parameters are then ``Class.<parameter>``::
+    A custom class is named as ``module:Class`` in the parameter `identification_methods`; its own
+    parameters are then ``Class.<parameter>``::
 
         class Finest(IdentificationMethod):
             Parameters = FinestParameters

@@ -63,40 +63,26 @@ class SplitRecord:
         self.period = float(np.median(np.concatenate([np.diff(p.time) for p in self.parts])))
 
     def segments(self, parts: Sequence[int], samples: int | None = None) -> Segments:
-        """Return some segments on grids, cut into pieces of at most so many samples."""
+        """Return some segments on grids, cut into pieces of a largest number of samples."""
         return Segments.of(self._pieces([self.parts[i] for i in parts], samples), self.step)
 
     def foreseen(self, predictor: Predictor[Drift], parts: Sequence[int],
                  samples: int | None = None) -> Array:
-        """Return the states (M, n_x) foreseen for the first samples of these, in deviations."""
+        """Return the predicted states (M, n_x) of the first samples of these, in deviations."""
         run = self._run(predictor)
         pieces = self._pieces([replace(self.parts[i], x=self._rows[i][:, None].astype(float))
                                for i in parts], samples)
         return run.foreseen[[int(piece.x[0, 0]) for piece in pieces]]
 
-    def simulated(self, predictor: Predictor[Drift], samples: int, fit: Sequence[int],
-                  judge: Sequence[int], settling: int) -> tuple[Segments, Segments, Array]:
+    def simulated(self, predictor: Predictor[Drift], samples: int) -> tuple[Segments, Array]:
         """
-        Return the record in pieces for simulations, which go on through what does not count.
+        Return the whole record in pieces with at most a number of samples, for simulations.
 
-        :param samples: longest piece.
-        :param settling: first samples of each piece, which count with the segments to fit to:
-            they determine the start.
-        :return: pieces of which the segments to fit to count, the same with those to judge by, and
-            the states (M, n_x) foreseen for their first samples, in deviations.
+        With them the predicted states (M, n_x) of their first samples, in deviations.
         """
-        pieces, numbers = cut(self._episodes, samples), cut(self._numbered, samples)
-        rows = [piece.x[:, 0].astype(int) for piece in numbers]
-        counts = np.zeros((1 + max(int(own[-1]) for own in rows), 2))
-        counts[self._rows_of(fit), 0] = counts[self._rows_of(judge), 1] = 1.0
-        for own in rows:
-            counts[own[:settling]] = 1.0, 0.0
-        data = Segments.of(pieces, self.step)
-        flags = Segments.of([replace(piece, x=counts[own])
-                             for piece, own in zip(pieces, rows, strict=True)], self.step).x
-        fitted, judged = (replace(data, measured=data.measured & (flags[..., i] > 0.0))
-                          for i in range(2))
-        return fitted, judged, self._run(predictor).foreseen[[int(own[0]) for own in rows]]
+        rows = [int(piece.x[0, 0]) for piece in cut(self._numbered, samples)]
+        return (Segments.of(cut(self._episodes, samples), self.step),
+                self._run(predictor).foreseen[rows])
 
     def innovations(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None
                     ) -> Array:
@@ -104,7 +90,7 @@ class SplitRecord:
         return self._run(predictor).innovations[self._rows_of(parts)]
 
     def estimates(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None) -> Array:
-        """Return the states (N, n_x) as they are estimated there, likewise, in deviations."""
+        """Return the estimated states (N, n_x) there, in deviations."""
         return self._run(predictor).estimates[self._rows_of(parts)]
 
     def identified(self, predictor: Predictor[Drift], method: str, scores: Sequence[Score],

@@ -157,7 +157,7 @@ class DriftModel(Drift):
         return InputTerms.regressors(xi, v, self.input_degree)
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
-        """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
+        """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
         return self.slope_of(self.features(xi), xi, v)
 
     def slope_of(self, features: Array, xi: Array, v: Array | None) -> Array:
@@ -219,7 +219,7 @@ class Segments:
         return cls(steps, u, x, measured)
 
     def repeated(self, count: int) -> Segments:
-        """Return all of them so many times, one round of them after the other."""
+        """Return all of them a number of times, one round after the other."""
         return Segments(*(np.tile(one, (1, count, *[1] * (one.ndim - 2)))
                           for one in (self.steps, self.u, self.x, self.measured)))
 
@@ -304,10 +304,10 @@ def gauss_newton_step(slopes: Array, errors: Array) -> Array | None:
 
 def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
     """
-    Find a state and an input near given ones under which the drift stands still.
+    Find a steady state of the drift and its input near given ones.
 
-    With as many inputs as states the state stays what it is; otherwise both move as little as
-    they can, in units of their range. ValueError when there is none nearby.
+    With as many inputs as states the state is unchanged; otherwise both move as little as they
+    can, in units of their range. ValueError when there is none nearby.
 
     :param x: (n_x,) in state units.
     :param u: (n_u,) in input units.

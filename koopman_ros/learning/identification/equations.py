@@ -95,7 +95,7 @@ class Equations(Drift):
         return np.sin(self.theta)
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
-        """Evaluate the rate in deviations as :class:`Drift` has it."""
+        """Evaluate the rate in deviations; see :class:`Drift`."""
         rate: Array = _rate(self._system, *self._own(xi, v)).take(self._back, axis=-1)
         return rate * self._pace
 
@@ -112,7 +112,7 @@ class Equations(Drift):
         return rate, dS
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
-        """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
+        """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
         x, u = self._own(xi, np.zeros(len(self.box.inputs)) if v is None else v)
         scale = self.box.states.scale
         slope = self._system.slope(x, u)[..., self._back[:, None], self._back]
@@ -125,7 +125,7 @@ class Equations(Drift):
         return callable(self._system.B)
 
     def scaled_input_matrix(self, xi: Array) -> Array:
-        """Evaluate B(x) in deviations as :class:`Drift` has it."""
+        """Evaluate B(x) in deviations; see :class:`Drift`."""
         x = self.box.states.to_physical(xi)
         B = self._speed * (self._system.input_matrix(x[..., self._states])
                            if self.varying_input_matrix else np.asarray(self._system.B))
@@ -193,5 +193,5 @@ def _check(system: ControlAffineSystem, plant: Any, known: PlantDescription) -> 
         if not given.items() <= own.items() or (whole and given != own):
             said, needed = (', '.join(f'{name} [{unit}]' for name, unit in one.items()) or 'none'
                             for one in (given, own))
-            raise ValueError(f'the record has the {kind}s {said}, {plant.__name__} has {needed}: '
-                             'give the names and units of the class')
+            raise ValueError(f'the record has the {kind}s {said}, but {plant.__name__} has '
+                             f'{needed}: use the names and units of the class')

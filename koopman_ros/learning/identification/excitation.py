@@ -52,9 +52,9 @@ def check_inputs(plant: PlantDescription, episodes: Sequence[Episode]) -> tuple[
                if len(names) == 2 else f'condition index {index:.3g}')
     said = f'{", ".join(names[:-1])} and {names[-1]} moved together ({measure})'
     if index >= _STRONG:
-        raise ValueError(f'{said}: the effect of each is not in the record, step them '
+        raise ValueError(f'{said}: their separate effects cannot be identified; step them '
                          'independently')
-    return (f'{said}: the effect of each is uncertain, step them independently',)
+    return (f'{said}: their separate effects are uncertain; step them independently',)
 
 
 def _window_means(episodes: Sequence[Episode]) -> Array:
@@ -84,8 +84,8 @@ def _noise_of_means(names: Sequence[str], episodes: Sequence[Episode], means: Ar
         chance = _SIGMAS * np.sqrt(2.0 / len(means))
         if 0.0 < variance < (1.0 + chance) * deviation ** 2 / _WINDOW:
             raise ValueError(
-                f'{name} moved no more than white noise does (standard deviation '
-                f'{deviation:.3g}): step it, and hold each step for several measurements')
+                f'{name} did not move more than white noise (standard deviation {deviation:.3g}): '
+                'step it, and hold each step for several measurements')
         # the median is not moved by steps; an input that changes at each sample is no noise
         steps = np.abs(np.concatenate([np.diff(part) for part in samples]))
         sigma = float(np.median(steps)) / (_MEDIAN * np.sqrt(2.0))

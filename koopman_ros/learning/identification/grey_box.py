@@ -52,13 +52,13 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     """
     Estimate constants of a plant's equations from a record of some of its states.
 
-    Constants, the gain of a filter and the starts of all segments are refined until the next
-    measurement is foreseen best: the innovations form (Ljung 1999, section 4.3), by
+    Constants, the gain of a filter and the starts of all segments are refined for the best
+    prediction of the next measurement: the innovations form (Ljung 1999, section 4.3), by
     Levenberg-Marquardt with the exact derivatives of the Runge-Kutta steps, of the equations by
     their Jacobian, and by the constants to ten digits by differences. The filter keeps the
-    predictor stable where the plant is not, and finds states that are not measured, which have
-    the names and units of the class. The search begins at the values of the class. Standard
-    errors are those of least squares (Ljung 1999, section 9.4), outputs taken as uncorrelated.
+    predictor stable where the plant is not, and finds states that are not measured, which have the
+    names and units of the class. The search begins at the values of the class. Standard errors are
+    those of least squares (Ljung 1999, section 9.4), outputs taken as uncorrelated.
 
     :param plant: names and units of the measured signals; B and the nominal point play no part.
     :param equations: a plant's class, see :func:`koopman_ros.plants.plant_class`.
@@ -67,7 +67,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     :return: an estimate with `constants`; its first states are the measured ones.
     :raises ValueError: when names, units or ranges do not fit the class, the episodes are too
         short, or the equations follow none of them.
-    :raises Stopped: when `watch` asked for it.
+    :raises Stopped: when `watch` requested it.
     """
     plant = replace(plant, B=None, input_matrix_degree=0)
     sought = estimated_parameters_of(equations, ranges or {})
@@ -108,8 +108,8 @@ def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equati
             with contextlib.suppress(ValueError):  # it diverges
                 tried.append((float(np.mean(record.innovations(one) ** 2)), noise, one))
     if not tried:
-        raise ValueError(f'with the constants to begin with, the {model.form} follow the episodes '
-                         'in no filter: give ranges about values that are nearer')
+        raise ValueError(f'with the initial constants, the {model.form} reproduce the episodes '
+                         'with no filter: give ranges closer to the true values')
     return min(tried, key=lambda one: one[:2])[2]
 
 
@@ -119,7 +119,7 @@ def _refined(record: SplitRecord, start: Predictor[Equations], monitor: Callable
     Refine the constants on the segments to fit to, without a gain and with that of a filter.
 
     Without one the estimate is that of maximum likelihood where nothing but the sensors is noisy,
-    and a gain would bias what is found from closed loop. With one it follows a plant that is
+    and a gain would bias the estimate from closed-loop data. With one it follows a plant that is
     disturbed, too. The one is taken that foresees the measurements better.
 
     :return: the equations with the filter that goes through all episodes, and how they were found.
@@ -158,8 +158,7 @@ def _within(record: SplitRecord, predictor: Predictor[Equations]) -> Predictor[E
     low, high = (np.concatenate((end[:n_y], of(x[:, n_y:], axis=0))) for end, of in (
         (old.lower, np.min), (old.upper, np.max)))
     if not np.all(high > low):
-        raise ValueError('a state that is not measured never moves: record longer, with steps of '
-                         'the input')
+        raise ValueError('an unmeasured state is constant: record longer, with steps of the input')
     new = Coordinates.spanning(old.names, old.units, low, high)
     gain = predictor.gain * old.scale[:, None] / old.scale[:n_y] * (
         new.scale[:n_y] / new.scale[:, None])

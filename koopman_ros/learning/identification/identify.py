@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 import itertools
 import math
@@ -62,7 +62,7 @@ def stage_by_stage(watch: Watch, total: int, done: int = 0
     """
     Return a function that begins the next of `total` stages and returns its monitor.
 
-    Of the stages so many are `done` already.
+    `done` stages are already complete.
 
     A stage reports when it begins and whenever its monitor is called, which raises
     :class:`Stopped` when `watch` asked to stop.
@@ -97,18 +97,15 @@ class EstimateStatus(Enum):
     """Reliability of the estimate of a constant; the value is the sentence for the user."""
 
     ESTIMATED = ''
-    AT_LOWER_END = ('it ends at the lower end of its range: widen the range, or look for what '
-                    'else is not as the equations say')
-    AT_UPPER_END = ('it ends at the upper end of its range: widen the range, or look for what '
-                    'else is not as the equations say')
-    NOT_IDENTIFIABLE = ('the record tells no more of it than its range does: give its value in '
-                        'place of a range, or that of another constant that acts as it does, or '
-                        'record more')
+    AT_LOWER_END = ('at the lower end of its range: widen the range, or check the equations')
+    AT_UPPER_END = ('at the upper end of its range: widen the range, or check the equations')
+    NOT_IDENTIFIABLE = ('not identifiable from the record: fix its value, or that of another '
+                        'constant with the same effect, or record more')
 
 
 @dataclass(frozen=True)
 class EstimatedConstant:
-    """A constant of a plant's equations, as a record tells it."""
+    """A constant of a plant's equations, as estimated from a record."""
 
     name: str  #: of the field of the plant's class
     unit: str  #: of SI, as the plant node has it
@@ -143,6 +140,9 @@ class Identified:
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()
     warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
+    #: (n_u,) by which the inputs of the segments are later than those of the record, in time
+    #: units; empty for none
+    dead_time: Array = field(default_factory=lambda: np.empty(0))
 
     __repr__ = short_repr
 
@@ -162,14 +162,14 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
 
     :param plant: names, units, and B where it is known, or the degree of the B(x) to learn.
     :param degrees: of f that are tried, rising, the first one 1; by default those whose drift has
-        few enough coefficients for so many states.
+        few enough coefficients for the number of states.
     :param methods: by name, in the order in which they pass a rough B on; all of ``METHODS`` by
         default.
     :param seed: of the split.
     :param backend: where the degrees are estimated, each by itself; this process by default.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
         nothing fits.
-    :raises Stopped: when `watch` asked for it.
+    :raises Stopped: when `watch` requested it.
     """
     n_x, n_u = len(plant.state_names), len(plant.input_names)
     degrees = degrees or tuple(degree for degree in DEGREES if degree == 1
@@ -269,13 +269,13 @@ def _candidate(given: _Given, degree: int, tell: Tell) -> _DegreeCandidate:
 
 
 def segments_of(episodes: Sequence[Episode], signals: int) -> list[Episode]:
-    """Cut into segments, of which three fifths may hold the extremes of so many signals."""
+    """Cut into segments, of which three fifths may hold the extremes of the signals."""
     low, high = _SEGMENT_SAMPLES
     count = max(_SEGMENTS, math.ceil(2 * signals / _FITTED))
     total = sum(len(episode) for episode in episodes)
     if total < _FEWEST * low:
-        raise ValueError(f'{total} samples are too few to learn from and to judge by: record at '
-                         f'least {_FEWEST * low}, better some thousand')
+        raise ValueError(f'{total} samples are too few for training and testing: record at least '
+                         f'{_FEWEST * low}, better several thousand')
     parts = cut(episodes, min(high, max(low, total // count)))
     kept = [part for part in parts if len(part) >= low // 2]
     if len(kept) < _FEWEST:
@@ -296,8 +296,8 @@ def split(parts: Sequence[Episode], seed: int) -> tuple[list[int], list[int], li
     free = [i for i in np.random.default_rng(seed).permutation(len(parts)).tolist()
             if i not in furthest]
     if len(free) < 2:
-        raise ValueError(f'all but {len(free)} of {len(parts)} segments hold the lowest or the '
-                         'highest of a state or an input, none is left to judge by: record longer')
+        raise ValueError(f'all but {len(free)} of {len(parts)} segments contain the lowest or '
+                         'highest value of a signal, so none can be held out: record longer')
     fifth = min(max(1, len(parts) // 5), len(free) // 2)
     choose, held_out = free[:fifth], free[fifth:2 * fifth]
     fit = furthest.union(free[2 * fifth:])

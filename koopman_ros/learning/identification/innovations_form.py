@@ -71,7 +71,7 @@ class Predictor(Generic[_Drift]):
         return states.only(states.names[:self.gain.shape[1]]).to_deviation(data.x)
 
     def _starts(self, data: Segments) -> Array:
-        """Return starts (M, n_x) from which the first measurements are foreseen, in deviations."""
+        """Return initial states (M, n_x) that predict the first measurements, in deviations."""
         taken = np.cumsum(data.measured, axis=0).max(axis=1)
         rows = min(int(np.sum(taken <= SETTLING)), len(data.steps))
         first = Segments(data.steps[:rows], data.u[:rows], data.x[:rows + 1],
@@ -152,7 +152,7 @@ def standardised(predictor: Predictor[DriftModel], xi: Array) -> Predictor[Drift
     turned = rest @ rest_axes.T
     low, high = turned.min(axis=0), turned.max(axis=0)
     if not np.all(high > low):
-        raise ValueError('a state that is not measured never moves')
+        raise ValueError('an unmeasured state is constant')
     S = np.eye(len(xi.T))
     S[n_y:, n_y:] = 2.0 * rest_axes / (high - low)[:, None]
     S[n_y:, :n_y] = -S[n_y:, n_y:] @ weights[1:].T

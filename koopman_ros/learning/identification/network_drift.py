@@ -64,6 +64,11 @@ class NetworkDrift(Drift):
         return False
 
     @property
+    def bounded(self) -> bool:
+        """Whether the state stays bounded with bounded inputs, whatever the network is."""
+        return bool(np.all(np.linalg.eigvals(self.A).real < 0.0))
+
+    @property
     def drift(self) -> NetworkDrift:
         """Itself."""
         return self
@@ -104,17 +109,17 @@ class NetworkDrift(Drift):
         return replace(self, **arrays)
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
-        """Evaluate the rate in deviations as :class:`Drift` has it."""
+        """Evaluate the rate in deviations; see :class:`Drift`."""
         network = self.pace * np.tanh(xi @ self.W1.T + self.b1) @ self.W2.T
         rate: Array = xi @ self.A.T + v @ self.B.T + self.c + network
         return rate
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
-        """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
+        """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
         return self.A + self._weighed(np.tanh(xi @ self.W1.T + self.b1)) @ self.W1
 
     def scaled_input_matrix(self, xi: Array) -> Array:
-        """Evaluate B in deviations as :class:`Drift` has it."""
+        """Evaluate B in deviations; see :class:`Drift`."""
         return self.B
 
     def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Generic, Protocol, Self, TypeVar
@@ -25,6 +25,7 @@ from koopman_ros.learning.lift.levenberg_marquardt import (
 )
 
 _MAX_ITERATIONS = 40
+_BLOCK = 200_000  # numbers of derivatives that are evaluated at once
 
 
 class Refinable(Protocol):
@@ -70,7 +71,7 @@ class PolynomialCoefficients:
             drift, B=B, coefficients=theta[:n].reshape(drift.coefficients.shape)))
 
     def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
-        """Evaluate rates of states and sensitivities as :class:`Refinable` has it."""
+        """Evaluate rates of states and sensitivities; see :class:`Refinable`."""
         drift, n_x = self.drift, xi.shape[1]
         features, inputs = drift.features(xi), drift.regressors(xi, v)
         rate = drift.rate_of(features, inputs)
@@ -139,6 +140,18 @@ class Refined(Generic[_Model]):
         matrix: Array = found.matrix.numpy() * self._problem.count
         return matrix
 
+    def left_out(self, samples: int) -> Array:
+        """
+        Return the errors (N, n_y) of samples in models that were not fitted to them.
+
+        Segments of this length are left out one by one, with a model linearised in its parameters:
+        e = (I - H)^-1 r with the hat matrix H of the segment (Cook and Weisberg 1982). The errors
+        have the weights of the cost; the pieces of the record follow each other.
+
+        :param samples: of a segment.
+        """
+        return self._problem.left_out(self._theta, samples)
+
 
 def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Array,
                      deviation: Array, *, settling: int = 0, smooth: bool = False,
@@ -146,12 +159,12 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
                      iterations: int = _MAX_ITERATIONS,
                      monitor: Callable[[int, float], bool] | None = None) -> Refined[_Model]:
     """
-    Refine a drift model and a filter's gain until the next measurement is foreseen best.
+    Refine a drift model and a filter's gain for the best prediction of the next measurement.
 
-    dx/dt = f(x) + B u, and at each measurement y of the first n_y states x becomes
-    x + K (y - C x), C = [1 0] (the innovations form, Ljung 1999, section 4.3). The predictor is
-    stable where the plant is not, and the other states need not be measured: their coordinates
-    are what they come out as, where the model does not say what they are.
+    dx/dt = f(x) + B u, and at each measurement y of the first n_y states x becomes x + K (y - C
+    x), C = [1 0] (the innovations form, Ljung 1999, section 4.3). The predictor is stable where
+    the plant is not, and the other states need not be measured: their coordinates are arbitrary
+    unless the model defines them.
 
     :param gain: (n_x, n_y) K to begin with, in deviations.
     :param segments: with n_y columns of measurements.
@@ -223,47 +236,16 @@ class _Problem(Generic[_Model]):
 
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
         """Add the scaled prediction errors at given parameters."""
-        model, K, x = self.split(theta.numpy())
-        data, target = self.segments, self._target
-        M, n_x = x.shape
-        n_y = target.shape[2]
-        # starts of a simulation are refined without a gain
-        corrected = not self.smooth or bool(np.any(K))
-        p = len(self.model.theta) + (0 if self.smooth else K.size)
-        weight = 1.0 / self.deviation
-        y, sums = x[..., None], None
-        if equations.derivatives:
-            starts = n_x if self.smooth else 0
-            sums = _Sums(M, p, starts)
-            # beside the state its change with the model's parameters and with the start
-            y = np.concatenate((y, np.zeros((M, n_x, p)),
-                                np.broadcast_to(np.eye(n_x, starts), (M, n_x, starts))), axis=-1)
-        cost = 0.0
+        model, K, starts = self.split(theta.numpy())
         with np.errstate(all='ignore'):
-            for k in range(len(data.steps) + 1):
-                counted = self._counted[k]
-                seen = y[:, :n_y]
-                error = seen[..., 0] - target[k]
-                weighed = np.where(counted, weight * error, 0.0)
-                cost += 0.5 * float(np.sum(weighed ** 2)) / self.count
-                if not np.isfinite(cost):
-                    equations.add_sums(np.inf)
-                    return
-                if sums is not None:
-                    sums.add(np.where(counted[..., None], weight[:, None] * seen[..., 1:], 0.0),
-                             weighed)
-                if corrected:
-                    measured = data.measured[k][:, None]
-                    correction = K @ np.concatenate((error[..., None], seen[..., 1:]), axis=-1)
-                    if sums is not None and not self.smooth:
-                        for i in range(n_x):
-                            first = 1 + p - K.size + i * n_y
-                            correction[:, i, first:first + n_y] += error
-                    y = y - np.where(measured[..., None], correction, 0.0)
-                if k < len(data.steps):
-                    y = runge_kutta_step(partial(_rates, model, self._inputs[k]), y,
-                                         data.steps[k][:, None, None])
-        found = () if sums is None else sums.result()
+            before, after = self._path(model.drift, K, starts)
+            errors = np.where(self._counted, before[..., :self._target.shape[2]] - self._target,
+                              0.0) / self.deviation
+            cost = 0.5 * float(np.sum(errors ** 2)) / self.count
+            if not np.isfinite(cost):
+                equations.add_sums(np.inf)
+                return
+            found = self._sums(model, K, before, after, errors) if equations.derivatives else ()
         equations.add_sums(cost, *(torch.from_numpy(a / self.count) for a in found))
         if self.penalty is not None:
             weights = np.zeros(len(theta))
@@ -272,35 +254,111 @@ class _Problem(Generic[_Model]):
             equations.add_sums(0.5 * float(slope @ theta.numpy()), *(
                 map(torch.from_numpy, (slope, np.diag(weights))) if found else ()))
 
-
-class _Sums:
-    """J' r and J' J, whose rows of starts touch only their own segment."""
-
-    def __init__(self, M: int, p: int, starts: int) -> None:
-        self._p = p
-        self._gradient = np.zeros((M, p + starts))
-        self._matrix = np.zeros((M, p + starts, p + starts))
-
-    def add(self, S: Array, error: Array) -> None:
-        self._gradient += (S.transpose(0, 2, 1) @ error[..., None])[..., 0]
-        self._matrix += S.transpose(0, 2, 1) @ S
-
-    def result(self) -> tuple[Array, Array]:
-        p, (M, size) = self._p, self._gradient.shape
-        n_x = size - p
-        gradient = np.concatenate((self._gradient[:, :p].sum(axis=0),
-                                   self._gradient[:, p:].ravel()))
-        matrix = np.zeros((len(gradient), len(gradient)))
-        matrix[:p, :p] = self._matrix[:, :p, :p].sum(axis=0)
+    def left_out(self, theta: Array, samples: int) -> Array:
+        """Return the errors as :meth:`Refined.left_out` has them."""
+        model, K, starts = self.split(theta)
+        p, (M, n_x), n_y = len(self.model.theta), starts.shape, self._target.shape[2]
+        q = p + (n_x if self.smooth else K.size)
+        before, after = self._path(model.drift, K, starts)
+        errors = (before[..., :n_y] - self._target) / self.deviation
+        J = np.concatenate([S for _, S in self._sensitivities(model, K, before, after, q)])
+        J /= self.deviation[:, None]
+        matrix = normal_equations(self.add_residuals, torch.from_numpy(theta)).matrix.numpy()
+        C = (np.linalg.pinv(matrix, hermitian=True) / self.count)[:p, :p]
+        # a start is always fitted, within the range: nothing but the first samples tells it
+        prior = np.mean(errors[self._counted[..., 0]] ** 2) * np.eye(q - p)
+        found = []
         for m in range(M):
-            rows = slice(p + m * n_x, p + (m + 1) * n_x)
-            matrix[rows, rows] = self._matrix[m, p:, p:]
-            matrix[rows, :p] = self._matrix[m, p:, :p]
-            matrix[:p, rows] = self._matrix[m, :p, p:]
-        return gradient, matrix
+            rows = np.flatnonzero(self._counted[:, m, 0])
+            for part in np.array_split(rows, max(1, len(rows) // samples)):
+                S, start = np.split(J[part, m].reshape(-1, q), [p], axis=1)
+                if self.smooth:
+                    S = S - start @ np.linalg.solve(start.T @ start + prior, start.T @ S)
+                rest = np.eye(len(S)) - S @ C @ S.T
+                found.append(np.linalg.solve(rest, errors[part, m].ravel()).reshape(-1, n_y))
+        return np.concatenate(found)
+
+    def _path(self, drift: Drift, K: Array, x: Array) -> tuple[Array, Array]:
+        """Return the states (K + 1, M, n_x) before and after the corrections by a gain."""
+        data, v, n_y = self.segments, self._inputs, self._target.shape[2]
+        before = np.empty((len(v) + 1, *x.shape))
+        # without a gain a predictor never corrects its state: its prediction is a simulation
+        after = np.empty(before.shape) if np.any(K) else before
+        for k in range(len(before)):
+            before[k] = x
+            if after is not before:
+                error = np.where(data.measured[k][:, None], x[:, :n_y] - self._target[k], 0.0)
+                after[k] = x = x - error @ K.T
+            if k < len(v):
+                x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x, data.steps[k][:, None])
+        return before, after
+
+    def _sums(self, model: _Model, K: Array, before: Array, after: Array, errors: Array
+              ) -> tuple[Array, Array]:
+        """Return J' r and J' J, whose rows of starts touch only their own segment."""
+        M, n_x, p = *before.shape[1:], len(self.model.theta)
+        q = p + (n_x if self.smooth else K.size)
+        gradient, matrix = np.zeros((M, q, 1)), np.zeros((M, q, q))
+        for rows, S in self._sensitivities(model, K, before, after, q):
+            J = np.where(self._counted[rows, ..., None], S / self.deviation[:, None], 0.0)
+            J = J.transpose(1, 3, 0, 2).reshape(M, q, -1)
+            gradient += J @ errors[rows].swapaxes(0, 1).reshape(M, -1, 1)
+            matrix += J @ J.swapaxes(1, 2)
+        if not self.smooth:
+            return gradient[..., 0].sum(axis=0), matrix.sum(axis=0)
+        whole = np.zeros((p + M * n_x,) * 2)
+        whole[:p, :p] = matrix[:, :p, :p].sum(axis=0)
+        for m in range(M):
+            own = slice(p + m * n_x, p + (m + 1) * n_x)
+            whole[own, own], whole[own, :p] = matrix[m, p:, p:], matrix[m, p:, :p]
+            whole[:p, own] = matrix[m, :p, p:]
+        return np.concatenate((gradient[:, :p, 0].sum(axis=0), gradient[:, p:].ravel())), whole
+
+    def _sensitivities(self, model: _Model, K: Array, before: Array, after: Array, q: int
+                       ) -> Iterator[tuple[slice, Array]]:
+        """
+        Yield blocks of derivatives (k, M, n_y, q) of the outputs by the parameters.
+
+        Those of single steps do not depend on each other and are evaluated at once; only their
+        chain is followed step by step.
+        """
+        data, p, n_y = self.segments, len(self.model.theta), self._target.shape[2]
+        steps, M, n_x = before.shape
+        S = np.zeros((M, n_x, q))
+        if self.smooth:
+            S[..., p:] = np.eye(n_x)
+        block = max(1, _BLOCK // (M * n_x * (1 + p + n_x)))
+        for first in range(0, steps, block):
+            rows = slice(first, min(first + block, steps))
+            slopes = _step_slopes(model, after[rows][:steps - 1 - first], self._inputs[rows],
+                                  data.steps[rows])
+            found = np.empty((rows.stop - first, M, n_y, q))
+            for k, own in enumerate(found):
+                own[:] = S[:, :n_y]
+                if after is not before or not self.smooth:
+                    correction = K @ own
+                    if not self.smooth:
+                        error = before[first + k, :, :n_y] - self._target[first + k]
+                        for i in range(n_x):
+                            correction[:, i, p + i * n_y:p + (i + 1) * n_y] += error
+                    S = S - np.where(data.measured[first + k][:, None, None], correction, 0.0)
+                if k < len(slopes):
+                    S = slopes[k, ..., p:] @ S
+                    S[..., :p] += slopes[k, ..., :p]
+            yield rows, found
+
+
+def _step_slopes(model: Refinable, x: Array, v: Array, steps: Array) -> Array:
+    """Return the derivatives (K, M, n_x, p + n_x) of steps by parameters and by states before."""
+    n_x, p = x.shape[-1], len(model.theta)
+    y = np.zeros((x[..., 0].size, n_x, 1 + p + n_x))
+    y[..., 0], y[..., 1 + p:] = x.reshape(-1, n_x), np.eye(n_x)
+    after = runge_kutta_step(partial(_rates, model, v.reshape(len(y), -1)), y,
+                             steps.reshape(-1, 1, 1))
+    return after[..., 1:].reshape(*x.shape, -1)
 
 
 def _rates(model: Refinable, v: Array, y: Array) -> Array:
-    """Evaluate the rates of states and, beside them, of their sensitivities: (M, n_x, 1 + ...)."""
+    """Evaluate the rates of states and of their sensitivities: (M, n_x, 1 + ...)."""
     rate, dS = model.rates(y[..., 0], v, y[..., 1:])
     return np.concatenate((rate[..., None], dS), axis=-1)

@@ -47,9 +47,9 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
     :raises ValueError: when no episode is long enough, or without a B to take off.
     """
     if assumed is None:
-        raise ValueError('total variation needs a rough B: take one from the weak form')
+        raise ValueError('total variation needs an approximate B: use that of the weak form')
     if assumed.shape[1] != len(box.inputs):
-        raise ValueError('total variation needs a constant B: take the weak form')
+        raise ValueError('total variation needs a constant B: use the weak form')
     shape = DriftModel(box, degree, np.empty(0), assumed)
     features, inputs, rates = [], [], []
     episodes = [episode for episode in episodes if len(episode) >= _SHORTEST]

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 from dataclasses import dataclass, replace
-import itertools
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from koopman_ros.learning.identification.drift import Drift, DriftModel, Segment
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
-    INNOVATIONS_FORM,
     OUTPUT_ERROR,
     Score,
     stage_by_stage,
@@ -51,8 +49,9 @@ _SAMPLES = 20  # between samples, in which rates are counted at first
 # A larger model must err less by so many standard errors of the difference.
 _SIGMAS = 2.0
 
-_UNITS, _STARTS = 8, 2  # hidden units of a network, and how often it is learned with each ridge
-_RIDGES = (1e-4, 1e-6)  # weights of its squared parameters beside the mean squared error
+_UNITS = (3, 8)  # hidden units of the networks that are tried
+_STARTS = 4  # of each network, of which the one that fits best is judged
+_RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
 _ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _LOST = 10.0  # half-ranges from the measurement
@@ -68,23 +67,25 @@ class _StructureCandidate:
     model: Refinable
     gain: Array  #: (n_x, n_y) of the filter, in deviations
     hidden: int
-    method: str
-    errors: Array  #: (N, n_y) of simulations of the segments to choose by, in deviations
+    errors: Array  #: (N, n_y) of simulations by models that were not fitted there, in deviations
 
     @property
     def label(self) -> str:
-        count = self.hidden
-        return f'{self.method}, {count} {"state" if count == 1 else "states"} not measured'
-
-    @property
-    def degree(self) -> int:
-        return getattr(self.model.drift, 'degree', 1)
+        drift = self.model.drift
+        network = f' of a {drift.form}' if isinstance(drift, NetworkDrift) else ''
+        return f'{OUTPUT_ERROR}{network}, {_not_measured(self.hidden)}'
 
     @property
     def score(self) -> Score:
-        scale = self.model.drift.box.states.scale[:self.errors.shape[1]]
+        drift = self.model.drift
+        scale = drift.box.states.scale[:self.errors.shape[1]]
         squares = np.mean(self.errors ** 2, axis=0)
-        return Score(self.label, self.degree, scale * np.sqrt(squares), float(np.mean(squares)))
+        return Score(self.label, drift.degree if isinstance(drift, DriftModel) else None,
+                     scale * np.sqrt(squares), float(np.mean(squares)))
+
+
+def _not_measured(count: int) -> str:
+    return f'{count} {"state" if count == 1 else "states"} not measured'
 
 
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
@@ -94,13 +95,14 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
-    First the next measurement is foreseen by a filter, see :func:`innovations_form`: linear
-    models, from filters that know nothing of the plant, then polynomials of higher degree. From
-    each of them simulations of the record are refined (output error), also with a small network
-    beside a linear drift. Of all numbers of states that are not measured and all drifts the
-    smallest model is taken whose simulations of segments held out for the choice err about as
-    little as the best, and fitted to these, too. States that are not measured are what the filter
-    makes of them: of the unit 1, from -1 to 1; no record tells their own names and units.
+    First a filter predicts the next measurement, see :func:`innovations_form`: linear models, from
+    filters that know nothing of the plant, then polynomials of higher degree. From each of them
+    simulations of the record are refined (output error), also with a small network added to a
+    linear drift. Of all numbers of states that are not measured and all drifts the smallest model
+    is taken whose simulations err about as little as the best, at samples that were left out of
+    the fit, see :meth:`Refined.left_out`. At last the gain of its filter is fitted. Unmeasured
+    states are those of the filter: dimensionless, from -1 to 1, because no record gives their
+    names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
@@ -110,16 +112,15 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
         nothing fits.
-    :raises Stopped: when `watch` asked for it.
+    :raises Stopped: when `watch` requested it.
     """
     if callable(plant.B) or plant.input_matrix_degree:
-        raise ValueError('where states are not measured, B must not depend on them: set '
-                         'input_matrix_degree to 0')
+        raise ValueError('B must not depend on unmeasured states: set input_matrix_degree to 0')
     record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
-    total = hidden * (highest_degree + 1) + 2
-    words = {f'{count} {"state" if count == 1 else "states"} not measured': count
-             for count in range(1, hidden + 1)}
+    kinds = highest_degree + len(_UNITS)
+    total = hidden * kinds + 2
+    words = {_not_measured(count): count for count in range(1, hidden + 1)}
     candidates: list[_StructureCandidate] = []
     under_way = dict.fromkeys(words, 0)  # kinds of drift that were tried
 
@@ -128,24 +129,25 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             under_way[name] = kind - 1
         text = 'drift' if not kind else (
             f'drift of degree {kind} with {name}' if kind <= highest_degree else
-            f'network with {name}')
+            f'network of {_UNITS[kind - highest_degree - 1]} units with {name}')
         if watch(sum(under_way.values()), total, text):
             raise Stopped
         return False
 
-    first = _Search(record).linear(1, lambda *_: progress(next(iter(words)), 1))
-    shared = _Shared(record, highest_degree, seed, record.memory(first.drift))
+    first = _Search(record)
+    linear = first.linear(1, lambda *_: progress(next(iter(words)), 1))
+    shared = _Shared(record, highest_degree, seed, linear, first.deviation,
+                     _piece_length(record, linear, first.learn_B))
     with contextlib.closing((backend or Serial()).run(
             _tried, words, shared=shared, watch=progress)) as results:
         for name, found in results:
-            under_way[name] = highest_degree + 1
+            under_way[name] = kinds
             candidates += found
-    stage = stage_by_stage(watch, total, hidden * (highest_degree + 1))
+    stage = stage_by_stage(watch, total, hidden * kinds)
     if not candidates:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
     best = _plainest(candidates)
-    monitor = stage(f'{best.model.drift.form} on all episodes')
-    predictor = _fitted(shared, best, monitor)
+    predictor = _with_gain(shared, best, stage('gain of the filter'))
     return replace(record.identified(
         predictor, best.label, [one.score for one in candidates], stage('linear model')),
         warnings=warnings)
@@ -163,30 +165,38 @@ def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
         excess = own - least
         return bool(np.mean(excess) > _SIGMAS * np.std(excess) / np.sqrt(len(excess)))
 
-    able = [one for one, own in zip(candidates, squares, strict=True) if not worse(own)]
-    return min(able, key=lambda one: len(one.model.theta))
+    able = [(len(one.model.theta), float(np.mean(own)), i) for i, (one, own) in enumerate(
+        zip(candidates, squares, strict=True)) if not worse(own)]
+    return candidates[min(able)[-1]]
 
 
 @dataclass(frozen=True)
 class _Shared:
-    """What all candidates are made of."""
+    """The common data of all candidates."""
 
     record: SplitRecord
     highest_degree: int
     seed: int
-    samples: int  #: of a simulation
+    linear: _Polynomial  #: the linear predictor with one state that is not measured
+    deviation: Array  #: of its innovations
 
-    def simulations(self, predictor: Predictor[Drift], fit: Sequence[int], judge: Sequence[int]
-                    ) -> tuple[Segments, Segments, Array]:
-        """Return the pieces to fit to, those to judge by, and their foreseen starts."""
-        return self.record.simulated(
-            predictor, self.samples, fit, judge, min(SETTLING, self.samples // 3))
+    samples: int  #: longest piece that is simulated
+
+
+def _piece_length(record: SplitRecord, linear: _Polynomial, learn_B: bool) -> int:
+    """Return the memory of the plant in samples, by simulations of a linear model."""
+    length = record.memory(linear.drift)
+    found = _simulated(PolynomialCoefficients(linear.drift, learn_B), linear.gain,
+                       *record.simulated(linear, length), lambda *_: False)
+    # a filter's own model forgets as fast as the filter does
+    return record.memory(found.model.drift) if np.isfinite(found.cost) else length
 
 
 def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]:
-    """Return candidates with so many hidden states: polynomials of rising degree, and networks."""
-    record, search, found = shared.record, _Search(shared.record), list[_StructureCandidate]()
-    last: _Polynomial | None = None
+    """Return candidates with a number of hidden states: polynomials of rising degree, networks."""
+    record, found = shared.record, list[_StructureCandidate]()
+    last = shared.linear if count == 1 else None
+    search = _Search(record, None if last is None else shared.deviation)
     linear: Refined[PolynomialCoefficients] | None = None
 
     def begin(kind: int) -> Callable[..., bool]:
@@ -196,90 +206,75 @@ def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]
     for degree in range(1, shared.highest_degree + 1):
         monitor = begin(degree)
         try:
-            last = search.linear(count, monitor) if last is None else search.refined(
-                record.fit, raised(last), monitor)
-            foreseeing = _Candidates(shared, last, count)
-            polynomial = PolynomialCoefficients(last.drift, search.learn_B)
-            found += foreseeing.judged(polynomial, foreseeing.starts, INNOVATIONS_FORM)
-            refined = foreseeing.refined(polynomial, monitor)
+            if last is None:
+                last = search.linear(count, monitor)
+            elif degree > 1:
+                last = search.refined(record.fit, raised(last), monitor)
+            data, starts = record.simulated(last, shared.samples)
+            refined = _simulated(
+                PolynomialCoefficients(last.drift, search.learn_B), last.gain, data, starts,
+                monitor)
         except (ValueError, np.linalg.LinAlgError):
             break
-        found += foreseeing.judged(refined.model, refined.starts, OUTPUT_ERROR)
+        found += _candidate(refined, last.gain, count)
         if linear is None:
-            linear, beside = refined, foreseeing
+            linear, simulated = refined, (last.gain, data, refined.starts)
     explained = _EXPLAINED * float(np.mean(search.deviation ** 2))
-    if linear is not None and all(np.mean(one.errors ** 2) > explained for one in found):
-        monitor = begin(shared.highest_degree + 1)
-        for start, ridge in itertools.product(range(_STARTS), _RIDGES):
-            network = NetworkDrift.beside(
-                linear.model.drift, _UNITS, shared.seed + start, ridge=ridge,
-                learn_input_matrix=search.learn_B)
-            refined_network = beside.refined(network, monitor, linear.starts)
-            offered = beside.judged(refined_network.model, refined_network.starts, OUTPUT_ERROR)
-            found += offered
-            if any(np.mean(one.errors ** 2) <= explained for one in offered):
-                break
+    if linear is None:
+        return found
+    for kind, units in enumerate(_UNITS, shared.highest_degree + 1):
+        if any(np.mean(one.errors ** 2) <= explained for one in found):
+            break
+        monitor = begin(kind)
+        networks = [_simulated(NetworkDrift.beside(
+            linear.model.drift, units, _STARTS * shared.seed + start, ridge=_RIDGE,
+            learn_input_matrix=search.learn_B), *simulated, monitor) for start in range(_STARTS)]
+        # far from the data a network is constant, and the rest must not diverge there
+        bounded = [one for one in networks if one.model.bounded or not _stable(linear.model.drift)]
+        if bounded:
+            found += _candidate(min(bounded, key=lambda one: one.cost), simulated[0], count)
     return found
 
 
-class _Candidates:
-    """Models that are simulated from where a filter foresees the first samples."""
-
-    def __init__(self, shared: _Shared, predictor: _Polynomial, count: int) -> None:
-        self._gain, self._count = predictor.gain, count
-        record = shared.record
-        self._fitted, self._judged, self.starts = shared.simulations(
-            predictor, record.fit, record.choose)
-
-    def refined(self, model: _Model, monitor: Callable[..., bool], starts: Array | None = None
-                ) -> Refined[_Model]:
-        """Return a model whose simulations err least."""
-        return _simulated(model, self._gain, self._fitted,
-                          self.starts if starts is None else starts, monitor)
-
-    def judged(self, model: Refinable, starts: Array, method: str) -> list[_StructureCandidate]:
-        """Return the candidate of a model, or none where its simulations diverge."""
-        drift, n_y = model.drift, self._gain.shape[1]
-        states, data = drift.box.states, self._judged
-        path = data.path(drift.rate, states.to_physical(starts))[data.measured]
-        errors = (path[:, :n_y] - data.x[data.measured]) / states.scale[:n_y]
-        if not np.all(np.abs(errors) < _LOST):
-            return []
-        return [_StructureCandidate(model, self._gain, self._count, method, errors)]
+def _stable(drift: Drift) -> bool:
+    center = np.zeros(len(drift.box.states))
+    return bool(np.all(np.linalg.eigvals(drift.scaled_slope(center)).real < 0.0))
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
                monitor: Callable[..., bool]) -> Refined[_Model]:
+    """Return a model whose simulations err least."""
     penalty = model.penalty if isinstance(model, NetworkDrift) else None
     return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
                             tolerance=_TOLERANCE, penalty=penalty, iterations=_ITERATIONS,
                             monitor=monitor)
 
 
-def _fitted(shared: _Shared, best: _StructureCandidate, monitor: Callable[..., bool]
-            ) -> Predictor[Drift]:
-    """Return the best candidate, fitted to the segments to choose by, too, with its filter."""
+def _candidate(refined: Refined[Any], gain: Array, hidden: int) -> list[_StructureCandidate]:
+    """Return the candidate of a model, or none where its simulations diverge."""
+    if not np.isfinite(refined.cost):
+        return []
+    errors = refined.left_out(SETTLING)
+    return [_StructureCandidate(refined.model, gain, hidden, errors)] * bool(
+        np.all(np.abs(errors) < _LOST))
+
+
+def _with_gain(shared: _Shared, best: _StructureCandidate, monitor: Callable[..., bool]
+               ) -> Predictor[Drift]:
+    """Return the best candidate with a filter that is fitted to it."""
     record = shared.record
     parts = sorted([*record.fit, *record.choose])
     start = Predictor(best.model.drift, best.gain)
-    deviation = np.std(record.innovations(start), axis=0)
-    if best.method == INNOVATIONS_FORM:
-        assert isinstance(best.model, PolynomialCoefficients)
-        return _Search(record, deviation).refined(
-            parts, Predictor(best.model.drift, best.gain), monitor)
-    data, _, starts = shared.simulations(start, parts, record.held_out)
-    model = _simulated(best.model, best.gain, data, starts, monitor).model
-    start = Predictor(model.drift, best.gain)
     found = innovations_form(
-        _Known(model.drift), best.gain, record.segments(parts), record.foreseen(start, parts),
-        deviation, settling=min(SETTLING, min(len(record.parts[i]) for i in parts) // 3),
-        monitor=monitor)
-    predictor = Predictor(model.drift, found.gain)
+        _Known(start.drift), best.gain, record.segments(parts), record.foreseen(start, parts),
+        np.std(record.innovations(start), axis=0),
+        settling=min(SETTLING, min(len(record.parts[i]) for i in parts) // 3), monitor=monitor)
+    predictor = Predictor(start.drift, found.gain)
     estimates = record.estimates(predictor)
-    if isinstance(predictor.drift, DriftModel):
-        return standardised(Predictor(predictor.drift, found.gain), estimates)
-    assert isinstance(predictor.drift, NetworkDrift)
-    return _spanned(Predictor(predictor.drift, found.gain), estimates)
+    if isinstance(start.drift, DriftModel):
+        return standardised(Predictor(start.drift, found.gain), estimates)
+    assert isinstance(start.drift, NetworkDrift)
+    return _spanned(Predictor(start.drift, found.gain), estimates)
 
 
 def _spanned(predictor: Predictor[NetworkDrift], xi: Array) -> Predictor[NetworkDrift]:
@@ -295,7 +290,7 @@ def _spanned(predictor: Predictor[NetworkDrift], xi: Array) -> Predictor[Network
 
 @dataclass(frozen=True)
 class _Known:
-    """A drift that is not refined, beside a gain that is."""
+    """A drift that is not refined, with a gain that is."""
 
     drift: Drift
 

@@ -59,7 +59,7 @@ class WeakForm(IdentificationMethod):
         super().__init__(parameters)
         windows = self.parameters.windows
         if not all(window >= _NARROWEST for window in windows):
-            raise ValueError(f'windows = {list(windows)} must hold at least {_NARROWEST} samples '
+            raise ValueError(f'windows = {list(windows)} must have at least {_NARROWEST} samples '
                              'each')
 
     def estimate(self, problem: DriftProblem) -> Sequence[DriftEstimate]:

@@ -26,7 +26,7 @@ class Algorithm1:
     Levenberg-Marquardt where the paper takes IPOPT.
 
     The objective falls when z shrinks and the decoder grows, so that it does not tell a good lift
-    from a useless one; see :class:`IncrementalTraining` for what does.
+    from a useless one; see :class:`IncrementalTraining` for one that does.
     """
 
     n_z: int  #: number of lifted coordinates

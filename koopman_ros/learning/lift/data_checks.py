@@ -68,9 +68,9 @@ def check_rates(plant: PlantDescription, samples: DriftSamples) -> None:
         if low > _FACTOR or high < 1.0 / _FACTOR:
             raise ValueError(
                 f'{name} changes {factor:.3g} times as much from sample to sample as dxdt and '
-                f'time say, must be 1 (0.5 to 2 is allowed for noise): give time in '
-                f'{plant.time_unit} and dxdt in {plant.state_units[i]} per {plant.time_unit}, '
-                'another time_unit, or no time where samples lie a whole oscillation apart')
+                f'time predict (0.5 to 2 is allowed for noise): give time in {plant.time_unit} '
+                f'and dxdt in {plant.state_units[i]} per {plant.time_unit}, or another time_unit, '
+                'or no time if samples are a whole oscillation apart')
 
 
 def _middle_ratio(a: Array, b: Array) -> float:
@@ -84,8 +84,8 @@ def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box
     """
     Look at the drift at the nominal point, where a lift has none.
 
-    It is the constant of a polynomial fit; how far it can be relied on tell the fit's standard
-    error, a fit of one degree less, and what both leave of the samples nearest to the point, as
+    It is the constant of a polynomial fit; its reliability follows from the fit's standard error,
+    a fit of one degree less, and the residuals of both at the samples nearest to the point, as
     where the drift has a kink.
 
     :raises ValueError: when the plant moves there, with a steady state nearby if there is one.
@@ -121,7 +121,7 @@ def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box
         _ERRORS * spread, _MISFITS * np.abs(np.mean(nearest, axis=0))], axis=0)
     if not moves.any():
         return
-    nearby = 'move the plant around a state that it can hold'
+    nearby = 'excite the plant around a state that it can hold'
     with contextlib.suppress(ValueError):
         x_held, u_held = steady_point(fitted, box.states.center, box.inputs.center)
         apart = max(np.max(np.abs(one.to_deviation(held)), initial=0.0) for one, held in (
@@ -129,14 +129,15 @@ def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box
         if apart <= _NEAR:
             return
         if apart <= _FAR:
-            nearby = (f'by the samples it does with nominal_state = {_text(box.states, x_held)} '
-                      f'and nominal_input = {_text(box.inputs, u_held)}')
+            nearby = ('according to the samples it is steady at nominal_state = '
+                      f'{_text(box.states, x_held)} and nominal_input = '
+                      f'{_text(box.inputs, u_held)}')
     states = box.states
     speeds = ', '.join(
         f'{drift[i] * states.scale[i]:.3g} {states.units[i]}/{box.time_unit} of {states.names[i]}'
         for i in np.flatnonzero(moves))
-    raise ValueError(f'the plant does not stand still at the nominal point, but moves with '
-                     f'{speeds}: {nearby}')
+    raise ValueError(f'the nominal point is not a steady state, the plant moves with {speeds}: '
+                     f'{nearby}')
 
 
 def _text(signals: Coordinates, values: Array) -> str:

@@ -94,7 +94,7 @@ class IncrementalTraining:
         """
         Extend the lift of the round before, None in the first one, to `n_z` coordinates.
 
-        One that has so many already is only fitted to the samples.
+        One with n_z coordinates is only fitted to the samples.
         """
         if parent is not None and parent.layout.n_z == n_z:
             layout, theta = parent.layout, parent.theta
@@ -129,7 +129,7 @@ class IncrementalTraining:
 
         :param W: (h, n_x) and b (h,) of the hidden layer, of the states as the samples have them.
         :param V: (n_free, h) output weights; each coordinate is scaled to variance 1 here.
-        :raises ValueError: for a coordinate that stands still on the samples.
+        :raises ValueError: for a coordinate that is constant on the samples.
         """
         root = self.root(data)
         n_z = root.layout.n_z + len(V)
@@ -137,9 +137,8 @@ class IncrementalTraining:
         begun = Parameters(W, b, V, data.x.new_zeros((n_z, n_z)), root.layout.split(root.theta).B)
         size = _lifted(layout, begun, data).z[:, n_z - len(V):].square().mean(0).sqrt()
         if not bool((size > _STILL).all()):
-            raise ValueError('a coordinate of the lift that is begun from stands still on the '
-                             'samples: begin from that of a plant in the same range, or from '
-                             'nothing')
+            raise ValueError('a coordinate of the initial lift is constant on the samples: use '
+                             'that of a plant in the same range, or none')
         begun = replace(begun, V=V / size[:, None])
         theta = _with_linear_fits(layout, begun, data, torch.Generator().manual_seed(0))
         return TrainedLift(layout, theta, MinimumStatus.CONVERGED)
@@ -257,5 +256,5 @@ def _least_spanned_product(grown: TrainedLift, data: ScaledSamples) -> Tensor:
                     best, best_share = part, share
         if best is not None and best_share > 1e-6:
             return best / best_share ** 0.5
-    raise ValueError('no new coordinate can be started: the samples are spanned by the present '
-                     'lift; use a smaller n_z or samples over a wider range')
+    raise ValueError('no coordinate can be added: the present lift already spans the samples; use '
+                     'a smaller n_z or samples over a wider range')

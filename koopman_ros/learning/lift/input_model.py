@@ -59,9 +59,9 @@ class InputModel:
                 break
         if error > _MOST_ERROR * size:
             raise ValueError(
-                f'B(x) differs from a polynomial of degree {_HIGHEST_DEGREE} by {error / size:.2g}'
-                f' of its size, at most {_MOST_ERROR:g} can be controlled with: narrow the range '
-                'of the states, or take another input')
+                f'B(x) differs from a polynomial of degree {_HIGHEST_DEGREE} by '
+                f'{error / size:.2g} of its size, at most {_MOST_ERROR:g} is allowed: narrow the '
+                'range of the states, or use another input')
         blocks = [nominal, *terms.reshape(-1, *nominal.shape)]
         return InputModel(n_u, degree, np.hstack(blocks))
 
@@ -70,8 +70,8 @@ class InputModel:
         Subtract the known effect of the inputs from the rates.
 
         :param x: (N, n_x), and rates (N, n_x) and inputs (N, n_u), all scaled deviations.
-        :return: what is left (N, n_x), and what the unknown weights are of (N, n_u (1 + n_phi)),
-            None where they are known.
+        :return: the residual (N, n_x), and the regressors of the unknown weights (N, n_u (1 +
+            n_phi)), None where they are known.
         """
         regressors = InputTerms.regressors(x, u, self.degree)
         if self.weights is None:

@@ -23,10 +23,10 @@ class MinimumStatus(Enum):
     """How a minimisation ended; the value is the sentence for the user."""
 
     CONVERGED = 'converged: a step no longer lowers the cost noticeably'
-    MAX_ITERATIONS = ('reached the iteration limit while still improving: where the held-out '
-                      'figures do not suffice, increase `max_iterations` or the number of starts')
-    STALLED = ('no damped step lowers the cost: the start is degenerate or the data hold values '
-               'that are not finite; check the data and try another seed')
+    MAX_ITERATIONS = ('reached the iteration limit while still improving: if the held-out errors '
+                      'are too large, increase `max_iterations` or the number of starts')
+    STALLED = ('no damped step lowers the cost: the start is degenerate or the data contain '
+               'values that are not finite; check the data and try another seed')
     INTERRUPTED = 'interrupted: the best parameters so far are kept'
 
 

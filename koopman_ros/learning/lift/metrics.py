@@ -78,8 +78,8 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     S = z.T @ z / len(z)
     cond = float(np.linalg.cond(S))
     if not cond < _MAX_COND:
-        raise ValueError(f'{len(z)} samples do not tell {model.n_z} coordinates apart: judge by '
-                         'samples that move more, or use a smaller n_z')
+        raise ValueError(f'{len(z)} samples do not distinguish {model.n_z} coordinates: use '
+                         'samples that move more, or a smaller n_z')
     factor = np.linalg.cholesky(S)
     residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
     reference = np.linalg.solve(factor, dz.T)
@@ -135,7 +135,7 @@ def rollout_rmse(model: LiftedModel, samples: DriftSamples) -> Array | None:
 
 def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     """
-    Return dx/dt of a model's drift, in units and per a time unit of so many seconds.
+    Return dx/dt of a model's drift, in units and per a time unit given in seconds.
 
     It is NaN for states that have diverged: their pseudo-inverse does not exist.
     """

@@ -24,9 +24,9 @@ class MomentSums:
     """
     Moments of the features phi of N samples, and the normal equations that follow.
 
-    phi stacks F (h (n_x + 1)), the part of the feature rates by W and b; G likewise, that of the
-    features; the feature rates (h); the features (h); x (n_x); and where B is learned slope times
-    u (h n_u) and u (n_u).
+    phi stacks F (h (n_x + 1)), the part of the feature rates by W and b; G that of the features;
+    the feature rates (h); the features (h); x (n_x); and where B is learned slope times u (h n_u)
+    and u (n_u).
     """
 
     def __init__(self, layout: Layout, parameters: Parameters, N: int) -> None:

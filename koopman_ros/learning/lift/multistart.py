@@ -35,6 +35,14 @@ class MultistartProgress:
     checked: float = 0.0  #: share that is done of the closed loops, which come last
     name: str = ''  #: of the class that is being learned, where several are compared
 
+    @property
+    def text(self) -> str:
+        """The progress in words."""
+        if self.checked:
+            return f'{100.0 * self.checked:.0f} % of the closed loops'
+        rw = '' if math.isnan(self.rw) else f', rw {self.rw:.1e}'
+        return f'n_z {self.n_z}, start {min(self.finished + 1, self.total)} of {self.total}{rw}'
+
 
 # Called after steps and starts, and again while others work; True ends the training with the best
 # so far.
@@ -101,4 +109,4 @@ def _start(shared: tuple[ScaledSamples, int, TrainedLift | None], item: tuple[Re
         with _one_thread():
             return recipe.start(data, n_z, parent, seed, lambda *step: tell(step))
     except torch.linalg.LinAlgError as error:
-        return f'a start is degenerate ({error}): check that all states move on their own'
+        return f'a start is degenerate ({error}): check that all states move independently'

@@ -66,8 +66,8 @@ class NeuralDrift:
     """
     A network for the drift alone: dx/dt = A x + V (h(x) - h(0)) + B u, h its hidden layer.
 
-    Levenberg-Marquardt on the rates. As a model it is the lift z = x with a read-out: its z is
-    not linear, so that only laws that go by the drift have use for it.
+    Levenberg-Marquardt on the rates. As a model it is the lift z = x with a read-out: its z is not
+    linear, so that only laws based on the drift can use it.
     """
 
     hidden: int = 16  #: units of the hidden layer

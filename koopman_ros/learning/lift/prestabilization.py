@@ -25,7 +25,7 @@ class PrestabilizedFrame:
     """
     The plant under a pre-feedback, f(x) + B K x, in states x' = T x with E[x' x''] = I.
 
-    What it is learned from is changed, by :meth:`enter`, and what was learned is changed back, by
+    Its training data are changed, by :meth:`enter`, and the learned model is changed back, by
     :meth:`leave`. Scaled deviations throughout; time may be in any unit.
     """
 
@@ -49,8 +49,7 @@ class PrestabilizedFrame:
         """
         n_x, n_u = x.shape[1], inputs.n_u
         if not n_u:
-            raise ValueError('a plant without inputs has none to feed back: leave `pre_feedback` '
-                             'out')
+            raise ValueError('a plant without inputs has no feedback: leave `pre_feedback` out')
         known = x if regressors is None else np.hstack([x, regressors])
         fitted = np.linalg.lstsq(known, f, rcond=None)[0].T.astype(np.float64)
         A = fitted[:, :n_x]
@@ -60,11 +59,12 @@ class PrestabilizedFrame:
             raise ValueError(
                 'no feedback of the inputs stabilises the linear fit of the samples, whose '
                 f'eigenvalues are {np.round(np.linalg.eigvals(A), 3).tolist()} in 1/time unit: '
-                'excite the inputs, add one that acts on what grows, or leave `pre_feedback` out')
+                'excite the inputs, add one that acts on the unstable modes, or leave '
+                '`pre_feedback` out')
         covariance = x.T @ x / len(x)
         variances = np.linalg.eigvalsh(covariance)
         if not variances[0] > _SINGULAR * variances[-1]:
-            raise ValueError('the states of the samples do not move each on its own: excite the '
+            raise ValueError('the states of the samples do not move independently: excite the '
                              'plant, or leave out a state')
         return PrestabilizedFrame(inputs, B, -riccati.K,
                                   np.linalg.inv(np.linalg.cholesky(covariance)))

@@ -51,7 +51,7 @@ class ScaledSamples:
 
 @dataclass(frozen=True)
 class ResidualWeights:
-    """Weights of the residuals beside that of the dynamics, whose weight is 1."""
+    """Weights of the residuals relative to that of the dynamics, whose weight is 1."""
 
     whitening: float = 0.0  #: of E[z z'] - I, 0 to leave it out
     decoder: float = 0.0  #: of x - D(N(x)), the paper's lambda; 0 to leave it out

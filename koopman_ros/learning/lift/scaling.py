@@ -49,7 +49,7 @@ class Scaling:
         """
         Scale samples, onto a device as torch names it.
 
-        :raises ValueError: for a device that there is not.
+        :raises ValueError: for an unavailable device.
         """
         plain = _plain(self.box, self.inputs, samples)
         x, f, regressors = self.frame.enter(*plain) if self.frame else plain
@@ -66,15 +66,14 @@ class Scaling:
 
         :param data: the samples, scaled.
         :raises ValueError: for a lift that the recipe would not make, of other signals, or with a
-            coordinate that stands still on the samples.
+            coordinate that is constant on the samples.
         """
         own, network = self.box.states, begin.observables
         for kind, its, ours in (('states', begin.states, own),
                                 ('inputs', begin.inputs, self.box.inputs)):
             if (its.names, its.units) != (ours.names, ours.units):
-                raise ValueError(f'the lift that is begun from has the {kind} {_listed(its)}, the '
-                                 f'plant has {_listed(ours)}: begin from that of a plant of the '
-                                 'same kind')
+                raise ValueError(f'the initial lift has the {kind} {_listed(its)}, but the plant '
+                                 f'has {_listed(ours)}: use the lift of a plant of the same kind')
         if not isinstance(network, NetworkObservables) or not len(network.V) or (
                 network.identity != recipe.identity):
             raise ValueError(
@@ -121,7 +120,7 @@ def _plain(box: Box, inputs: InputModel, samples: DriftSamples) -> tuple[Array, 
 
 
 def checked_device(name: str) -> torch.device:
-    """Return a device of torch's; ValueError, saying why, for one that there is not."""
+    """Return a device of torch's; ValueError, saying why, for an unavailable one."""
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
@@ -129,6 +128,6 @@ def checked_device(name: str) -> torch.device:
         found = f'{torch.cuda.device_count()} GPU(s)' if torch.cuda.is_available() else 'no GPU'
         raise ValueError(
             f'device is {name!r}, but torch {torch.__version__} finds {found} on this machine '
-            f'({str(error).splitlines()[0]}): use cpu, or install a driver and a torch that '
-            'support it') from error
+            f'({str(error).splitlines()[0]}): use cpu, or install a matching driver and '
+            'torch') from error
     return device

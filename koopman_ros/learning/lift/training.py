@@ -15,6 +15,7 @@ import numpy as np
 from koopman_ros import __version__
 from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
+from koopman_ros.core.progress import progress_line
 from koopman_ros.evaluation.closed_loop_test import (
     ClosedLoopTest,
     evaluate_closed_loops,
@@ -143,6 +144,8 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
     :param starts: number of starts in each round; their seeds are drawn from `seed`.
+    :param watch: called with the progress; True ends the training with the best lift so far. By
+        default a terminal shows the progress on one line.
     :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
         refused.
     :param loops: closed loops in which the law is tried before, see
@@ -169,7 +172,6 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
         rounds = _further(recipe, rounds, begin)
     prepared = PreparedSamples.of(plant, samples)
     parts, box = prepared.parts, prepared.box
-    tracker = Tracker(watch, starts * len(rounds) - (starts - 1) * (begin is not None))
     backend = backend or Serial()
     scaling = Scaling.of(plant, box, parts[0],
                          recipe.pre_feedback if isinstance(recipe, IncrementalTraining) else None)
@@ -186,19 +188,23 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     def judge(grown: TrainedLift | str) -> _Candidate | str:
         return _judged(grown, lambda found: scaling.model(found, **about), parts)
 
-    path, interrupted = _run_rounds(rounds, tracker, run, judge)
-    return _conclude(prepared, path, interrupted, tracker, loops if refuse else 0, refuse,
-                     backend)
+    with progress_line() as report:
+        tracker = Tracker(
+            watch or (lambda now: bool(report(now.finished / now.total, now.text))),
+            starts * len(rounds) - (starts - 1) * (begin is not None))
+        path, interrupted = _run_rounds(rounds, tracker, run, judge)
+        return _conclude(prepared, path, interrupted, tracker, loops if refuse else 0, refuse,
+                         backend)
 
 
 def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple[int, ...]:
     """Return the rounds from those of a lift to begin from on."""
     if not isinstance(recipe, IncrementalTraining):
-        raise ValueError('only a lift by growth begins from another one: choose its class, or '
-                         'begin from nothing')
+        raise ValueError('only IncrementalTraining can start from a lift: use it, or pass no '
+                         'initial lift')
     if begin.n_z not in rounds:
-        raise ValueError(f'the lift that is begun from has {begin.n_z} coordinates, must have '
-                         f'{rounds[0]} to {rounds[-1]} for one of {rounds[-1]}')
+        raise ValueError(f'the initial lift has {begin.n_z} coordinates, must have {rounds[0]} to '
+                         f'{rounds[-1]} for a lift of {rounds[-1]}')
     return tuple(n_z for n_z in rounds if n_z >= begin.n_z)
 
 
@@ -269,8 +275,8 @@ def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bo
                 backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
-            raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} is no controller: '
-                                 f'{law_check}: use {_remedies(winner.model)}')
+            raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} does not control the '
+                                 f'plant: {law_check}: use {_remedies(winner.model)}')
     models, figures = [], []
     for candidate in path:
         figures.append(evaluate(candidate.model, test))

@@ -59,12 +59,12 @@ class ReactorParameters(Constants):
     feed_temperature: float = constant(
         350.0, 'K', 250.0, 500.0, 'temperature T_i of the feed', si='degC')
     feed_concentration: float = constant(
-        1.0, 'mol/L', 0.0, 100.0, 'reactant C_Af in the feed, of the two-state reactor alone',
+        1.0, 'mol/L', 0.0, 100.0, 'reactant C_Af in the feed (two-state reactor only)',
         si='mol/m^3', factor=1e-3)
     #: by default that of the two-state reactor's stable steady state at a coolant of 300 K
     concentration: float = constant(
         0.87725294608097, 'mol/L', 0.0, 100.0,
-        'reactant C_A that the one-state reactor holds, its alone', si='mol/m^3', factor=1e-3)
+        'constant reactant C_A (one-state reactor only)', si='mol/m^3', factor=1e-3)
 
     @cached_property
     def dilution_rate(self) -> float:
@@ -119,10 +119,10 @@ def two_state_reactor(parameters: ReactorParameters | None = None,
 def fed_reactor(parameters: ReactorParameters | None = None,
                 nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
-    Build the two-state reactor with its feed flow as an input beside the coolant.
+    Build the two-state reactor with its feed flow as a second input.
 
-    What the flow q does depends on the state: q/V (C_Af - C_A) and q/V (T_i - T). Parameters and
-    errors are those of :func:`one_state_reactor`; the flow rate is the nominal one.
+    The effect of the flow q depends on the state: q/V (C_Af - C_A) and q/V (T_i - T). Parameters
+    and errors are those of :func:`one_state_reactor`; the flow rate is the nominal one.
     """
     constants = parameters or ReactorParameters()
     fixed = two_state_reactor(constants, nominal_state=nominal_state)
@@ -270,8 +270,8 @@ def _cold_stable_state(constants: ReactorParameters, drift: ArrayFunction,
         if np.all(np.linalg.eigvals(jacobian(state)).real < 0.0):
             return state
     raise EquilibriumError(
-        f'the reactor has no stable steady state on its cold branch at a coolant temperature of '
+        'the reactor has no stable steady state on its cold branch at a coolant temperature of '
         f'{NOMINAL_COOLANT_TEMPERATURE:.10g} K: with heat_transfer_coefficient = '
         f'{constants.heat_transfer_coefficient:.10g} J/(min K) and feed_temperature = '
-        f'{constants.feed_temperature:.10g} K the reaction outruns the cooling; '
-        'give nominal_state, or cool more')
+        f'{constants.feed_temperature:.10g} K the cooling cannot hold the reaction; give '
+        'nominal_state, or increase the cooling')

@@ -44,7 +44,8 @@ def linear_plant(A: np.ndarray, B: np.ndarray, reach: float = 100.0
     names, forces = tuple(f'x{i}' for i in range(n)), tuple(f'u{i}' for i in range(m))
     system = ControlAffineSystem(
         'linear', names, ('1',) * n, forces, ('1/s',) * m, 's', lambda x: x @ A.T,
-        lambda x: np.broadcast_to(A, (*x.shape[:-1], n, n)), B, np.zeros(n), np.zeros(m))
+        B, np.zeros(n), np.zeros(m),
+        drift_jacobian=lambda x: np.broadcast_to(A, (*x.shape[:-1], n, n)))
     states, inputs = (
         Coordinates(of, units, np.zeros(k), np.ones(k), np.full(k, -reach), np.full(k, reach))
         for of, units, k in ((names, ('1',) * n, n), (forces, ('1/s',) * m, m)))

@@ -38,8 +38,8 @@ class Vessel(Constants):
     def system(self):
         return ControlAffineSystem(
             'vessel', ('level',), ('m',), ('pump',), ('V',), 's', lambda x: -self.leak * x,
-            lambda x: np.full((*x.shape, 1), -self.leak),
-            np.array([[self.gain * self.strength]]), np.zeros(1), np.zeros(1))
+            np.array([[self.gain * self.strength]]), np.zeros(1), np.zeros(1),
+            drift_jacobian=lambda x: np.full((*x.shape, 1), -self.leak))
 
 
 TRUE = Vessel(gain=1.2, leak=0.4)
@@ -255,11 +255,12 @@ class Silent(Constants):
 
 
 @pytest.mark.parametrize(('plant', 'equations', 'ranges', 'words'), [
-    (VESSEL, Silent, {}, 'does not say which of its constants are to be estimated: name some of '
+    (VESSEL, Silent, {}, 'marks no constants as estimated: name some of '
      'leak'),
-    (VESSEL, Vessel, {'height': None}, 'height is no constant of Vessel: it has gain, strength'),
+    (VESSEL, Vessel, {'height': None},
+     'height is not a constant of Vessel: choose from gain, strength'),
     (VESSEL, Vessel, {'leak': (0.5, 0.1)},
-     r'the range of leak is \[0.5, 0.1\] 1/s, must rise and lie in \[0, 10\] 1/s'),
+     r'the range of leak is \[0.5, 0.1\] 1/s, must increase and lie in \[0, 10\] 1/s'),
     (VESSEL, Vessel, {'leak': (0.5, 11.0)}, r'lie in \[0, 10\] 1/s'),
     (description(('depth',), ('pump',)), Vessel, {},
      r'the record has the states depth \[m\], Vessel has level \[m\]'),

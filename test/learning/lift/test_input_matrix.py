@@ -189,4 +189,4 @@ def test_it_is_identified_and_lifted_from_noisy_samples():
     table = trainer_table(lift, {'system': 'fed_reactor'})
     assert table.snapshot({}).input_matrix_degree == 1
     given = table.snapshot({'input_matrix': [0.0] * 4})
-    assert table.check(given).startswith('input_matrix_degree is 1, must be 0 where input_matrix')
+    assert table.check(given).startswith('input_matrix_degree is 1, must be 0 if input_matrix')

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Inputs under way: each acts on the plant a dead time of its own after it was applied."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
+import itertools
+import math
+
+import numpy as np
+
+from koopman_ros.core.arrays import Array, read_only
+from koopman_ros.core.units import NANOSECONDS
+
+# Stamp of an input that was applied before all others.
+_ALWAYS = -(1 << 62)
+
+
+@dataclass(frozen=True, slots=True)
+class AppliedInputs:
+    """
+    Inputs (n_u,) in input units, each applied from its time until that of the next one.
+
+    The first one was applied at all times before, too. A dead time is an integer of nanoseconds
+    for each input.
+    """
+
+    times_ns: tuple[int, ...] = ()  #: rising
+    values: tuple[Array, ...] = ()  #: (n_u,) each
+
+    def followed_by(self, time_ns: int, u: Array, dead_ns: tuple[int, ...]) -> AppliedInputs:
+        """Append an input in place of those from its time on; drop those that no longer act."""
+        end = bisect_left(self.times_ns, time_ns)
+        times, values = (*self.times_ns[:end], time_ns), (*self.values[:end], u)
+        begin = max(0, bisect_right(times, time_ns - max(dead_ns, default=0)) - 1)
+        return AppliedInputs(times[begin:], values[begin:])
+
+    def corrected(self, u: Array) -> AppliedInputs:
+        """Replace the last input by the measured one (n_u,)."""
+        return AppliedInputs(self.times_ns or (_ALWAYS,), (*self.values[:-1], read_only(u)))
+
+    def shifted(self, by_ns: int) -> AppliedInputs:
+        """Move all times, as a clock was set."""
+        return AppliedInputs(tuple(time + by_ns for time in self.times_ns), self.values)
+
+    def acting(self, time_ns: int, dead_ns: tuple[int, ...]) -> Array:
+        """Return the input (n_u,) that acts on the plant from a time on."""
+        return np.array([self.values[max(0, bisect_right(self.times_ns, time_ns - dead) - 1)][i]
+                         for i, dead in enumerate(dead_ns)])
+
+    def pieces(self, start_ns: int, end_ns: int, dead_ns: tuple[int, ...]
+               ) -> list[tuple[float, Array]]:
+        """Return the durations in s and the inputs (n_u,) that act from one time to another."""
+        edges = {start_ns, end_ns} | {
+            time + dead for time in self.times_ns for dead in set(dead_ns)
+            if start_ns < time + dead < end_ns}
+        return [((end - begin) / NANOSECONDS, self.acting(begin, dead_ns))
+                for begin, end in itertools.pairwise(sorted(edges))]
+
+
+@dataclass(frozen=True, slots=True)
+class PendingInputs:
+    """The inputs that were applied before a time, of which some act after it."""
+
+    applied: AppliedInputs
+    time_ns: int  #: that of the estimate
+    dead_ns: tuple[int, ...]  #: (n_u,) dead time of each input
+
+    def between(self, start_ns: int, end_ns: int) -> list[tuple[float, Array]]:
+        """Return :meth:`AppliedInputs.pieces` between two times after that of the estimate."""
+        return self.applied.pieces(self.time_ns + start_ns, self.time_ns + end_ns, self.dead_ns)
+
+
+def largest_bandwidth(dead_time: float, slowest: float) -> float:
+    """
+    Return the bandwidth of an observer in 1/s with which its loop keeps a margin.
+
+    The disturbance settles with a time constant of three dead times. For first-order plants the
+    maximum sensitivity is below 2, and gain and dead time may be twice as large as known.
+
+    :param dead_time: the longest of the inputs, in s, above 0.
+    :param slowest: rate of the model's slowest mode, in 1/s.
+    """
+    return (1.0 + math.sqrt(1.0 + 3.0 * slowest * dead_time)) / (3.0 * dead_time)

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Learn a model of a plant from files of measurements, without ROS.
+
+The model is written with a report. Exit code: 0 for an accepted model, 2 for a refused one, 1 for
+an error.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping
+import sys
+from typing import Any
+
+from koopman_ros import __version__
+from koopman_ros.core.message_fields import place
+from koopman_ros.core.paths import model_path
+from koopman_ros.execution.training import (
+    class_lines,
+    constant_lines,
+    JobState,
+    outcome_text,
+    TrainingProgress,
+)
+from koopman_ros.model import LiftedModel, load
+from koopman_ros.model_classes import BEST
+from koopman_ros.parameters.signal_topics import Signals
+from koopman_ros.parameters.table import ParameterTable
+from koopman_ros.parameters.trainer import trainer_table, TrainerParameters
+from koopman_ros.records import read, Record, RecordedInput, RecordedState
+
+# Parameters of the trainer that are options here, by the same names.
+_OPTIONS = (
+    'model', 'model_output', 'model_class', 'lifted_dimension', 'unmeasured_states',
+    'input_matrix', 'input_matrix_degree', 'physical_model', 'estimated_constants',
+    'identification_methods', 'restarts', 'training_seed', 'training_samples', 'warm_start_model',
+    'acceptance_margin', 'max_condition_number', 'synchronisation_tolerance', 'executor', 'device')
+# Not those of a node: any class may be the best for a plant that is not known yet.
+_DEFAULTS = {'model_class': BEST, 'model_output': ''}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Learn, print the result, and return the exit code."""
+    options = vars(_parser().parse_args(arguments))
+    try:
+        present = _loaded(options.get('model', ''))
+        record, test = (read(files, *_wanted(options, present), time=options['time'],
+                             period=options['period'], linear=options['linear'],
+                             tolerance=options.get('synchronisation_tolerance', 0.0))
+                        if files else None for files in (options['record'], options['test']))
+        assert record is not None
+        print(record, flush=True)
+        return _learned(options, present, record, test)
+    except (OSError, ValueError, ImportError) as error:
+        print(f'learn: {" ".join(str(error).split())}', file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        'learn', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add: Callable[..., Any] = parser.add_argument
+    add('--version', action='version', version=__version__)
+    add('record', nargs='+', help='.csv, .parquet or .mat files, or bags')
+    signal = "as name, 'name [unit]' or 'name = column [unit]'"
+    add('--states', nargs='+', default=(), metavar='STATE', help=f'measured signals, {signal}; '
+        'by default those of the model')
+    add('--inputs', nargs='+', default=(), metavar='INPUT', help=f'inputs, {signal}')
+    add('--time', default='', metavar='COLUMN', help="column of the time, with its unit, as in "
+        "'stamp [ms]'; by default the column time")
+    add('--period', type=float, default=0.0, metavar='S',
+        help='time between rows, in place of a column, in s')
+    add('--linear', nargs='+', default=(), metavar='INPUT',
+        help='inputs that are linear from row to row; others are held')
+    add('--test', nargs='+', default=(), metavar='FILE', help='record of the same signals to test '
+        'the model on; it takes no part in the training')
+    options = parser.add_argument_group('training, by the parameters of the trainer node')
+    for row in (_table(None, ['x [1]'], ['u [1]']).rows[name] for name in _OPTIONS):
+        default = _DEFAULTS.get(row.name, row.default)
+        many = isinstance(default, tuple)
+        notes = '; '.join(filter(None, (
+            row.range_text if not row.choices else '', '' if many or row.default == '' else
+            f'default: {default or "the name of the record"}')))
+        options.add_argument(
+            f'--{row.name}', type=type(default[0] if many else default),
+            default=argparse.SUPPRESS, nargs='+' if many else None, choices=row.choices or None,
+            metavar=None if row.choices else row.name.upper(), help=(
+                f'{row.description}{f" [{row.unit}]" if row.unit else ""}'
+                f'{f" ({notes})" if notes else ""}').replace('%', '%%'))
+    return parser
+
+
+def _loaded(model: str) -> LiftedModel | None:
+    return load(model_path(model)) if model else None
+
+
+def _wanted(options: Mapping[str, Any], present: LiftedModel | None
+            ) -> tuple[list[str], list[str]]:
+    """Return states and inputs as named, or else as the present model has them."""
+    named = list(options['states']), list(options['inputs'])
+    if all(named):
+        return named
+    if present is None:
+        raise ValueError('the signals are not known: give --states and --inputs, as in --states '
+                         "level --inputs 'pump [V]'")
+    states, inputs = ([f'{name} [{unit}]' for name, unit in zip(of.names, of.units, strict=True)]
+                      for of in (present.states, present.inputs))
+    return states, inputs
+
+
+def _table(present: LiftedModel | None, states: list[str], inputs: list[str]
+           ) -> ParameterTable[TrainerParameters]:
+    return trainer_table(present, {
+        'system': '', 'states_measured': tuple(states), 'inputs_commanded': tuple(inputs)})
+
+
+def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record,
+             test: Record | None) -> int:
+    # not before it is clear that there is something to learn: torch takes seconds
+    from koopman_ros.learning import retrain, TrainingTask
+    from koopman_ros.learning.report import reported
+
+    about = record.plant
+    signals = Signals(dict(zip(about.state_names, about.state_units, strict=True)),
+                      dict(zip(about.input_names, about.input_units, strict=True)))
+    table = _table(present, *([f'{name} [{unit}]' for name, unit in some.items()]
+                              for some in (signals.states, signals.inputs)))
+    given = {name: tuple(value) if isinstance(value, list) else value
+             for name, value in options.items() if name in _OPTIONS}
+    settings = table.snapshot({
+        **_DEFAULTS, 'model_output': f'{about.name}.safetensors', **given})
+    if reason := table.check(settings):
+        raise ValueError(reason)
+    # tables have no topics: those that the names would usually have stand for them
+    task = TrainingTask(
+        bags=record.sources, output=settings.model_output, plant=about.name,
+        model=str(model_path(settings.model)) if settings.model else '',
+        warm_start_model=(str(model_path(settings.warm_start_model))
+                          if settings.warm_start_model else ''),
+        states=tuple(RecordedState(name, unit, place(name, name, unit))
+                     for name, unit in signals.states.items()),
+        inputs=tuple(RecordedInput(name, unit, place(name, name, unit))
+                     for name, unit in signals.inputs.items()),
+        **settings.training(signals))
+    progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
+
+    def on_progress(share: float, text: str) -> bool:
+        progress.show(JobState(share, text))
+        return False
+
+    retrained = retrain(task, on_progress, record=record, test=test)
+    progress.show(JobState(1.0, ended=True))
+    summary, files = reported(retrained)
+    print(outcome_text(summary))
+    for name, line in {**class_lines(summary), **constant_lines(summary)}.items():
+        print(f'{name}: {line}')
+    for warning in summary['warnings']:
+        print(f'warning: {warning}')
+    for name, run in retrained.free_runs.items():
+        print(f'{name}: {run}')
+    print('report: ' + ', '.join(files))
+    return 0 if retrained.accepted else 2

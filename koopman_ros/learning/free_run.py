@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The free run of a model: a simulation of a whole record by its inputs alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import os
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.plots import drawing
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
+from koopman_ros.learning.identification import Drift, Identified, longest_step, Segments
+from koopman_ros.learning.identification.drift import Rate
+from koopman_ros.learning.lift.metrics import lifted_rate
+from koopman_ros.learning.lift.training import Trained
+from koopman_ros.learning.model_selection import ClassComparison
+from koopman_ros.model import Coordinates, LiftedModel
+from koopman_ros.records import Record
+
+#: whatever has a drift
+AnyModel: TypeAlias = LiftedModel | Trained | ClassComparison | Drift | Identified
+
+_GUESSES = (0.6, -0.6)  # starts of unmeasured states that are tried beside 0, in half-ranges
+_EVALUATIONS = 30  # of the search from each of them
+_LOST = 1e3  # error of a start that diverges, in half-ranges
+_PICTURED = 3  # episodes of a picture
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """A simulation of a record, with its errors after the samples that determine the start."""
+
+    names: tuple[str, ...]  #: (n_y,) of the measured states
+    units: tuple[str, ...]  #: (n_y,) their units, those of the model
+    plant: PlantDescription  #: of the record
+    episodes: tuple[Episode, ...]  #: of the record, the states as named and in these units
+    #: (N, n_x) for each episode, simulated states at its measurements, the measured ones first;
+    #: not finite after a divergence
+    paths: tuple[Array, ...]
+    init: int  #: first samples of each episode, to which the start is fitted
+    rmse: Array  #: (n_y,) root mean square error after those; infinite after a divergence
+    #: (n_y,) share of the motion that is explained, 1 - ||y - y_model|| / ||y - mean(y)||, in %
+    fit: Array
+
+    __repr__ = short_repr
+
+    def __str__(self) -> str:
+        """Show the errors."""
+        count = sum(map(len, self.episodes))
+        return '\n  '.join([
+            f'free run of {count} measurements, after the start fitted to the first {self.init}:',
+            *(f'{name}: error {rmse:.4g} {unit}, fit {fit:.1f} %' for name, unit, rmse, fit in zip(
+                self.names, self.units, self.rmse, self.fit, strict=True))])
+
+    def error_text(self) -> str:
+        """Return the errors in a line."""
+        return ', '.join(f'{rmse:.4g} {unit} in {name}' for name, unit, rmse in zip(
+            self.names, self.units, self.rmse, strict=True))
+
+    @property
+    def diverged(self) -> bool:
+        """Whether an episode cannot be simulated to its end."""
+        return not np.all(np.isfinite(self.rmse))
+
+    def draw(self, path: str | os.PathLike[str]) -> None:
+        """
+        Draw measurements, simulation and inputs of the first episodes, as PNG.
+
+        :raises ImportError: without matplotlib.
+        """
+        episodes = self.episodes[:_PICTURED]
+        inputs, n_y = self.plant.input_names, len(self.names)
+        rows, columns = n_y + len(inputs), len(episodes)
+        with drawing(Path(path), rows, columns, size=(7.0 * columns, 2.2 * rows + 0.8),
+                     sharex='col') as (figure, panels):
+            for k, (episode, simulated) in enumerate(zip(episodes, self.paths, strict=False)):
+                for i in range(rows):
+                    axes = panels[i * columns + k]
+                    if i < n_y:
+                        unit = self.units[i]
+                        axes.plot(episode.time, shown(episode.x[:, i], unit), '.', color='0.6',
+                                  markersize=3.0, label='measured')
+                        axes.plot(episode.time, shown(simulated[:, i], unit), color='tab:green',
+                                  label='free run')
+                        axes.axvspan(episode.time[0], episode.time[
+                            min(self.init, len(episode)) - 1], color='0.93', label='start')
+                        name = self.names[i]
+                    else:
+                        j = i - n_y
+                        name, unit = inputs[j], self.plant.input_units[j]
+                        axes.step(episode.time, shown(
+                            episode.inputs_at(episode.time)[:, j], unit), where='post',
+                            color='tab:blue')
+                    axes.set_ylabel(f'{name.replace("_", " ")} [{unit_label(unit)}]')
+                panels[k].legend(fontsize=8, loc='upper right')
+                panels[(rows - 1) * columns + k].set_xlabel(f'time [{self.plant.time_unit}]')
+            figure.suptitle('Free run, ' + ', '.join(
+                f'{name}: fit {fit:.1f} %' for name, fit in zip(self.names, self.fit, strict=True)
+            ))
+
+
+def simulate(model: AnyModel, record: Record, init: int = 50, *,
+             picture: str | os.PathLike[str] = '') -> FreeRun:
+    """
+    Simulate a whole record by its inputs alone, and compare with the measurements.
+
+    The start of each episode, unmeasured states included, is fitted to its first samples; after
+    these the simulation sees no measurement.
+
+    :param model: a model, or anything that training or identification returns.
+    :param record: with all inputs and at least one state of the model, in any units.
+    :param init: samples to which the start is fitted; at most half of an episode.
+    :param picture: file of a picture to draw, ending in .png; none by default.
+    :raises ValueError: for a record without the model's signals.
+    """
+    rate, states, inputs, dead_time = _drift(model, record.plant)
+    measured = [i for i, name in enumerate(states.names) if name in record.plant.state_names]
+    if not measured:
+        raise ValueError(f'the record has none of the states {", ".join(states.names)}, it has '
+                         f'{", ".join(record.plant.state_names)}: read those')
+    # the measured states first, where that is not their order already
+    order = [*measured, *(i for i in range(len(states)) if i not in measured)]
+    some = states.only([states.names[i] for i in measured])
+    record = record.of(*(dict(zip(own.names, own.units, strict=True)) for own in (some, inputs)))
+    episodes = tuple(late for episode in record.episodes
+                     if (late := episode.delayed(dead_time)) is not None)
+    if not episodes:
+        raise ValueError('no episode of the record is longer than the dead time of the model, '
+                         f'{max(dead_time):g} {record.plant.time_unit}')
+    if init < 1:
+        raise ValueError(f'init = {init} must be at least 1 sample')
+    indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
+    step = longest_step(episodes)
+    inits = [max(1, min(init, len(one) // 2)) for one in episodes]
+    starts = np.array([_start(rate, states, measured, one, index, count, step)
+                       for one, index, count in zip(episodes, indexed, inits, strict=True)])
+    segments = Segments.of(indexed, step)
+    run = segments.path(rate, starts)
+    paths = tuple(run[np.flatnonzero(segments.x[:, k, 0])[:len(one)], k][:, order]
+                  for k, one in enumerate(episodes))
+    errors, values = (np.concatenate(parts) for parts in (
+        [path[count:, :len(measured)] - one.x[count:]
+         for path, one, count in zip(paths, episodes, inits, strict=True)],
+        [one.x[count:] for one, count in zip(episodes, inits, strict=True)]))
+    missing = np.isnan(values)
+    with np.errstate(over='ignore', invalid='ignore'):
+        squares = np.where(missing, 0.0, errors ** 2).sum(axis=0)
+    squares = np.where(np.isfinite(squares), squares, np.inf)
+    spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2, axis=0)
+    found = FreeRun(some.names, some.units, record.plant, episodes, paths, init,
+                    np.sqrt(squares / np.sum(~missing, axis=0)),
+                    100.0 * (1.0 - np.sqrt(squares / spread)))
+    if picture:
+        found.draw(picture)
+    return found
+
+
+def _drift(model: AnyModel, plant: PlantDescription
+           ) -> tuple[Rate, Coordinates, Coordinates, Array]:
+    """Return rate, states, inputs and dead times of a model, in the time unit of a plant."""
+    seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
+    if isinstance(model, Trained | ClassComparison):
+        model = model.model
+    if isinstance(model, LiftedModel):
+        return (lifted_rate(model, seconds), model.states, model.inputs,
+                model.dead_time / seconds)
+    drift = model.drift if isinstance(model, Identified) else model
+    factor = seconds / SECONDS_PER_TIME_UNIT[drift.box.time_unit]
+    dead_time = model.dead_time if isinstance(model, Identified) else np.empty(0)
+    return (lambda x, u: factor * drift.rate(x, u), drift.box.states, drift.box.inputs,
+            dead_time / factor if len(dead_time) else np.zeros(len(drift.box.inputs)))
+
+
+def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,
+           indexed: Episode, count: int, step: float) -> Array:
+    """Return the start (n_x,) of an episode that suits its first samples best."""
+    segments = Segments.of([indexed.part(0, count)] if count > 1 else [indexed.part(0, 2)], step)
+    rows = np.flatnonzero(segments.x[:, 0, 0])[:count]
+    y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])
+    there, n_x = ~np.isnan(y), len(states)
+    home = np.zeros(n_x)
+    for i, column, seen in zip(measured, y.T, there.T, strict=True):
+        if seen.any():
+            home[i] = column[seen][0]
+
+    def errors(xi: Array) -> Array:
+        """Return the errors (S, m) from starts (S, n_x), side by side, in half-ranges."""
+        path = segments.repeated(len(xi)).path(rate, states.to_physical(xi))
+        found = states.to_deviation(path[rows])[..., measured] - y[:, None]
+        return np.clip(np.nan_to_num(np.swapaxes(found, 0, 1)[:, there], nan=_LOST),
+                       -_LOST, _LOST)
+
+    def slopes(xi: Array) -> Array:
+        here, *others = errors(xi + 1e-4 * np.vstack([np.zeros(n_x), np.eye(n_x)]))
+        return np.transpose(np.subtract(others, here)) / 1e-4
+
+    hidden = [i for i in range(n_x) if i not in measured]
+    shifts = [np.zeros(n_x), *(guess * row for row in np.eye(n_x)[hidden]
+                               for guess in _GUESSES)]
+    found = [least_squares(lambda xi: errors(xi[None])[0], home + shift, slopes,
+                           max_nfev=_EVALUATIONS) for shift in shifts]
+    return states.to_physical(min(found, key=lambda one: float(one.cost)).x)

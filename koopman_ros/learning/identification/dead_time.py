@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Dead time of each input of a record, by simulations of linear models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag, lstsq
+from scipy.signal import lfilter
+
+from koopman_ros.core.datasets import Array, Episode
+
+_ORDERS = (1, 2, 3)  # of the linear models
+_LONGEST = 60  # samples of dead time that are tried, where the record is long enough
+_SHARE = 8  # of an episode, which the longest dead time may take
+_ROUNDS = 3  # over all inputs
+_ITERATIONS = 8  # of Steiglitz and McBride from nothing; from a neighbour's filter below
+_FEW = 3
+_SIGMAS = 2.0  # standard errors of a clear difference
+_WHITE = 0.3  # correlation of an error with the next one
+_BLOCKS = 30  # in which errors are compared
+_STABLE = 0.9999  # largest magnitude of a pole
+
+
+@dataclass(frozen=True)
+class DeadTimes:
+    """The dead times that suit a record best."""
+
+    samples: tuple[int, ...]  #: (n_u,) intervals between samples
+    period: float  #: usual interval, in time units
+    order: int  #: of the linear model of each output
+    rmse: Array  #: (n_y,) error of its simulation, in state units
+    rmse_without: Array  #: (n_y,) that of the best model without dead time
+
+    @property
+    def values(self) -> Array:
+        """(n_u,) in time units."""
+        return self.period * np.array(self.samples, dtype=np.float64)
+
+
+def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
+                    watch: Callable[[], object] = lambda: None) -> DeadTimes:
+    """
+    Find how many samples each input acts late.
+
+    Each measured signal is simulated by linear models of rising order, their inputs moved by every
+    number of samples in turn. The model with the least Bayesian information criterion (Schwarz
+    1978) is taken. Where linear models do not explain the record, a dead time must also reduce the
+    error of the best model without by more than chance. A record whose models are all unstable, as
+    of a plant that only a controller holds, tells no dead time.
+
+    The models are fitted by the iteration of Steiglitz and McBride (1965): least squares of the
+    equation error, filtered by the denominator that was found before, which ends where the error
+    of the simulation is least.
+
+    :param known: (n_u,) inputs whose dead time the episodes have already; none by default.
+    :param watch: called now and then; it may raise to end the search.
+    """
+    period = float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
+    n_y, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
+    longest = min(_LONGEST, max(len(episode) for episode in episodes) // _SHARE)
+    data = [_Sampled.of(episode, period, longest) for episode in episodes
+            if len(episode) > 2 * longest + 10 * _ORDERS[-1]]
+    none = (0,) * n_u
+    highest = tuple(0 if fixed else longest for fixed in known or (False,) * n_u)
+    tried: list[_LinearModel] = []
+    for order in _ORDERS if data and any(highest) else ():
+        search = _DeadTimeSearch(data, order, n_y)
+        delays = search.best(highest, watch)
+        # a larger model needs no longer dead time, but for chance
+        highest = tuple(min(most, d + 2) for most, d in zip(highest, delays, strict=True))
+        tried += [model for one in dict.fromkeys((none, delays))
+                  if (model := search.model(one)) is not None]
+    if not tried:
+        return DeadTimes(none, period, 0, np.full(n_y, np.nan), np.full(n_y, np.nan))
+    best = min(tried, key=lambda one: one.criterion)
+    plain = min((one for one in tried if one.delays == none), key=lambda one: one.criterion,
+                default=best)
+    # errors that are not white hide whether a dead time is one, or what the models lack
+    if not (_white(best.errors) or _clearly_less(best.errors, plain.errors)):
+        best = plain
+    return DeadTimes(best.delays, period, best.order, best.rmse, plain.rmse)
+
+
+@dataclass(frozen=True)
+class _LinearModel:
+    """A linear model with dead times, and the errors (N, n_y) of its simulations."""
+
+    order: int
+    delays: tuple[int, ...]
+    errors: Array
+
+    @property
+    def rmse(self) -> Array:
+        return np.sqrt(np.mean(self.errors ** 2, axis=0))
+
+    @property
+    def criterion(self) -> float:
+        count, n_y = self.errors.shape
+        size = n_y * self.order * (1 + len(self.delays)) + np.count_nonzero(self.delays)
+        return float(2.0 * count * np.sum(np.log(self.rmse + 1e-300)) + size * np.log(count))
+
+
+def _white(errors: Array) -> bool:
+    return bool(np.all(np.sum(errors[1:] * errors[:-1], axis=0) < _WHITE * np.sum(
+        errors ** 2, axis=0)))
+
+
+def _clearly_less(errors: Array, others: Array) -> bool:
+    """Return whether squared errors (N, n_y) are less than others by more than chance."""
+    scale = np.mean(others ** 2, axis=0) + 1e-300
+    gain = np.array([np.mean(block) for block in np.array_split(
+        (others ** 2 - errors ** 2) / scale, _BLOCKS)])
+    return bool(np.mean(gain) > _SIGMAS * np.std(gain) / np.sqrt(len(gain)))
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """An episode at equal intervals; the inputs begin earlier than the measurements."""
+
+    y: Array  #: (N, n_y)
+    u: Array  #: (longest + N, n_u) means from one sample to the next
+
+    @classmethod
+    def of(cls, episode: Episode, period: float, longest: int) -> _Sampled:
+        count = int((episode.time[-1] - episode.time[0]) / period * (1.0 + 1e-9)) + 1
+        time = np.minimum(episode.time[0] + period * np.arange(count), episode.time[-1])
+        y = np.column_stack([np.interp(time, episode.time, column)
+                             for column in episode.interpolated().T])
+        u = np.diff(episode.input_integral(time), axis=0) / period
+        return cls(y[longest:], np.vstack((u, u[-1:])))
+
+    def inputs(self, delays: Sequence[int], order: int) -> Array:
+        """Return the inputs (N, n_u order) of the samples before, each late by its dead time."""
+        rows = np.arange(len(self.u) - len(self.y), len(self.u))
+        return np.column_stack([self.u[np.maximum(rows - d - k, 0), j]
+                                for j, d in enumerate(delays) for k in range(1, 1 + order)])
+
+
+class _DeadTimeSearch:
+    """Linear models of an order with any dead times."""
+
+    def __init__(self, data: Sequence[_Sampled], order: int, n_y: int) -> None:
+        self._data, self._order, self._n_y = data, order, n_y
+        self._variance = np.var(np.concatenate([one.y for one in data]), axis=0) + 1e-300
+        self._filters: dict[int, Array] = {}  # the last denominator of each output
+        self._found: dict[tuple[int, ...], _LinearModel | None] = {}
+
+    def best(self, highest: tuple[int, ...], watch: Callable[[], object]) -> tuple[int, ...]:
+        """Return the dead times with the least error, one input after the other."""
+        delays: tuple[int, ...] = (0,) * len(highest)
+        for _ in range(_ROUNDS if len(highest) > 1 else 1):
+            before = delays
+            for j, most in enumerate(highest):
+                costs = []
+                for d in range(most + 1):
+                    watch()
+                    tried = (*delays[:j], d, *delays[j + 1:])
+                    model = self.model(tried)
+                    costs.append((np.inf if model is None else float(np.sum(
+                        model.rmse ** 2 / self._variance)), tried))
+                delays = min(costs)[1]
+            if delays == before:
+                break
+        return delays
+
+    def model(self, delays: tuple[int, ...]) -> _LinearModel | None:
+        """Return the model with some dead times; None where none is stable."""
+        if delays not in self._found:
+            errors = [self._errors(i, delays) for i in range(self._n_y)]
+            self._found[delays] = None if any(own is None for own in errors) else _LinearModel(
+                self._order, delays, np.column_stack([own for own in errors if own is not None]))
+        return self._found[delays]
+
+    def _errors(self, i: int, delays: tuple[int, ...]) -> Array | None:
+        known = self._filters.get(i)
+        denominator = np.ones(1) if known is None else known
+        best: tuple[float, Array, Array] | None = None
+        for _ in range(_ITERATIONS if known is None else _FEW):
+            A, y = self._equations(i, delays, denominator, simulated=False)
+            denominator = np.append(1.0, lstsq(A, y, lapack_driver='gelsy')[0][:self._order])
+            poles = np.roots(denominator)
+            far = np.abs(poles) > _STABLE
+            if np.any(far):
+                # a filter must be stable; the next one may be so by itself
+                denominator = np.real(np.poly(np.where(far, _STABLE ** 2 / poles.conj(), poles)))
+                continue
+            A, y = self._equations(i, delays, denominator, simulated=True)
+            errors = y - A @ lstsq(A, y, lapack_driver='gelsy')[0]
+            cost = float(np.mean(errors ** 2))
+            if best is not None and cost >= best[0] * (1.0 - 1e-6):
+                break
+            best = cost, errors, denominator
+        if best is None:
+            return None
+        self._filters[i] = best[2]
+        return best[1]
+
+    def _equations(self, i: int, delays: tuple[int, ...], denominator: Array, *, simulated: bool
+                   ) -> tuple[Array, Array]:
+        """
+        Return A and y of the least squares for an output.
+
+        :param simulated: whether the denominator is kept and y simulated; otherwise a better
+            denominator is in front of the parameters.
+        """
+        shared, starts, outputs = [], [], []
+        for one in self._data:
+            y, order = one.y[:, i], self._order
+            past = [] if simulated else [
+                -np.concatenate((np.zeros(k), y[:-k])) for k in range(1, 1 + order)]
+            regressors = np.column_stack((*past, one.inputs(delays, order), np.ones(len(y))))
+            columns = lfilter([1.0], denominator, np.hstack((
+                regressors, np.eye(len(y), order), y[:, None])), axis=0)
+            shared.append(columns[:, :-1 - order])
+            starts.append(columns[:, -1 - order:-1])
+            outputs.append(y if simulated else columns[:, -1])
+        return np.hstack((np.vstack(shared), block_diag(*starts))), np.concatenate(outputs)

@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A record of a plant, read from tables and bags into episodes with names and units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+import os
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.message_fields import base_name, place
+from koopman_ros.core.units import check_unit, NANOSECONDS
+from koopman_ros.records.episodes import loop_episodes
+from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
+from koopman_ros.records.tables import (
+    conversion_of,
+    seconds_of,
+    SignalColumn,
+    Source,
+    table_of,
+    TableImport,
+    with_unit,
+)
+
+#: Names of signals: ``'level'``, ``'level [m]'``, ``'level = LT101.PV [m]'``.
+Names: TypeAlias = str | Sequence[str]
+
+_BAGS = ('.mcap', '.db3')
+
+
+@dataclass(frozen=True)
+class Record:
+    """Measurements of a plant, with the names and units of its signals."""
+
+    plant: PlantDescription  #: its nominal point is NaN and its B None, as they are not known yet
+    episodes: tuple[Episode, ...]  #: times in s since the first measurement of each
+    report: ImportReport  #: counts of measurements used and dropped, and notes
+    sources: tuple[str, ...]  #: names of the files
+
+    __repr__ = short_repr
+
+    def of(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> Record:
+        """
+        Return the record with some signals alone, in their order and units.
+
+        :param states: units of the states by name.
+        :param inputs: units of the inputs by name.
+        :raises ValueError: for a signal that the record does not have, or a unit of another kind.
+        """
+        about, taken = self.plant, []
+        for kind, wanted, names, units in (
+                ('state', states, about.state_names, about.state_units),
+                ('input', inputs, about.input_names, about.input_units)):
+            if missing := [name for name in wanted if name not in names]:
+                raise ValueError(f'the record has no {kind} {missing[0]}, it has '
+                                 f'{", ".join(names)}: name one of them')
+            columns = [names.index(name) for name in wanted]
+            taken.append((columns, [conversion_of(name, units[j], unit) for j, (name, unit) in zip(
+                columns, wanted.items(), strict=True)]))
+        (of_x, in_x), (of_u, in_u) = taken
+        return replace(self, plant=replace(
+            about, state_names=tuple(states), state_units=tuple(states.values()),
+            input_names=tuple(inputs), input_units=tuple(inputs.values()), B=None,
+            nominal_state=np.full(len(states), np.nan), nominal_input=np.full(len(inputs), np.nan),
+        ), episodes=tuple(replace(
+            one, x=np.column_stack([to(one.x[:, j]) for j, to in zip(of_x, in_x, strict=True)]),
+            u=np.column_stack([to(one.u[:, j]) for j, to in zip(of_u, in_u, strict=True)]),
+            linear=tuple(one.linear[j] for j in of_u) if one.linear else ())
+            for one in self.episodes))
+
+    def __str__(self) -> str:
+        """Show the signals, the episodes and the report."""
+        about = self.plant
+        signals = ', '.join(f'{name} [{unit}]' for name, unit in zip(
+            (*about.state_names, *about.input_names), (*about.state_units, *about.input_units),
+            strict=True))
+        lengths = [f'{len(one)} measurements in {one.time[-1]:.6g} s' for one in self.episodes]
+        return '\n  '.join([signals, *lengths, *self.report.lines()])
+
+
+def read(source: Source, states: Names, inputs: Names, *, time: str = '', period: float = 0.0,
+         linear: Names = (), tolerance: float = 0.0, name: str = '') -> Record:
+    """
+    Read a record of a plant from tables or bags.
+
+    A signal is the column of its name, with the unit in the header or in the argument::
+
+        record = read('day_1.csv', states='level', inputs='pump')          # level [m], pump [V]
+        record = read(frame, ['temperature [K]'], ['heater = HC12.OUT [percent]'])
+
+    Where both have a unit, values are converted to that of the argument. A signal without a unit
+    has the unit 1. A cell without a number is a missing measurement of that signal alone: NaN in
+    the episodes, so that a signal from the laboratory counts at its own times. An input without a
+    number keeps its last value. A new episode begins at a gap of 3.5 usual periods, where time is
+    set back, and where a state jumps as after a reset; spikes of a single sample are dropped.
+
+    :param source: a .csv, .parquet or .mat file, a bag, a DataFrame, columns by name, or a list
+        of them. Columns of a two-dimensional array y of a .mat file are y_1, y_2 and so on.
+    :param states: measured signals, ``name``, ``name [unit]`` or ``name = column [unit]``.
+    :param inputs: inputs that acted from the time of their row on. In a bag, an input is its
+        commands and its measurements, on the usual topics of its name.
+    :param time: column of the time, by default ``time`` or an index of dates. Dates and durations
+        are recognised; numbers are seconds, or of the unit in brackets: ns, us, ms, s, min, h, d.
+    :param period: time between rows in s, in place of a column.
+    :param linear: inputs that are linear from row to row, such as measurements of a slow actuator.
+    :param tolerance: largest difference in s between the stamps of one sample in a bag.
+    :param name: of the plant; by default that of the first file.
+    :raises BagReadError: for a bag that cannot be read.
+    :raises ValueError: for a table without such a column, with times that cannot be in seconds, or
+        of another kind.
+    """
+    sources = source if isinstance(source, list | tuple) else [source]
+    of_states, of_inputs = (tuple(map(SignalColumn.of, _names(some))) for some in (states, inputs))
+    _check_names(of_states, of_inputs, _names(linear))
+    report, episodes = ImportReport(), []
+    for number, one in enumerate(sources):
+        label = os.fspath(one) if isinstance(one, str | os.PathLike) else f'table {number + 1}'
+        if _is_bag(one):
+            found, own = loop_episodes(
+                [one], [_recorded_state(signal) for signal in of_states],
+                [_recorded_input(signal) for signal in of_inputs],
+                tolerance_ns=round(tolerance * NANOSECONDS))
+            report.add(own)
+            episodes += found
+            continue
+        table = table_of(one)
+        of_states, of_inputs = (tuple(with_unit(table, signal, report) for signal in some)
+                                for some in (of_states, of_inputs))
+        episodes += TableImport(label, of_states, of_inputs, _names(linear), report).episodes(
+            table, seconds_of(table, time, period))
+    files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
+    if not episodes:
+        raise ValueError('the record holds no usable segment of measurements: '
+                         + '; '.join(report.lines()))
+    plant = PlantDescription(
+        name or Path(files[0] if files else 'plant').stem,
+        tuple(one.name for one in of_states), tuple(one.unit for one in of_states),
+        tuple(one.name for one in of_inputs), tuple(one.unit for one in of_inputs),
+        's', np.full(len(of_states), np.nan), np.full(len(of_inputs), np.nan), None)
+    return Record(plant, tuple(episodes), report, files)
+
+
+def _names(names: Names) -> list[str]:
+    return [names] if isinstance(names, str) else list(names)
+
+
+def _check_names(states: Sequence[SignalColumn], inputs: Sequence[SignalColumn],
+                 linear: Sequence[str]) -> None:
+    every = [one.name for one in (*states, *inputs)]
+    if not (states and inputs):
+        raise ValueError('a record has states and inputs: name at least one of each')
+    if twice := [name for name in every if every.count(name) > 1]:
+        raise ValueError(f'{twice[0]} is named twice: give each signal once')
+    if unknown := [name for name in linear if name not in every[len(states):]]:
+        raise ValueError(f'linear names {unknown[0]}, which is no input: name some of '
+                         f'{", ".join(every[len(states):])}')
+
+
+def _is_bag(source: Source) -> bool:
+    return isinstance(source, str | os.PathLike) and (
+        Path(source).is_dir() or Path(source).suffix in _BAGS)
+
+
+def _recorded_state(signal: SignalColumn) -> RecordedState:
+    unit = _unit_in_bag(signal)
+    return RecordedState(signal.name, unit, place(f'/{signal.column}', signal.name, unit))
+
+
+def _recorded_input(signal: SignalColumn) -> RecordedInput:
+    unit = _unit_in_bag(signal)
+    command = f'/{base_name(signal.column, unit)}_setpoint'
+    return RecordedInput(signal.name, unit, place(command, signal.name, unit),
+                         place(f'/{signal.column}', signal.name, unit))
+
+
+def _unit_in_bag(signal: SignalColumn) -> str:
+    if not signal.unit:
+        raise ValueError(f"{signal.name} has no unit, and bags have none: write '{signal.name} "
+                         "[m]', or 1 in the brackets for none")
+    check_unit(signal.unit)
+    return signal.unit

@@ -1,0 +1,244 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Closed loops whose inputs act late: as without dead time, only later; wrong dead times."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
+from koopman_ros.core.status import StatusCode
+from koopman_ros.estimation import AppliedInputs, largest_bandwidth
+from koopman_ros.estimation.kalman_filters import uncertainty
+from koopman_ros.evaluation import at, exchange, perfect, simulate
+from koopman_ros.event_log.records import decoded, encoded
+from koopman_ros.model import Coordinates, linearised_model, Provenance
+from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.plants import (
+    Actuator,
+    equilibrium_input,
+    one_state_reactor,
+    Process,
+    ReactorParameters,
+)
+from koopman_ros.tuning import Tuning
+from support.closed_loops import REACTOR, SECOND, SETPOINT, shipped, START
+
+REACTOR_MODEL = shipped('reactor_nz4')
+FOULED = one_state_reactor(
+    replace(ReactorParameters(),
+            heat_transfer_coefficient=0.8 * ReactorParameters().heat_transfer_coefficient),
+    REACTOR.nominal_state)
+
+
+def late_reactor(seconds, known=None, plant=REACTOR, **given):
+    """Return a reactor at rest with a late coolant, and its controller by default parameters."""
+    model = replace(REACTOR_MODEL, dead_time=np.array([seconds if known is None else known]))
+    table = table_of(model, given)
+    loop = built(table.amended(table.snapshot({}), **given), model)
+    x = np.array([START])
+    u = equilibrium_input(plant, x)
+    # without noise a plant at rest is like a sensor that is stuck
+    loop = replace(loop, tuning=replace(loop.tuning, sensor=replace(
+        loop.tuning.sensor, stuck_sensor_timeout=0.0)))
+    return loop, Process(plant, 0, x, u, Actuator(dead_time=seconds), u), loop.initialise(
+        State(), u)
+
+
+def step(loop, plant, state, duration, *events):
+    run = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT]))), *events],
+                   duration=duration, state=state, input_sensor=perfect)
+    assert not run.failure
+    assert set(run.levels) == {'sdre'}
+    return run
+
+
+@pytest.mark.parametrize(('seconds', 'known'), [
+    (10.0, 9.0), (10.0, 11.0), (30.5, 27.0), (60.0, 54.0), (120.0, 108.0)])
+def test_a_late_coolant_brings_no_overshoot(seconds, known):
+    run = step(*late_reactor(seconds, known), 150.0 + 2.0 * seconds)
+    assert SETPOINT - run.states.min() < 0.3
+    assert abs(run.states[-1, 0] - SETPOINT) < 0.5
+
+
+@pytest.mark.parametrize(('seconds', 'known', 'duration'), [(10.0, 11.0, 400), (30.0, 27.0, 600)])
+def test_a_late_coolant_leaves_no_offset_on_a_changed_plant(seconds, known, duration):
+    run = step(*late_reactor(seconds, known, FOULED), duration)
+    assert abs(run.states[-1, 0] - SETPOINT) < 0.02
+
+
+def test_a_dead_time_twice_as_long_as_known_leaves_the_loop_stable():
+    run = step(*late_reactor(20.0, 10.0), 400)
+    assert np.ptp(run.states[-60:]) < 0.1 < np.ptp(run.states[100:200])
+    assert abs(run.states[-1, 0] - SETPOINT) < 0.1
+
+
+def test_a_takeover_a_record_and_the_next_level_keep_what_is_under_way():
+    loop, plant, state = late_reactor(20.0)
+    whole = step(loop, plant, state, 60.0)
+    # of a hand-over to a controller with the same settings nothing is seen
+    again = step(loop, plant, state, 60.0, at(20.0, exchange(replace(loop))),
+                 at(30.0, lambda now: replace(now, state=decoded(encoded(now.state)))))
+    np.testing.assert_allclose(again.commands, whole.commands, rtol=0, atol=1e-9)
+    half = step(loop, plant, state, 20.0).loop.state
+    assert len(half.applied.times_ns) == 21
+    forgetful = replace(half, applied=AppliedInputs().corrected(half.command))
+    now_ns = half.time_ns + SECOND
+    commands = [loop.step(one, np.array([START]), now_ns)[1][0] for one in (half, forgetful)]
+    assert commands[0] == pytest.approx(whole.commands[21, 0], abs=0.2)
+    assert abs(commands[1] - commands[0]) > 0.3
+    # where stamps go back, the inputs under way go with them
+    back = loop.step(half, np.array([START]), half.time_ns - 1800 * SECOND)[0]
+    assert np.diff(back.applied.times_ns).tolist()[-3:] == [SECOND] * 3
+
+
+def test_a_prediction_that_diverges_is_a_failure_of_the_level():
+    loop, _, state = late_reactor(3600.0, observer_bandwidth=0.0)
+    hot = np.array([loop.model.states.upper[0]])
+    applied = AppliedInputs().corrected(np.array([1e3])).followed_by(
+        0, state.command, loop.estimation.dead_ns)
+    _, command, report = loop.step(replace(state, applied=applied), hot, SECOND)
+    assert report.level == 'hold'
+    assert report.reason.cause.code is StatusCode.NOT_PREDICTED
+    assert report.reason.cause.values['seconds'] < 3600.0
+    np.testing.assert_array_equal(command, state.command)
+
+
+@pytest.mark.parametrize(('known', 'given', 'bandwidth'), [
+    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.023), (40.0, {'dead_time': 0.0}, 0.1),
+    (0.0, {'dead_time': 80.0}, 0.013), (40.0, {'dead_time': -1.0}, 0.023),
+    (40.0, {'observer_bandwidth': 0.1}, 0.1)])
+def test_the_default_bandwidth_falls_with_the_dead_time(known, given, bandwidth):
+    model = replace(REACTOR_MODEL, dead_time=np.array([known]))
+    named = {f'coolant_temperature.{name}' if name == 'dead_time' else name: value
+             for name, value in given.items()}
+    table = table_of(model, named)
+    loop = built(table.amended(table.snapshot({}), **named), model)
+    assert loop.tuning.observer_bandwidth == pytest.approx(bandwidth)
+    seconds = given.get('dead_time', -1.0)
+    assert loop.estimation.dead_ns == (round((known if seconds < 0.0 else seconds) * SECOND),)
+
+
+def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
+    loop, outputs = late_reactor(0.0)[0], late_reactor(0.0)[0].measured
+    noise, usual, _ = uncertainty(loop.model, outputs, loop.tuning)
+    for seconds in (60.0, 120.0):
+        model = replace(REACTOR_MODEL, dead_time=np.array([seconds]))
+        slowest = -float(model.drift_jacobian(np.zeros(1))[0, 0]) / 60.0
+        # K/s of the temperature for a coolant of one scale more
+        gain = float((model.B[0, 0] * model.states.scale[0]) / 60.0)
+        limited = uncertainty(model, outputs, loop.tuning)[1]
+        assert limited < usual
+        assert limited == pytest.approx(
+            largest_bandwidth(seconds, slowest) ** 2 * noise / gain)
+        own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
+        np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
+                                      uncertainty(loop.model, outputs, own)[1])
+
+
+@pytest.mark.parametrize('levels', [('mpc', 'linear'), ('linear',), ('pi',)])
+@pytest.mark.parametrize('estimator', ['', 'extended_kalman_filter'])
+def test_every_law_and_filter_acts_on_the_prediction(levels, estimator):
+    gains = {'pi.temperature.gain': 1.0, 'pi.temperature.integral_time': 60.0}
+    loop, plant, state = late_reactor(
+        30.0, 27.0, estimator=estimator, fallback_order=levels, **gains)
+    run = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
+                   duration=440.0, period=2.0, state=state)
+    assert set(run.levels) == {levels[0]}
+    # a PI law has its own overshoot, and without prediction it would swing
+    assert SETPOINT - run.states.min() < (1.0 if levels == ('pi',) else 0.3)
+    assert abs(run.states[-1, 0] - SETPOINT) < 0.5
+    plan = run.reports[-1].command.plan
+    assert plan is None or plan.times[0] == 27.0
+
+
+# Several inputs.
+
+A, B = np.array([[-0.2, 0.1], [0.0, -0.3]]), np.array([[0.3, 0.1], [0.1, 0.4]])
+PERIOD = 0.5  # s
+
+
+def two_inputs(dead_time, **given):
+    x, u = (Coordinates((f'{name}1', f'{name}2'), ('1', '1'), np.zeros(2), np.ones(2),
+                        np.full(2, -5.0), np.full(2, 5.0)) for name in 'xu')
+    model = replace(linearised_model(A, B, x, u, 's', Provenance('two inputs')),
+                    dead_time=np.array(dead_time))
+    return Controller(model, Tuning.for_model(model, **given))
+
+
+AT_REST = ((-100 * SECOND, np.zeros(2)),)
+
+
+class Linear:
+    """The plant of that model, whose inputs act late."""
+
+    def __init__(self, dead_time, x, time_ns=0, commands=AT_REST):
+        self.dead_time, self.x, self.time_ns, self.commands = dead_time, x, time_ns, commands
+
+    @property
+    def u(self):
+        return self.commands[-1][1]
+
+    applied = u
+
+    def commanded(self, u, time_ns):
+        return Linear(self.dead_time, self.x, self.time_ns, (*self.commands, (time_ns, u)))
+
+    def acting(self, seconds):
+        return np.array([next(u[i] for time, u in reversed(self.commands)
+                              if time / SECOND + dead <= seconds + 1e-9)
+                         for i, dead in enumerate(self.dead_time)])
+
+    def until(self, time_ns):
+        now, end, x = self.time_ns / SECOND, time_ns / SECOND, self.x
+        edges = {now, end} | {edge for time, _ in self.commands for dead in self.dead_time
+                              if now < (edge := time / SECOND + dead) < end}
+        for begin, later in pairwise(sorted(edges)):
+            block = np.zeros((3, 3))
+            block[:2, :2], block[:2, 2] = A, B @ self.acting(begin)
+            x = (expm((later - begin) * block) @ np.append(x, 1.0))[:2]
+        return Linear(self.dead_time, x, time_ns, self.commands)
+
+
+@pytest.mark.parametrize('dead_time', [
+    (0.7, 0.7), (0.7, 2.2), (2.2, 0.7), (0.0, 1.5), (10.7, 0.2)])
+def test_each_input_is_what_the_law_gives_for_the_state_when_it_acts(dead_time):
+    """Where the model is right, as if there were no dead time."""
+    loop = two_inputs(dead_time)
+    goal = np.array([2.0, -1.0])
+    run = simulate(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
+                   duration=30.0, period=PERIOD)
+    gain, target = loop.best.law, loop.best.target(goal, np.zeros(2), None)
+    plant = Linear(dead_time, np.zeros(2), commands=run.loop.plant.commands)
+    for k, dead in ((k, dead) for k in range(4, 30) for dead in enumerate(dead_time)):
+        i, seconds = dead
+        x = plant.until(round((k * PERIOD + seconds) * SECOND)).x
+        law = gain.compute(loop.estimation.level(State().supervisor).estimator.restart(
+            None, x, None), target, None, PERIOD, None).u
+        assert run.commands[k, i] == pytest.approx(law[i], abs=0.02), (k, i)
+    np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
+
+
+def test_a_plan_knows_what_is_under_way():
+    """With different dead times it costs less than the law that acts on predicted states."""
+    dead_time, goal, costs = (0.2, 3.3), np.array([2.0, -1.0]), []
+    for law in ('sdre', 'mpc'):
+        loop = two_inputs(dead_time, fallback_order=(law,), limits=InputLimits(
+            np.full(2, -4.0), np.full(2, 4.0), np.array([2.0, 0.8])))
+        run = simulate(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
+                       duration=30.0, period=PERIOD)
+        assert set(run.levels) == {law}
+        target, e = loop.best.target(goal, np.zeros(2), None), run.states[4:] - goal
+        acted = np.array([run.loop.plant.acting(time) for time in run.times[4:]])
+        costs.append(np.sum(e ** 2) + np.sum((acted - target.u) ** 2))
+        np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
+    assert costs[1] < costs[0]
+    # the plan keeps the rates by itself
+    reports = [report.command for report in run.reports[5:]]
+    assert not any(report.at_rate for report in reports)
+    assert any(report.plan.at_rate[1] for report in reports)
+    assert reports[0].plan.times[0] == 0.2

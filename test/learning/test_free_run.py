@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Free runs of models on records, against the exact solution of an oscillator."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from koopman_ros.core.datasets import Episode
+from koopman_ros.learning import compare_classes, evaluate_model, learn_lift, simulate, Thresholds
+from koopman_ros.learning.identification import DriftModel, Identified, identify
+from koopman_ros.learning.pipeline import _failed_test
+from koopman_ros.model import Box, Coordinates, linearised_model, Provenance
+from koopman_ros.records import read
+
+A, B = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]])
+N, PERIOD = 200, 0.1
+RECORDS = Path(__file__).parents[2] / '../shared/records'
+STATES = Coordinates.spanning(('position', 'speed'), ('m', 'm/s'), -2.0 * np.ones(2),
+                              2.0 * np.ones(2))
+INPUTS = Coordinates.spanning(('force',), ('N',), -np.ones(1), np.ones(1))
+
+
+def table(seed=0, x=(1.0, -0.5)):
+    """Return a run of the oscillator under random steps, solved exactly."""
+    step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), PERIOD)
+    u = np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, N // 10), 10)
+    path = [np.array(x)]
+    for value in u[:-1]:
+        path.append(step @ path[-1] + gain[:, 0] * value)
+    return {'time': PERIOD * np.arange(N), 'force': u,
+            **dict(zip(STATES.names, np.transpose(path), strict=True))}
+
+
+def lifted(unit='s', slope=A):
+    factor = 60.0 if unit == 'min' else 1.0
+    return linearised_model(factor * slope, factor * B, STATES, INPUTS, unit, Provenance('test'))
+
+
+def drift(slope=A):
+    scaled = slope * STATES.scale / STATES.scale[:, None]
+    return DriftModel(Box(STATES, INPUTS, 's'), 1, np.vstack([np.zeros(2), scaled.T]),
+                      B * INPUTS.scale / STATES.scale[:, None])
+
+
+@pytest.mark.parametrize('model', [lifted(), lifted('min'), drift()])
+@pytest.mark.parametrize('states', [['position [m]', 'speed [m/s]'], ['speed [m/s]'],
+                                    ['speed [m/s]', 'position [m]']])
+def test_a_right_model_follows_the_record(model, states):
+    tables = [table(), {**table(1, (0.0, 1.5)), 'position': np.where(
+        np.arange(N) % 20, np.nan, table(1, (0.0, 1.5))['position'])}]
+    run = simulate(model, read(tables, states, 'force [N]'))
+    assert not run.diverged
+    assert np.all(run.fit > 99.9)
+    assert np.all(run.rmse < 1e-4)
+    assert run.names == tuple(name for name in STATES.names if name in ' '.join(states))
+    # the state that was not measured is found, too
+    speed = run.paths[0][:, run.names.index('speed')]
+    assert speed == pytest.approx(table()['speed'], abs=1e-3)
+    assert run.paths[0].shape == (N, 2)
+
+
+def test_units_of_the_record_are_converted():
+    values = table()
+    run = simulate(lifted(), read({**values, 'position': 1e3 * values['position']},
+                                  'position [mm]', 'force [N]'))
+    assert (run.units, run.names) == (('m',), ('position',))
+    assert run.fit[0] > 99.9
+
+
+def test_errors_of_a_wrong_model_count_after_the_start(tmp_path):
+    record = read(table(), 'position [m]', 'force [N]')
+    stiffer = lifted(slope=A * [[1.0, 1.0], [1.4, 1.0]])
+    run = simulate(stiffer, record, init=40, picture=tmp_path / 'run.png')
+    error = run.paths[0][40:, 0] - table()['position'][40:]
+    assert run.rmse[0] == pytest.approx(np.sqrt(np.mean(error ** 2)))
+    spread = np.linalg.norm(table()['position'][40:] - np.mean(table()['position'][40:]))
+    assert run.fit[0] == pytest.approx(100.0 * (1.0 - np.linalg.norm(error) / spread))
+    assert 'position: error' in str(run)
+    assert (tmp_path / 'run.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_model_that_diverges_says_so(tmp_path):
+    run = simulate(lifted(slope=30.0 * np.eye(2)), read(table(), 'position [m]', 'force [N]'),
+                   init=2)
+    assert run.diverged
+    assert run.rmse[0] == np.inf
+    run.draw(tmp_path / 'run.png')
+
+
+@pytest.mark.parametrize(('slope', 'words'), [
+    (A, ''), (A * [[1.0, 1.0], [1.4, 1.0]], 'above that of the best linear model'),
+    (30.0 * np.eye(2), 'error of its free run, inf m in position')])
+def test_a_model_is_refused_whose_free_run_is_worse_than_that_of_the_linear_model(slope, words):
+    test = read(table(), 'position [m]', 'force [N]')
+    found = Identified(drift(), '', drift(A * [[1.0, 1.0], [1.1, 1.0]]), (), np.ones(2), (), (), 1)
+    reasons = _failed_test({'test': simulate(lifted(slope=slope), test, init=5)}, found, test)
+    assert len(reasons) == bool(words)
+    assert words in ''.join(reasons)
+
+
+@pytest.mark.parametrize(('signals', 'options', 'words'), [
+    (('force', 'position'), {}, 'none of the states position, speed, it has force'),
+    (('position [m]', 'speed'), {}, 'no input force'),
+    (('position [s]', 'force'), {}, r"position: .* as 'position \[unit\]'"),
+    (('position [m]', 'force [N]'), {'init': 0}, 'init = 0'),
+])
+def test_refuses_a_record_of_other_signals(signals, options, words):
+    with pytest.raises(ValueError, match=words):
+        simulate(lifted(), read(table(), *signals), **options)
+
+
+@pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')
+def test_a_linear_model_of_two_heaters_follows_them_on_another_day():
+    signals = ['temperature_1 [K]', 'temperature_2 [K]'], ['heater_1', 'heater_2']
+    days, other = (read([RECORDS / f'tclab_{name}.csv' for name in names], *signals)
+                   for names in (('energy', 'mimo'), ('hybrid',)))
+    run = simulate(identify(days.plant, days.episodes, degrees=(1,)), other)
+    assert np.all(run.rmse < [4.0, 6.0])
+    # of a motion by 30 K and 20 K
+    assert run.fit[0] > 50.0
+
+
+def test_an_identification_with_unmeasured_states_is_learned_and_simulated_as_it_is():
+    values = table()
+    record = read(values, 'position [m]', 'force [N]')
+    whole = np.column_stack([values[name] for name in STATES.names])
+    parts = [Episode(values['time'], whole, values['time'], values['force'][:, None]).part(
+        k, k + 21) for k in range(0, N - 20, 20)]
+    found = Identified(drift(), 'output error', drift(), (), np.full(2, 1e-3), tuple(parts[:-2]),
+                       tuple(parts[-2:]), hidden=1)
+    learned = compare_classes(found, record.plant, Thresholds(), model_class='linear', n_z=3,
+                              seed=0, starts=1, loops=8)
+    assert learned.model.states.names == STATES.names
+    assert np.all(evaluate_model(found, learned, None, Thresholds(), loops=8).rmse < 1e-5)
+    for model in (found, learned, learned.model):
+        assert simulate(model, record).fit[0] > 99.9
+    with pytest.raises(ValueError, match='linear'):
+        learn_lift(found, record.plant, 3, seed=0, starts=1)

@@ -1,0 +1,220 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Records from tables: columns, units, times, missing values and gaps."""
+
+from pathlib import Path
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import savemat
+
+from koopman_ros.records import read
+
+N, PERIOD = 60, 0.5
+SECONDS = PERIOD * np.arange(N)
+LEVEL = 1.0 + 0.5 * np.sin(0.3 * SECONDS)
+PUMP = np.repeat([2.0, 4.0, 3.0], N // 3)
+START = pd.Timestamp('2026-03-01 08:00:00')
+RECORDS = Path(__file__).parents[2] / '../shared/records'
+
+
+def frame(**columns):
+    return pd.DataFrame({'level [m]': LEVEL, 'pump [V]': PUMP, **columns})
+
+
+def levels(source, **options):
+    (episode,) = read(source, 'level', 'pump', **options).episodes
+    return episode
+
+
+@pytest.mark.parametrize('write', [
+    lambda table, path: table.to_csv(path / 'day.csv', index=False),
+    lambda table, path: table.to_csv(path / 'day.csv', index=False, sep=';', decimal=',',
+                                     encoding='utf-8-sig'),
+    lambda table, path: table.to_csv(path / 'day.csv', index=False, sep='\t'),
+    lambda table, path: table.to_parquet(path / 'day.parquet'),
+    lambda table, path: savemat(path / 'day.mat', {
+        'time': table['time [s]'], 'level': LEVEL, 'pump': PUMP[:, None], 'Ts': PERIOD}),
+], ids=['csv', 'decimal comma', 'tabs', 'parquet', 'mat'])
+def test_each_kind_of_file_gives_the_same_episode(tmp_path, write):
+    if 'parquet' in str(write.__code__.co_consts):
+        pytest.importorskip('pyarrow')
+    write(frame(**{'time [s]': SECONDS}), tmp_path)
+    (path,) = tmp_path.iterdir()
+    record = read(path, 'level [m]', 'pump [V]')
+    (episode,) = record.episodes
+    assert episode.time == pytest.approx(SECONDS)
+    assert episode.x[:, 0] == pytest.approx(LEVEL)
+    assert episode.inputs_at(SECONDS)[:, 0].tolist() == PUMP.tolist()
+    assert (record.plant.name, record.plant.state_units, record.plant.input_units) == (
+        'day', ('m',), ('V',))
+    assert (record.sources, record.report.used, record.report.measurements) == (
+        (str(path),), N, N)
+
+
+@pytest.mark.parametrize(('column', 'times'), [
+    ('time', SECONDS),
+    ('t', SECONDS + 1.7e9),
+    ('time [h]', SECONDS / 3600.0),
+    ('Time [min]', SECONDS / 60.0),
+    ('time [ms]', (1000 * SECONDS).astype(np.int64)),
+    ('time [d]', SECONDS / 86400.0),
+    ('time [ns]', (1e9 * SECONDS).astype(np.int64)),
+    ('stamp', 1_772_352_000_123_456_789 + (1e9 * SECONDS).astype(np.int64)),
+    ('stamp', START + pd.to_timedelta(SECONDS, 's')),
+    ('stamp', (START.tz_localize('Europe/Berlin') + pd.to_timedelta(SECONDS, 's'))),
+    ('stamp', [str(START + pd.Timedelta(t, 's')) for t in SECONDS]),
+    ('stamp', [(START + pd.Timedelta(t, 's')).strftime('%m/%d/%Y %H:%M:%S.%f') for t in SECONDS]),
+    ('elapsed', pd.to_timedelta(SECONDS, 's')),
+])
+def test_times_of_each_kind_are_seconds_since_the_first_measurement(column, times):
+    name = '' if column.lower()[0] == 't' else column
+    assert levels(frame(**{column: times}), time=name).time == pytest.approx(SECONDS)
+
+
+@pytest.mark.parametrize('options', [{'period': PERIOD}, {'time': 'when [min]'}, {}])
+def test_times_may_be_a_period_a_unit_of_the_argument_or_an_index(options):
+    table = frame(when=SECONDS / 60.0)
+    if not options:
+        table.index = START + pd.to_timedelta(SECONDS, 's')
+    assert levels(table, **options).time == pytest.approx(SECONDS)
+
+
+@pytest.mark.parametrize(('columns', 'options', 'words'), [
+    ({'time': (1e9 * SECONDS).astype(np.int64)}, {}, r"can be no seconds: .*time='time \[ns\]'"),
+    ({'time': 1e9 * SECONDS}, {}, 'can be no seconds'),
+    ({'time': 1_772_352_000_123 + 500 * np.arange(N)}, {}, 'can be no seconds'),
+    ({}, {}, "no column 'time'.*or give the period of the rows in s"),
+    ({'time': SECONDS}, {'time': 'hour'}, "no column 'hour'"),
+    ({'time': SECONDS}, {'time': 'time', 'period': 1.0}, 'give one'),
+    ({'time': ['noon'] * N}, {}, 'neither numbers nor dates'),
+    ({'time': [np.nan] * N}, {}, 'holds no times'),
+    ({'time [K]': SECONDS}, {}, 'cannot be converted'),
+    ({'time': SECONDS, 'level [m]': ['Bad'] * N}, {}, 'holds no number'),
+    ({'time': SECONDS, 'level [m]': np.where(SECONDS < 4.0, LEVEL, np.nan)}, {},
+     'no usable segment'),
+])
+def test_refuses_times_and_columns_that_are_none(columns, options, words):
+    with pytest.raises(ValueError, match=words):
+        read(frame(**columns), 'level', 'pump', **options)
+
+
+@pytest.mark.parametrize(('second', 'point'), [('s;m;V', '.'), ('0;1;2', ',')])
+def test_a_row_of_units_below_the_header_and_late_decimal_commas_are_understood(
+        tmp_path, second, point):
+    rows = [f'{t:g};{x:g};{u:g}'.replace('.', point) for t, x, u in zip(
+        SECONDS, LEVEL, PUMP, strict=True)][point == ',':]
+    (tmp_path / 'day.csv').write_text('\n'.join(['time;level;pump', second, *rows]))
+    record = read(tmp_path / 'day.csv', 'level [m]', 'pump [V]')
+    assert record.episodes[0].time == pytest.approx(SECONDS)
+    assert record.episodes[0].x[:, 0] == pytest.approx(LEVEL, rel=1e-5)
+
+
+def test_a_signal_may_have_another_column_name_and_unit():
+    table = pd.DataFrame({'time': SECONDS, 'TI-101.PV [degC]': 20.0 + LEVEL, 'HC12': PUMP})
+    record = read(table, 'temperature = TI-101.PV [K]', 'heater = HC12')
+    assert record.episodes[0].x[:, 0] == pytest.approx(293.15 + LEVEL)
+    assert (record.plant.state_names, record.plant.state_units) == (('temperature',), ('K',))
+    assert record.plant.input_units == ('1',)
+    assert "write 'heater [m]'" in str(record)
+    for names, words in ((('flow', 'HC12'), "no column 'flow', it has 'time', 'TI-101.PV"),
+                         (('TI-101.PV [m]', 'HC12'), 'cannot be converted'),
+                         (('TI-101.PV', 'HC12 [squeeze]'), 'no unit')):
+        with pytest.raises(ValueError, match=words):
+            read(table, *names)
+
+
+def test_a_missing_value_leaves_the_other_signals():
+    level, lab = LEVEL.copy(), np.where(np.arange(N) % 20 == 0, 7.0 + SECONDS, np.nan)
+    level[[5, 20]] = np.nan
+    record = read({'time': SECONDS, 'level': level, 'lab': lab, 'pump': np.where(
+        np.arange(N) == 30, np.nan, PUMP)}, ['level', 'lab'], ['pump'])
+    (episode,) = record.episodes
+    # neither was measured at row 5
+    rows = np.delete(np.arange(N), 5)
+    assert episode.time == pytest.approx(SECONDS[rows])
+    assert np.array_equal(episode.x, np.column_stack([level, lab])[rows], equal_nan=True)
+    assert episode.inputs_at(SECONDS[30:31]) == PUMP[29]
+    assert (record.report.used, record.report.measurements) == (N - 2 + 3, N - 2 + 3)
+    words = str(record)
+    assert 'lab was measured in 3 of 60 rows' in words
+    assert 'pump has no value in 1 rows' in words
+
+
+def test_signals_with_rows_of_their_own_share_their_times():
+    rows = pd.DataFrame({'time': SECONDS, 'level': LEVEL, 'pump': np.nan})
+    rows = pd.concat([pd.DataFrame({'time': SECONDS[::20], 'level': np.nan, 'pump': PUMP[::20]}),
+                      rows]).sort_values('time', kind='stable')
+    assert levels(rows).x[:, 0] == pytest.approx(LEVEL)
+    repeated = pd.concat([rows, rows.iloc[-1:]])
+    assert read(repeated, 'level', 'pump').report.dropped == {
+        'measurement with a repeated time': 1}
+    # the newest first, as historians export
+    assert levels(rows[::-1]).x[:, 0] == pytest.approx(LEVEL)
+
+
+@pytest.mark.parametrize(('change', 'words', 'lengths'), [
+    (lambda t, x: t.__setitem__(slice(30, None), t[30:] + 60.0), 'gap of 60.500 s', [30, 30]),
+    (lambda t, x: t.__setitem__(slice(30, None), t[30:] - 60.0), 'set back by 59.500', [30, 30]),
+    (lambda t, x: x.__setitem__(slice(30, None), x[30:] + 9.0), r'jump to 9\.\d+ 1', [30, 30]),
+    (lambda t, x: x.__setitem__(30, 9.0), r'1 dropped: spike of a single sample \(level\)', [59]),
+    (lambda t, x: t.__setitem__(slice(55, None), t[55:] + 60.0), '5 dropped: in a segment', [55]),
+    (lambda t, x: t.__setitem__(2, np.nan), '1 dropped: without a time', [59]),
+])
+def test_episodes_end_where_the_motion_is_interrupted(change, words, lengths):
+    time, level = SECONDS.copy(), LEVEL.copy()
+    change(time, level)
+    record = read({'time': time, 'level': level, 'pump': PUMP}, 'level', 'pump')
+    assert list(map(len, record.episodes)) == lengths
+    assert [episode.time[0] for episode in record.episodes] == [0.0] * len(lengths)
+    assert re.search(words, str(record))
+
+
+def test_inputs_are_held_or_linear_and_count_from_the_first_row_that_has_all():
+    table = {'time': SECONDS, 'level': LEVEL, 'pump': np.where(SECONDS < 2.0, np.nan, SECONDS),
+             'valve': PUMP}
+    record = read(table, 'level', ['pump', 'valve'], linear='pump')
+    (episode,) = record.episodes
+    assert len(episode) == N - 4
+    assert record.report.dropped == {'before the first input': 4}
+    assert episode.inputs_at(np.array([0.25])).tolist() == [[2.25, PUMP[4]]]
+
+
+def test_several_tables_are_episodes_of_one_record(tmp_path):
+    frame(time=SECONDS).to_csv(tmp_path / 'a.csv')
+    record = read([tmp_path / 'a.csv', frame(time=SECONDS)], 'level', 'pump', name='tank')
+    assert list(map(len, record.episodes)) == [N, N]
+    assert (record.plant.name, record.sources) == ('tank', (str(tmp_path / 'a.csv'),))
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    ((frame(time=SECONDS), [], 'pump'), 'at least one of each'),
+    ((frame(time=SECONDS), 'level', ['pump', 'level']), 'level is named twice'),
+    ((frame(time=SECONDS), ' ', 'pump'), 'names no signal'),
+    ((np.zeros((9, 2)), 'level', 'pump'), 'a ndarray is no record'),
+    ((frame(time=SECONDS), 'level', 'pump', 'valve'), 'linear names valve'),
+])
+def test_refuses_signals_and_sources_that_are_none(arguments, words):
+    source, states, inputs, *linear = arguments
+    with pytest.raises(ValueError, match=words):
+        read(source, states, inputs, linear=linear)
+
+
+@pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
+def test_refuses_other_files(tmp_path, file):
+    (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
+    with pytest.raises(ValueError, match=r'is no record|version 7\.3'):
+        read(tmp_path / file, 'level', 'pump')
+
+
+@pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')
+def test_measured_records():
+    record = read([RECORDS / 'tclab_energy.csv', RECORDS / 'tclab_mimo.csv'],
+                  ['temperature_1 [K]', 'temperature_2 [K]'], ['heater_1', 'heater_2'])
+    assert list(map(len, record.episodes)) == [599, 201]
+    assert record.plant.input_units == ('percent', 'percent')
+    tanks = read(RECORDS / 'cascaded_tanks.csv', 'level = yEst [V]', 'pump = uEst [V]', period=4.0)
+    assert tanks.episodes[0].time[-1] == 4.0 * 1023

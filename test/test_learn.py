@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Learning from files on the command line."""
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from koopman_ros import learn
+from koopman_ros.model import load
+from support.quick_retraining import quick_retraining
+
+N, PERIOD = 600, 0.5
+
+
+def table(seed):
+    """Return a run of a tank that empties linearly, with a little noise."""
+    decay = np.exp(-0.2 * PERIOD)
+    rng = np.random.default_rng(seed)
+    pump, level = np.repeat(rng.uniform(0.0, 10.0, N // 10), 10), [2.0]
+    for value in pump[:-1]:
+        level.append(decay * level[-1] + (1.0 - decay) * 0.5 * value)
+    return pd.DataFrame({'time [s]': PERIOD * np.arange(N), 'pump [V]': pump,
+                         'level [m]': level + 1e-3 * rng.standard_normal(N)})
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    table(0).to_csv('day.csv', index=False)
+    table(1).to_csv('other.csv', index=False)
+    return tmp_path
+
+
+def learned(*arguments):
+    with quick_retraining(8, degrees=(1, 2)):
+        return learn.main(['day.csv', '--states', 'level', '--inputs', 'pump', '--model_class',
+                           'linear', *arguments])
+
+
+def test_a_file_is_learned_tested_and_reported(folder, capsys):
+    assert learned('--test', 'other.csv') == 0
+    printed = capsys.readouterr().out
+    assert [words in printed for words in (
+        'level [m], pump [V]', '600 of 600 measurements used', 'the new model (linear) is acc',
+        'test: free run of 600 measurements')] == [True] * 4
+    model = load(folder / 'day.safetensors')
+    assert (model.states.names, model.inputs.units) == (('level',), ('V',))
+    assert model.eigenvalues.real == pytest.approx([-0.2], rel=0.02)
+    assert {path.name for path in folder.glob('day.*')} == {
+        'day.csv', 'day.safetensors', 'day.json', 'day.md', 'day.png', 'day.free_run.png',
+        'day.test.png'}
+    runs = json.loads((folder / 'day.json').read_text())['free_runs']
+    assert [runs[name]['fit_percent']['level'] > 99.0 for name in ('record', 'test')] == [True] * 2
+    assert '| test | level |' in (folder / 'day.md').read_text()
+
+
+def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
+    assert learned('--model_output', 'first.safetensors') == 0
+    with quick_retraining(8, degrees=(1, 2)):
+        assert learn.main(['other.csv', '--model', 'first.safetensors', '--model_class', 'linear',
+                           '--training_seed', '1']) == 2
+    assert 'is not 10 % below that of the present model' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--states', 'height'], "no column 'height', it has 'time [s]'"),
+    (['--restarts', '0'], 'restarts = 0 must be in [1, 100]'),
+    (['--unmeasured_states', '1', '--input_matrix_degree', '1'], 'input_matrix_degree is 1'),
+    (['--model', 'none.safetensors'], 'none.safetensors'),
+    (['--test', 'none.csv'], 'none.csv'),
+    (['--period', '-1'], 'period = -1.0 s'),
+    (['--training_samples', 'many'], None),
+])
+def test_a_wrong_argument_is_a_sentence(folder, capsys, arguments, words):
+    if words is None:
+        with pytest.raises(SystemExit):
+            learned(*arguments)
+        return
+    assert learned(*arguments) == 1
+    assert words in capsys.readouterr().err
+
+
+def test_the_module_is_the_program(tmp_path):
+    found = subprocess.run(
+        [sys.executable, '-m', 'koopman_ros.learning', 'day.csv'], capture_output=True, text=True,
+        cwd=tmp_path, env={**os.environ, 'PYTHONPATH': str(Path(learn.__file__).parents[1])})
+    assert found.returncode == 1
+    assert found.stderr.startswith('learn: the signals are not known: give --states and --inputs')
