@@ -13,6 +13,12 @@ from collections.abc import Callable, Mapping
 import sys
 from typing import Any
 
+if __name__ == '__main__':
+    # before numpy is loaded, which then takes one thread
+    from koopman_ros.process_entry import learn
+
+    sys.exit(learn())
+
 from koopman_ros import __version__
 from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path

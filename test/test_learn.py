@@ -90,7 +90,7 @@ def test_a_wrong_argument_is_a_sentence(folder, capsys, arguments, words):
 
 def test_the_module_is_the_program(tmp_path):
     found = subprocess.run(
-        [sys.executable, '-m', 'koopman_ros.learning', 'day.csv'], capture_output=True, text=True,
+        [sys.executable, '-m', 'koopman_ros.learn', 'day.csv'], capture_output=True, text=True,
         cwd=tmp_path, env={**os.environ, 'PYTHONPATH': str(Path(learn.__file__).parents[1])})
     assert found.returncode == 1
     assert found.stderr.startswith('learn: the signals are not known: give --states and --inputs')
