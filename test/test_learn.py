@@ -67,7 +67,7 @@ def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
     with quick_retraining(8, degrees=(1, 2)):
         assert learn.main(['other.csv', '--model', 'first.safetensors', '--model_class', 'linear',
                            '--training_seed', '1']) == 2
-    assert 'is not 10 % below that of the present model' in capsys.readouterr().out
+    assert 'is not 10 % below that of the current model' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [
