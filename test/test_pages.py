@@ -176,6 +176,19 @@ def test_table_of_other_controllers_has_the_figures_of_its_summary() -> None:
                 _agrees(shown, value)
 
 
+def test_table_of_noisy_data_has_the_figures_of_its_summary() -> None:
+    found = json.loads((ROOT / 'docs/results/sensors.json').read_text())['sensors']
+    rows = [row for row in _rows('results/training.md') if len(row) == 3]
+    first = next(i for i, row in enumerate(rows) if 'studies-sensors' in row[0]) + 2
+    for row, (part, figure) in zip(rows[first:first + 5], (
+            ('noisy', 'rollout_kelvin'), ('noisy', 'input_gain_error'),
+            ('noise_free', 'rollout_kelvin'), ('drifted', 'offset_before_kelvin'),
+            ('drifted', 'offset_after_kelvin')), strict=True):
+        values = found[part][figure]
+        for cell, value in zip(row[1:], (np.median(values), max(values)), strict=True):
+            _agrees(cell.removesuffix(' K'), float(value))
+
+
 @each_page
 def test_named_files_are_there(page: Path) -> None:
     for code in _inline_code(page):
@@ -478,8 +491,9 @@ def _agrees(cell: str, value: float | None) -> None:
     if value is None:
         assert cell.startswith('never'), cell
         return
-    number = cell.replace('−', '-')
-    assert float(number) == pytest.approx(value, abs=0.501 * 0.1 ** len(cell.partition('.')[2]))
+    mantissa, _, exponent = cell.replace('−', '-').partition('e')
+    digits = len(mantissa.partition('.')[2]) - int(exponent or 0)
+    assert float(f'{mantissa}e{exponent or 0}') == pytest.approx(value, abs=0.501 * 0.1 ** digits)
 
 
 def _anchors(page: Path) -> set[str]:
