@@ -111,7 +111,8 @@ class PanelNode(LoopNode):
         self._operator_actions = self._matching.publish(topics.AUDIT_LOG)
         self._nodes = {role: RemoteNode(
             self, name, {service: kind for of, service, kind in _SERVICES.values() if of == role},
-            partial(self.view.take_parameters, role)) for role, name in nodes.items()}
+            None if role == PLANT else partial(self.view.take_parameters, role))
+            for role, name in nodes.items()}
         self._wake = self.create_guard_condition(self._on_actions)
         wall_timer(self, _PERIOD, self._on_timer)
         wall_timer(self, _REMOTE_PERIOD, self._on_remote_timer)

@@ -249,7 +249,7 @@ def _simulation(page: PageLayout) -> None:
         page.button('Reset the simulated plant …', reset)
         answer = AnswerLine()
     # the driver of a real plant is no node of ours
-    page.follow(lambda now: show_if(row, bool(now.parameters.get(PLANT))))
+    page.follow(lambda now: show_if(row, f'{PLANT}: simulation' in now.statuses))
 
 
 def _controller_card(page: PageLayout) -> None:

@@ -181,6 +181,7 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                         topics.CLOCK),
             serves=STANDARD_SERVICES,
             calls=(*(f'controller/{service}' for service in ('set_automatic', 'reload_model')),
+                   'plant/reset',
                    *(f'trainer/{service}' for service in (
                        'record', 'experiment', 'train', 'cancel_training')),
                    *(f'{node}/{service}' for node in ('controller', 'trainer')

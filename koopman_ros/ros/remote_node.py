@@ -32,15 +32,18 @@ class RemoteNode:
     Another node of a fixed name, which may come and go.
 
     :param services: types of the called services, in addition to those of parameters, by name.
-    :param on_parameters: called with all parameters when they have changed.
+    :param on_parameters: called with all parameters when they have changed; by default they are
+        neither read nor set.
     """
 
     def __init__(self, node: Node, name: str, services: Mapping[str, Any],
-                 on_parameters: Callable[[Mapping[str, ParameterDescription]], None]) -> None:
+                 on_parameters: Callable[[Mapping[str, ParameterDescription]], None] | None = None
+                 ) -> None:
         self._full, self._on_parameters = node.resolve_service_name(name), on_parameters
-        kinds = {'list_parameters': ListParameters, 'describe_parameters': DescribeParameters,
-                 'get_parameters': GetParameters,
-                 'set_parameters_atomically': SetParametersAtomically, **services}
+        kinds = dict(services) if on_parameters is None else {
+            'list_parameters': ListParameters, 'describe_parameters': DescribeParameters,
+            'get_parameters': GetParameters,
+            'set_parameters_atomically': SetParametersAtomically, **services}
         self._clients: dict[str, Client] = {
             service: node.create_client(kind, f'{name}/{service}')
             for service, kind in kinds.items()}
@@ -75,6 +78,8 @@ class RemoteNode:
         now = time.monotonic()
         for future in [one for one, (deadline, _) in self._waiting.items() if now > deadline]:
             self._waiting.pop(future)[1](None)
+        if self._on_parameters is None:
+            return
         if not self._clients['get_parameters'].service_is_ready():
             self._stale = True
             if self._known:
@@ -111,7 +116,8 @@ class RemoteNode:
 
     def _take(self, found: Mapping[str, ParameterDescription]) -> None:
         self._known = bool(found)
-        self._on_parameters(found)
+        if self._on_parameters is not None:
+            self._on_parameters(found)
 
 
 def _description(about: ParameterDescriptor, value: Any) -> ParameterDescription:

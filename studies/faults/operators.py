@@ -24,7 +24,7 @@ from studies.faults.interceptor import Alteration, value
 
 Maker = Callable[[], Alteration]
 _BIAS = 'equivalent sensor bias [K]'
-NO_CLOCK = '^controller: control: use_sim_time is set and nobody publishes /clock'
+NO_CLOCK = '^controller: control: use_sim_time is set, but /clock is not published'
 _AT_ONCE = 10  # requests on their way
 REQUESTS = 400
 _STORM = 2.0  # s of wall time

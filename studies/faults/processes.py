@@ -28,7 +28,7 @@ DISK = '1m'  # size of a small disk
 _BUSY = (sys.executable, '-c', 'while True: pass')
 PARTICIPANTS = 12  # at once; those of one machine find each other up to 32
 _FLOOD = (sys.executable, '-c', f'from {__name__} import flood; flood(5.0, {PARTICIPANTS})')
-KEPT = ('^controller: control: .*the old model is kept',)
+KEPT = ('^controller: control: .*the current model is kept',)
 TWO_CONTROLLERS = ('^controller: control: 2 nodes command the coolant',
                    '^plant: simulation: 2 nodes command the coolant')
 TWO_PLANTS = ('^controller: control: .*2 nodes publish the temperature',)
@@ -152,7 +152,8 @@ def reload(loop: FaultHarness, spoil: str) -> None:
             loop.expect(answer.success, f'the reload was refused: {answer.message}')
         else:
             loop.expect(not answer.success, 'a spoilt model was accepted')
-            loop.expect('the old model is kept' in answer.message, f'the reason: {answer.message}')
+            loop.expect('the current model is kept' in answer.message,
+                        f'the reason: {answer.message}')
 
 
 def second_controller(loop: FaultHarness, says: tuple[str, ...] = TWO_CONTROLLERS) -> None:

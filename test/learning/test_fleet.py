@@ -77,5 +77,5 @@ def test_what_is_refused_before_it_begins(tasks):
         next(retrain_fleet(twice))
     with pytest.raises(ValueError, match='no plant to retrain'):
         next(retrain_fleet({}))
-    with pytest.raises(ValueError, match="warm_start_model = 'first' is the first of a fleet"):
+    with pytest.raises(ValueError, match="warm_start_model = 'first' means the first model of a"):
         retrain(tasks['first'])

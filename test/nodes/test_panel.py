@@ -299,7 +299,7 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))
     assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(
         False, 'the controller is not running: start it')
-    ros.wait_until(lambda: len(actions) >= 11)
+    ros.wait_until(lambda: len(actions) >= 12)
     first, last = (json.loads(actions[at].data) for at in (0, -1))
     assert (first['who'], first['what']) == ('anna', 'setpoint temperature')
     assert (first['new'], first['unit'], first['accepted'], first['answer']) == (

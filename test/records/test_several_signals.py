@@ -61,7 +61,7 @@ def test_an_input_without_commands_that_is_not_measured_throughout(write: Callab
                   *(Sent('/jacket', k, 20.0) for k in range(1, 16))])
     episodes, account = records.loop_episodes([path], [WARM], [JACKET])
     assert not episodes
-    assert 'jacket was not measured throughout, and has no commands' in account.notes[-1]
+    assert 'jacket was not always measured, and has no commands' in account.notes[-1]
 
 
 def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., Path]) -> None:
