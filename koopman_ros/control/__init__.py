@@ -18,7 +18,6 @@ from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.state import Arrival, Mode, State, StepReport
 from koopman_ros.control.supervisor import HOLD, MANUAL, SAFE, Supervisor
-from koopman_ros.estimation import AppliedInputs
 from koopman_ros.tuning import InputLimits, SensorLimits, Tuning
 
 __all__ = [
@@ -26,7 +25,6 @@ __all__ = [
     'LAWS',
     'MANUAL',
     'SAFE',
-    'AppliedInputs',
     'Arrival',
     'Controller',
     'Event',
