@@ -101,7 +101,8 @@ class FreeRun:
                             episode.inputs_at(episode.time)[:, j], unit), where='post',
                             color='tab:blue')
                     axes.set_ylabel(f'{name.replace("_", " ")} [{unit_label(unit)}]')
-                panels[k].legend(fontsize=8, loc='upper right')
+                panels[k].legend(fontsize=8, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=3,
+                                 frameon=False)
                 panels[(rows - 1) * columns + k].set_xlabel(f'time [{self.plant.time_unit}]')
             figure.suptitle('Free run, ' + ', '.join(
                 f'{name}: fit {fit:.1f} %' for name, fit in zip(self.names, self.fit, strict=True)

@@ -216,7 +216,7 @@ def _experiment(page: PageLayout) -> None:
         obstacle.set_text(f'Start is not possible: {reason}')
         show_if(obstacle, bool(reason))
         page.allow(begin, not reason)
-        page.allow(end, 'left [s]' in found.values)
+        page.allow(end, found.values.get('left [s]', '0') != '0')
         task.show(found, {'time left [s]' if key == 'left [s]' else key: value
                           for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
