@@ -21,7 +21,7 @@ from koopman_ros.learning.identification.total_variation import noise_level
 from koopman_ros.learning.identification.weak_form import regress
 
 _GROWTH = 2.0  # exponent by which roll-outs that judge an unstable plant may grow
-_MEMORIES = 10.0  # slowest time constants of a simulation
+_MEMORIES = 30.0  # slowest time constants of a simulation
 _SHORTEST = 20  # samples of a segment, whatever grows
 
 

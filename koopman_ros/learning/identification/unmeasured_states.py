@@ -48,6 +48,7 @@ _GAINS = ((0.5, 0.1, 0.01), (0.2, 0.02, 0.001), (0.8, 0.4, 0.1))
 _SAMPLES = 20  # between samples, in which rates are counted at first
 # A larger model must err less by so many standard errors of the difference.
 _SIGMAS = 2.0
+_MOST = 2.0  # times the least squared error that a smaller model may have
 
 _UNITS = (3, 8)  # hidden units of the networks that are tried
 _STARTS = 4  # of each network, of which the one that fits best is judged
@@ -146,8 +147,17 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     stage = stage_by_stage(watch, total, hidden * kinds)
     if not candidates:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
-    best = _plainest(candidates)
-    predictor = _with_gain(shared, best, stage('gain of the filter'))
+    monitor, able = stage('gain of the filter'), candidates
+    while True:
+        best = _plainest(able)
+        try:
+            predictor = _with_gain(shared, best, monitor)
+            break
+        except ValueError:
+            # its filter diverges
+            able = [one for one in able if one is not best]
+            if not able:
+                raise
     return replace(record.identified(
         predictor, best.label, [one.score for one in candidates], stage('linear model')),
         warnings=warnings)
@@ -163,7 +173,9 @@ def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
 
     def worse(own: Array) -> bool:
         excess = own - least
-        return bool(np.mean(excess) > _SIGMAS * np.std(excess) / np.sqrt(len(excess)))
+        # of a model that errs wildly in a few blocks the scatter says nothing
+        return bool(np.mean(excess) > min(
+            _SIGMAS * np.std(excess) / np.sqrt(len(excess)), (_MOST - 1.0) * np.mean(least)))
 
     able = [(len(one.model.theta), float(np.mean(own)), i) for i, (one, own) in enumerate(
         zip(candidates, squares, strict=True)) if not worse(own)]
