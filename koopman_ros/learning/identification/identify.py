@@ -136,7 +136,9 @@ class Identified:
     #: that is measured too rarely
     noise: Array
     fitted: tuple[Episode, ...]  #: the segments that it was fitted to
-    held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
+    #: segments that neither fit nor choice has seen; those of a drift with unmeasured states are
+    #: part of its fit, whose scores are of samples left out in turn
+    held_out: tuple[Episode, ...]
     #: unmeasured states, the last ones: the segments hold a filter's estimates of them
     hidden: int = 0
     #: those that were estimated, where it is the equations of a plant's class

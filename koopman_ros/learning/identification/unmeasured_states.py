@@ -101,9 +101,9 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     simulations of the record are refined (output error), also with a small network added to a
     linear drift. Of all numbers of states that are not measured and all drifts the smallest model
     is taken whose simulations err about as little as the best, at samples that were left out of
-    the fit, see :meth:`Refined.left_out`. At last the gain of its filter is fitted. Unmeasured
-    states are those of the filter: dimensionless, from -1 to 1, because no record gives their
-    names and units.
+    the fit, see :meth:`Refined.left_out`. It is fitted to the whole record. At last the gain of
+    its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to 1,
+    because no record gives their names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
