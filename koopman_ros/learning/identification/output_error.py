@@ -145,8 +145,9 @@ class Refined(Generic[_Model]):
         Return the errors (N, n_y) of samples in models that were not fitted to them.
 
         Segments of this length are left out one by one, with a model linearised in its parameters:
-        e = (I - H)^-1 r with the hat matrix H of the segment (Cook and Weisberg 1982). The errors
-        have the weights of the cost; the pieces of the record follow each other.
+        e = (I - H)^-1 r with the hat matrix H of the segment (Cook and Weisberg 1982). Of a
+        simulation, whose starts are refined. The errors have the weights of the cost; the pieces
+        of the record follow each other.
 
         :param samples: of a segment.
         """
@@ -238,8 +239,7 @@ class _Problem(Generic[_Model]):
         model, K, starts = self.split(theta.numpy())
         with np.errstate(all='ignore'):
             before, after = self._path(model.drift, K, starts)
-            errors = np.where(self._counted, before[..., :self._target.shape[2]] - self._target,
-                              0.0) / self.deviation
+            errors = self._weighed(before[..., :self._target.shape[2]] - self._target)
             cost = 0.5 * float(np.sum(errors ** 2)) / self.count
             if not np.isfinite(cost):
                 equations.add_sums(np.inf)
@@ -257,25 +257,30 @@ class _Problem(Generic[_Model]):
         """Return the errors as :meth:`Refined.left_out` has them."""
         model, K, starts = self.split(theta)
         p, (M, n_x), n_y = len(self.model.theta), starts.shape, self._target.shape[2]
-        q = p + (n_x if self.smooth else K.size)
         before, after = self._path(model.drift, K, starts)
-        errors = np.where(self._counted, before[..., :n_y] - self._target, 0.0) / self.deviation
-        J = np.concatenate([S for _, S in self._sensitivities(model, K, before, after, q)])
-        J = np.where(self._counted[..., None], J / self.deviation[:, None], 0.0)
+        errors = self._weighed(before[..., :n_y] - self._target)
+        J = np.concatenate([self._weighed(S, rows) for rows, S in self._sensitivities(
+            model, K, before, after, p + n_x)])
         matrix = normal_equations(self.add_residuals, torch.from_numpy(theta)).matrix.numpy()
         C = (np.linalg.pinv(matrix, hermitian=True) / self.count)[:p, :p]
         # a start is always fitted, within the range: nothing but the first samples tells it
-        prior = np.mean(errors[self._counted] ** 2) * np.eye(q - p)
+        prior = np.mean(errors[self._counted] ** 2) * np.eye(n_x)
         found = []
         for m in range(M):
             rows = np.flatnonzero(self._counted[:, m].any(axis=1))
             for part in np.array_split(rows, max(1, len(rows) // samples)):
-                S, start = np.split(J[part, m].reshape(-1, q), [p], axis=1)
-                if self.smooth:
-                    S = S - start @ np.linalg.solve(start.T @ start + prior, start.T @ S)
+                S, start = np.split(J[part, m].reshape(-1, p + n_x), [p], axis=1)
+                S = S - start @ np.linalg.solve(start.T @ start + prior, start.T @ S)
                 rest = np.eye(len(S)) - S @ C @ S.T
                 found.append(np.linalg.solve(rest, errors[part, m].ravel()).reshape(-1, n_y))
         return np.concatenate(found)
+
+    def _weighed(self, values: Array, rows: slice = slice(None)) -> Array:
+        """Return values (k, M, n_y, ...) of the outputs at some steps as the cost weighs them."""
+        more = (1,) * (values.ndim - 3)
+        counted, deviation = self._counted[rows], self.deviation
+        return np.where(counted.reshape(*counted.shape, *more),
+                        values / deviation.reshape(*deviation.shape, *more), 0.0)
 
     def _path(self, drift: Drift, K: Array, x: Array) -> tuple[Array, Array]:
         """Return the states (K + 1, M, n_x) before and after the corrections by a gain."""
@@ -299,8 +304,7 @@ class _Problem(Generic[_Model]):
         q = p + (n_x if self.smooth else K.size)
         gradient, matrix = np.zeros((M, q, 1)), np.zeros((M, q, q))
         for rows, S in self._sensitivities(model, K, before, after, q):
-            J = np.where(self._counted[rows, ..., None], S / self.deviation[:, None], 0.0)
-            J = J.transpose(1, 3, 0, 2).reshape(M, q, -1)
+            J = self._weighed(S, rows).transpose(1, 3, 0, 2).reshape(M, q, -1)
             gradient += J @ errors[rows].swapaxes(0, 1).reshape(M, -1, 1)
             matrix += J @ J.swapaxes(1, 2)
         if not self.smooth:
