@@ -121,7 +121,7 @@ class SplitRecord:
 
     def length(self, drift: Drift, growth: float) -> int:
         """Return samples over which roll-outs of a plant, be it unstable, grow e^growth-fold."""
-        fastest = float(np.max(np.linalg.eigvals(drift.slope(drift.box.states.center)).real))
+        fastest = drift.growth_rate
         longest = max(len(part) for part in self.parts)
         if fastest * self.period * longest <= growth:
             return longest
@@ -129,7 +129,7 @@ class SplitRecord:
 
     def memory(self, drift: Drift) -> int:
         """Return samples over which a plant forgets its start, or an unstable one goes far."""
-        fastest = float(np.max(np.linalg.eigvals(drift.slope(drift.box.states.center)).real))
+        fastest = drift.growth_rate
         shortest = max(len(part) for part in self.parts)
         if fastest * self.period * shortest > _GROWTH:
             return self.length(drift, _GROWTH)

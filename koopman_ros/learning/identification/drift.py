@@ -84,6 +84,11 @@ class Drift(ABC):
         return scale[:, None] * self.scaled_slope(self.box.states.to_deviation(x)) / scale
 
     @property
+    def growth_rate(self) -> float:
+        """Real part of the fastest growing mode in the middle of the box, in 1/time unit."""
+        return float(np.max(np.linalg.eigvals(self.slope(self.box.states.center)).real))
+
+    @property
     def input_matrix(self) -> Array:
         """B (n_x, n_u) in state units per input and time unit, in the middle of the box."""
         return self.input_matrix_at(self.box.states.center)

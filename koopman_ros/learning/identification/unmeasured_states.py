@@ -191,7 +191,6 @@ class _Shared:
     seed: int
     linear: _Polynomial  #: the linear predictor with one state that is not measured
     deviation: Array  #: of its innovations
-
     samples: int  #: longest piece that is simulated
 
 
@@ -242,15 +241,11 @@ def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]
             linear.model.drift, units, _STARTS * shared.seed + start, ridge=_RIDGE,
             learn_input_matrix=search.learn_B), *simulated, monitor) for start in range(_STARTS)]
         # far from the data a network is constant, and the rest must not diverge there
-        bounded = [one for one in networks if one.model.bounded or not _stable(linear.model.drift)]
+        unstable = linear.model.drift.growth_rate >= 0.0
+        bounded = [one for one in networks if unstable or one.model.bounded]
         if bounded:
             found += _candidate(min(bounded, key=lambda one: one.cost), simulated[0], count)
     return found
-
-
-def _stable(drift: Drift) -> bool:
-    center = np.zeros(len(drift.box.states))
-    return bool(np.all(np.linalg.eigvals(drift.scaled_slope(center)).real < 0.0))
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
