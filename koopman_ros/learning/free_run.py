@@ -176,9 +176,10 @@ def _drift(model: AnyModel, plant: PlantDescription
                 model.dead_time / seconds)
     drift = model.drift if isinstance(model, Identified) else model
     factor = seconds / SECONDS_PER_TIME_UNIT[drift.box.time_unit]
-    dead_time = model.dead_time if isinstance(model, Identified) else np.empty(0)
+    dead_time = model.dead_time if isinstance(model, Identified) else np.zeros(
+        len(drift.box.inputs))
     return (lambda x, u: factor * drift.rate(x, u), drift.box.states, drift.box.inputs,
-            dead_time / factor if len(dead_time) else np.zeros(len(drift.box.inputs)))
+            dead_time / factor)
 
 
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,

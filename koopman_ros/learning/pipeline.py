@@ -100,9 +100,7 @@ class Retrained:
     @property
     def dead_time(self) -> Array:
         """Dead times (n_u,) of the inputs, in s."""
-        found = self.found
-        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * (
-            found.dead_time if len(found.dead_time) else np.zeros(len(found.drift.box.inputs)))
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * self.found.dead_time
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""

@@ -145,10 +145,14 @@ class Identified:
     constants: tuple[EstimatedConstant, ...] = ()
     warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
     #: (n_u,) by which the inputs of the segments are later than those of the record, in time
-    #: units; empty for none
-    dead_time: Array = field(default_factory=lambda: np.empty(0))
+    #: units; or one for all
+    dead_time: Array = field(default_factory=lambda: np.zeros(()))
 
     __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'dead_time', np.broadcast_to(
+            self.dead_time, len(self.drift.box.inputs)))
 
 
 def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
