@@ -4,7 +4,12 @@
 """Estimation of state and disturbance from measurements."""
 
 from koopman_ros.estimation.base import Estimate, Estimator, Innovation
-from koopman_ros.estimation.dead_time import AppliedInputs, largest_bandwidth, PendingInputs
+from koopman_ros.estimation.dead_time import (
+    AppliedInputs,
+    held_means,
+    largest_bandwidth,
+    PendingInputs,
+)
 from koopman_ros.estimation.disturbance_observer import (
     DisturbanceObserver,
     equivalent_bias,
@@ -24,4 +29,4 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
 __all__ = ['ESTIMATORS', 'Accepted', 'AppliedInputs', 'DisturbanceObserver', 'Estimate',
            'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'PendingInputs',
            'Standstill', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias',
-           'largest_bandwidth']
+           'held_means', 'largest_bandwidth']

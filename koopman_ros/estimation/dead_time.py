@@ -74,6 +74,19 @@ class PendingInputs:
         return self.applied.pieces(self.time_ns + start_ns, self.time_ns + end_ns, self.dead_ns)
 
 
+def held_means(edges: Array, values: Array, times: Array) -> Array:
+    """
+    Return the means (N - 1, n) of held values between times (N,).
+
+    :param edges: (K + 1,) from which one value is held until the next one, the last its end.
+    :param values: (K, n).
+    """
+    integral = np.vstack((np.zeros((1, values.shape[1])), np.cumsum(
+        values * np.diff(edges)[:, None], axis=0)))
+    return np.diff(np.column_stack([np.interp(times, edges, one) for one in integral.T]),
+                   axis=0) / np.diff(times)[:, None]
+
+
 def largest_bandwidth(dead_time: float, slowest: float) -> float:
     """
     Return the bandwidth of an observer in 1/s with which its loop keeps a margin.

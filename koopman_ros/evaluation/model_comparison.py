@@ -17,7 +17,7 @@ from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import Estimate
+from koopman_ros.estimation import Estimate, held_means
 from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.model import LiftedModel
 
@@ -121,13 +121,9 @@ class PredictionWindows:
         if not dead_time.any():
             return self
         times = np.concatenate(([0.0], np.cumsum(self.steps)))
-        impulse = np.vstack((np.zeros_like(self.u[:1]), np.cumsum(
-            self.u * self.steps[:, None], axis=0)))
-        acted = np.column_stack([
-            np.diff(np.interp(times - dead, np.append(-dead, times),
-                              np.append(-dead * first, column))) / self.steps
-            for dead, first, column in zip(dead_time.tolist(), self.u[0], impulse.T, strict=True)])
-        return replace(self, u=acted)
+        return replace(self, u=np.hstack([
+            held_means(np.append(-dead, times), np.vstack((column[:1], column)), times - dead)
+            for dead, column in zip(dead_time.tolist(), self.u.T[..., None], strict=True)]))
 
     def squares(self, model: LiftedModel, size: Array) -> Array:
         """

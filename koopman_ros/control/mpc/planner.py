@@ -27,7 +27,7 @@ from koopman_ros.core.solvers import (
     solve_riccati,
 )
 from koopman_ros.core.status import Reason, reason, StatusCode
-from koopman_ros.estimation import Estimate
+from koopman_ros.estimation import Estimate, held_means
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -144,11 +144,9 @@ class Planner:
         """Return the means (N, n_u) of inputs that act one after another."""
         model = self._model
         durations = np.array([seconds for seconds, _ in pieces]) / model.seconds_per_time_unit
-        impulse = np.vstack((np.zeros((1, model.n_u)), np.cumsum(durations[:, None] * [
-            model.inputs.to_deviation(u) for _, u in pieces], axis=0)))
-        times = np.concatenate(([0.0], np.cumsum(durations)))
-        return np.diff(np.column_stack([np.interp(grid.times, times, one) for one in impulse.T]),
-                       axis=0) / grid.lengths[:, None]
+        return held_means(
+            np.concatenate(([0.0], np.cumsum(durations))),
+            np.array([model.inputs.to_deviation(u) for _, u in pieces]), grid.times)
 
     def _new_grid(self, sample: float, after: float) -> HorizonGrid:
         A, B = self._slope, self._model.B
