@@ -216,7 +216,7 @@ def _experiment(page: PageLayout) -> None:
         obstacle.set_text(f'Start is not possible: {reason}')
         show_if(obstacle, bool(reason))
         page.allow(begin, not reason)
-        page.allow(end, found.values.get('left [s]', '0') != '0')
+        page.allow(end, experiment_running(now))
         task.show(found, {'time left [s]' if key == 'left [s]' else key: value
                           for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
@@ -224,10 +224,15 @@ def _experiment(page: PageLayout) -> None:
     page.follow(show)
 
 
+def experiment_running(now: Snapshot) -> bool:
+    """Return whether an experiment can be ended."""
+    return now.status(EXPERIMENT).values.get('left [s]', '0') != '0'
+
+
 def experiment_obstacle(now: Snapshot) -> str:
     """Return why no experiment can start, and what to do, or nothing."""
     signal = now.parameter(TRAINER, 'experiment_signal')
-    if now.status(EXPERIMENT).values.get('left [s]', '0') != '0':
+    if experiment_running(now):
         return 'an experiment is running'
     if signal == 'command' and now.mode:
         return ('the controller commands the inputs; stop it, or set experiment_signal to '

@@ -33,6 +33,7 @@ from koopman_ros.model import (
 STATE = Coordinates(('level',), ('m',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
 INPUT = Coordinates(('flow',), ('m/s',), np.zeros(1), np.ones(1), np.full(1, -3.0),
                     np.full(1, 3.0))
+CASCADE, CASCADE_INPUT = np.array([[-1.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
 TWO = Coordinates(('a', 'b'), ('m', 'K'), np.array([2.0, 300.0]), np.array([0.5, 20.0]),
                   np.array([1.5, 280.0]), np.array([2.5, 320.0]))
 A, B = np.array([[0.3, 1.0], [-2.0, -0.5]]), np.array([[0.0, 0.4], [1.5, 0.0]])
@@ -319,13 +320,19 @@ def test_ranges_are_told_to_what_tells():
     assert found.region == 'from a 2 m, b 300 K to set-points a 0 m, b 310 K'
 
 
-def test_setpoints_are_where_an_input_holds_the_plant():
-    """dx1/dt = -x1 + x2, dx2/dt = -x2 + u stands still where x1 = x2 = u."""
+def cascade():
+    """Return dx1/dt = -x1 + x2, dx2/dt = -x2 + u, which rests where x1 = x2 = u."""
     states = Coordinates.spanning(('x1', 'x2'), ('', ''), np.array([-1.0, -4.0]),
                                   np.array([1.0, 4.0]))
-    slope, b = np.array([[-1.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
-    model = linearised_model(slope, b, states, INPUT, 's', Provenance('cascade'))
-    found = evaluate_closed_loops(model, lambda x, u: x @ slope.T + u @ b.T, loops=32)
+    return linearised_model(CASCADE, CASCADE_INPUT, states, INPUT, 's', Provenance('cascade'))
+
+
+def cascade_rate(x, u):
+    return x @ CASCADE.T + u @ CASCADE_INPUT.T
+
+
+def test_setpoints_are_where_an_input_holds_the_plant():
+    found = evaluate_closed_loops(cascade(), cascade_rate, loops=32)
     assert found.setpoints[:, 0] == pytest.approx(found.setpoints[:, 1], abs=1e-6)
     assert np.ptp(found.setpoints[:, 0]) > 1.0
     assert found.accepted
@@ -340,6 +347,27 @@ def test_loops_begin_and_end_where_the_data_are():
     assert all(model.distance(x) <= 1e-9 for x in (*found.starts, *found.setpoints))
     for shares in ((found.starts - TWO.lower) / (TWO.upper - TWO.lower)).T:
         assert np.ptp(shares) > 0.9
+
+
+def test_a_plant_that_never_rested_is_tried_at_the_nearest_steady_states():
+    line = np.linspace(-0.5, 0.5, 41)
+    data = TrainingStates.of(np.stack([line, line + 0.4], 1), np.ones(2))
+    model = replace(cascade(), training_states=data)
+    found = evaluate_closed_loops(model, cascade_rate, loops=32)
+    assert found.loops > 8
+    distances = [model.distance(x) for x in found.setpoints]
+    assert min(distances) > 0.0
+    assert max(distances) < 0.5
+    assert found.accepted
+
+
+def test_loops_that_cannot_be_tried_have_a_reason():
+    found = evaluate_closed_loops(cascade(), cascade_rate, loops=16,
+                                  limits=InputLimits(*(np.full(1, bound) for bound in (
+                                      5.0, 6.0, np.inf))))
+    assert found.loops == 0
+    assert not found.accepted
+    assert str(found).startswith('no closed loop could be tried: no steady state within')
 
 
 def test_a_lift_is_not_charged_for_an_offset_that_an_observer_removes():

@@ -14,7 +14,7 @@ import pytest
 from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.faceplates import pen, span_text
-from koopman_ros.panel.model_page import experiment_obstacle
+from koopman_ros.panel.model_page import experiment_obstacle, experiment_running
 from koopman_ros.panel.requests import (
     Action,
     action_text,
@@ -482,6 +482,7 @@ def test_an_experiment_that_cannot_start_has_a_reason(
     found = experiment_obstacle(own.snapshot(NOW))
     assert words in found
     assert bool(found) is bool(words)
+    assert experiment_running(own.snapshot(NOW)) is (left != '0')
 
 
 def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:

@@ -11,7 +11,11 @@ from scipy.optimize import fsolve
 
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.learning.identification import identify_unmeasured, Stopped
+from koopman_ros.learning.identification import (
+    identify_unmeasured,
+    Stopped,
+    unmeasured_states,
+)
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 
 PLANT = PlantDescription('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
@@ -111,6 +115,17 @@ def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days():
     errors = [np.sqrt(np.mean((simulated(drift, other)[settled] - other.x[settled, 0]) ** 2))
               for drift in (found.drift, found.linear)]
     assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize('bounded', [True, False])
+def test_no_network_that_may_diverge_far_from_the_data_is_offered(bounded, monkeypatch):
+    monkeypatch.setattr(NetworkDrift, 'bounded', bounded)
+    monkeypatch.setattr(unmeasured_states, '_UNITS', (1,))
+    monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
+    found = identify_unmeasured(PLANT, [record(
+        lambda x, u: np.array([x[1] - 0.4 * x[0] - 2.0 * max(0.0, x[0] - 0.3), 1.5 * (u - x[1])]),
+        samples=300, size=0.8)], 1, highest_degree=1)
+    assert any('network' in score.method for score in found.scores) is bounded
 
 
 def test_a_record_whose_simulations_all_diverge_is_refused():
