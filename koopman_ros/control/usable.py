@@ -12,14 +12,15 @@ from koopman_ros.model import LiftedModel
 
 def unusable(model: LiftedModel) -> str:
     """Say which name, nominal value or range keeps a controller from running, or nothing."""
-    if wrong := [name for name in (*model.states.names, *model.inputs.names)
+    inputs = model.joined.inputs
+    if wrong := [name for name in (*model.states.names, *inputs.names)
                  if not SIGNAL_NAME.fullmatch(name)]:
         return (f'{wrong[0]!r} is the name of a signal, used in topics and parameters: train the '
                 'model again with a name of letters, digits and _, beginning with a letter')
-    if taken := set(model.states.names) & set(model.inputs.names):
+    if taken := set(model.states.names) & set(inputs.names):
         return (f'a state and an input are both named {min(taken)}: train the model again with '
                 'different names')
-    for kind, signals in (('state', model.states), ('input', model.inputs)):
+    for kind, signals in (('state', model.states), ('input', inputs)):
         for name, unit, low, center, high in zip(
                 signals.names, signals.units, signals.lower.tolist(), signals.center.tolist(),
                 signals.upper.tolist(), strict=True):

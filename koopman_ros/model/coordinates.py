@@ -89,6 +89,12 @@ class Coordinates:
         return Coordinates(tuple(names), tuple(self.units[i] for i in chosen), *(
             value[chosen] for value in (self.center, self.scale, self.lower, self.upper)))
 
+    def followed_by(self, others: Coordinates) -> Coordinates:
+        """Return these coordinates, and after them others."""
+        return Coordinates(self.names + others.names, self.units + others.units, *(
+            np.concatenate([getattr(self, name), getattr(others, name)])
+            for name in ('center', 'scale', 'lower', 'upper')))
+
     def to_deviation(self, value: Array) -> Array:
         """Map physical values (..., n) to scaled deviations (..., n)."""
         return (value - self.center) / self.scale
@@ -119,6 +125,10 @@ class Coordinates:
         """Lower and upper corner (2, n) of the training box, in scaled deviations."""
         return frozen(self.to_deviation(np.array((self.lower, self.upper))), 'corners',
                       (2, len(self)))
+
+
+#: coordinates of no signal
+NO_SIGNALS = Coordinates((), (), *([np.zeros(0)] * 4))
 
 
 @dataclass(frozen=True)

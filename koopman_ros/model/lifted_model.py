@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The learned model at run time: dx/dt = f(x) + B(x) u with its derivatives, in NumPy."""
+"""The learned model at run time: dx/dt = f(x) + B(x) u + E d with its derivatives, in NumPy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import check_time_unit, display_unit, SECONDS_PER_TIME_UNIT, shown
-from koopman_ros.model.coordinates import Coordinates
+from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.observables import NetworkObservables, Observables
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
@@ -80,7 +80,8 @@ class LiftedModel:
     """
     A lift z = N(x) with dz/dt = A z + J_N(x) B(x) u (paper, equation for control-affine systems).
 
-    B is constant without `input_terms`.
+    B is constant without `input_terms`. Measured disturbances d add J_N(x) E d, 0 at their nominal
+    values; they are no inputs, since nobody manipulates them.
 
     With a pre-feedback K the lift is one of the plant under it, f(x) + B K x, for which there is
     an A where the plant alone is unstable: dz/dt = A z - J_N(x) B K x + J_N(x) B(x) u. Inputs and
@@ -111,6 +112,10 @@ class LiftedModel:
     verified_loops: VerifiedLoops | None = None
     #: (n_u,) dead time of each input in s, from its application to its effect; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
+    #: the measured disturbances' names, units, nominal values, scaling and training range
+    disturbances: Coordinates = NO_SIGNALS
+    #: (n_x, n_d) effect of the disturbances on the rate, in scaled coordinates; None without any
+    E: Array | None = None
 
     __repr__ = short_repr
 
@@ -118,7 +123,8 @@ class LiftedModel:
         """Show the plant, the trained ranges, the rates, the held-out figures and the verdict."""
         about = self.provenance
         lines = [f'{self.kind}; learned from {about.plant}']
-        for role, of in (('state', self.states), ('input', self.inputs)):
+        for role, of in (('state', self.states), ('input', self.inputs),
+                         ('measured disturbance', self.disturbances)):
             for name, unit, low, high in zip(
                     of.names, of.units, of.lower.tolist(), of.upper.tolist(), strict=True):
                 lines.append(f'{role} {name}: trained from {shown(low, unit):.6g} to '
@@ -145,6 +151,8 @@ class LiftedModel:
                             ('readout', (n_x, self.observables.features.n_z))):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, frozen(value, name, shape))
+        object.__setattr__(self, 'E', frozen(
+            np.zeros((n_x, 0)) if self.E is None else self.E, 'E', (n_x, len(self.disturbances))))
         dead = frozen(self.dead_time if np.ndim(self.dead_time) else np.full(n_u, self.dead_time),
                       'dead_time', (n_u,))
         object.__setattr__(self, 'dead_time', dead)
@@ -213,9 +221,61 @@ class LiftedModel:
         values = np.linalg.eigvals(self.A).astype(np.complex128)
         return values[np.argsort(-values.real)]
 
+    def disturbance_rate(self, d: Array) -> Array:
+        """Evaluate E d, the rate due to disturbances (..., n_d), in their units: (..., n_x)."""
+        assert self.E is not None
+        return self.disturbances.to_deviation(d) @ self.E.T
+
+    def with_disturbances(self, names: Sequence[str]) -> LiftedModel:
+        """
+        Return the model in which some inputs are measured disturbances.
+
+        :raises ValueError: for an unknown name, an effect that depends on the state, a model under
+            a pre-feedback, or a disturbance with a dead time.
+        """
+        if not names:
+            return self
+        disturbances, terms, K = self.inputs.only(names), self.input_terms, self.pre_feedback
+        order = [self.inputs.names.index(name) for name in names]
+        kept = [i for i in range(self.n_u) if i not in order]
+        if (terms is not None and terms.coefficients[..., order].any()) or (
+                K is not None and K[order].any()):
+            raise ValueError(
+                f'the effect of {", ".join(names)} must not depend on the state: set '
+                'input_matrix_degree to 0, and learn without pre-feedback')
+        if self.dead_time[order].any():
+            raise ValueError(f'a measured disturbance has no dead time, got '
+                             f'{self.dead_time[order].tolist()} s for {", ".join(names)}')
+        assert self.E is not None
+        return replace(
+            self, B=self.B[:, kept], dead_time=self.dead_time[kept],
+            inputs=self.inputs.only(tuple(self.inputs.names[i] for i in kept)),
+            input_terms=terms and InputTerms(terms.coefficients[..., kept]),
+            pre_feedback=None if K is None else K[kept],
+            disturbances=self.disturbances.followed_by(disturbances),
+            E=np.hstack([self.E, self.B[:, order]]))
+
+    @cached_property
+    def joined(self) -> LiftedModel:
+        """The model in which the measured disturbances are further inputs, the last ones."""
+        if not len(self.disturbances):
+            return self
+        assert self.E is not None
+        terms, n_d = self.input_terms, len(self.disturbances)
+        return replace(
+            self, B=np.hstack([self.B, self.E]), disturbances=NO_SIGNALS, E=None,
+            inputs=self.inputs.followed_by(self.disturbances),
+            dead_time=np.concatenate([self.dead_time, np.zeros(n_d)]),
+            input_terms=terms and InputTerms(np.pad(
+                terms.coefficients, ((0, 0), (0, 0), (0, n_d)))),
+            pre_feedback=None if self.pre_feedback is None else np.pad(
+                self.pre_feedback, ((0, n_d), (0, 0))))
+
     def predict(self, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
         """
         Simulate the states under inputs that are held: dx/dt = f(x) + B(x) u.
+
+        Measured disturbances have their nominal values; :attr:`joined` takes others.
 
         :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
         :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units, from

@@ -18,7 +18,7 @@ import safetensors.numpy
 
 from koopman_ros.core.paths import write_atomically
 from koopman_ros.core.units import check_unit
-from koopman_ros.model.coordinates import Coordinates
+from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.lifted_model import LiftedModel, Provenance
 from koopman_ros.model.observables import NetworkObservables, PolynomialObservables
@@ -103,13 +103,15 @@ def check(model: LiftedModel) -> None:
     degree = lift.degree if isinstance(lift, PolynomialObservables) else 0
     for name, size, limit in (
             ('n_z', model.n_z, MAX_COORDINATES), ('n_x', model.n_x, _MAX_STATES),
-            ('n_u', model.n_u, _MAX_STATES), ('the degree', degree, _MAX_DEGREE),
+            ('n_u', model.n_u, _MAX_STATES),
+            ('n_d', len(model.disturbances), _MAX_STATES),
+            ('the degree', degree, _MAX_DEGREE),
             ('the degree of the input matrix', model.input_matrix_degree, _MAX_DEGREE),
             ('the number of metrics', len(origin.metrics), _MAX_ENTRIES),
             ('the number of reasons', len(origin.reasons), _MAX_ENTRIES)):
         if size > limit:
             raise ValueError(f'{name} is {size}, the maximum is {limit}')
-    for signals in (model.states, model.inputs):
+    for signals in (model.states, model.inputs, model.disturbances):
         for name, unit in zip(signals.names, signals.units, strict=True):
             _check_text('the name of a signal', name)
             _check_text(f'the unit of {name}', unit)
@@ -148,6 +150,8 @@ def _description(model: LiftedModel) -> dict[str, Any]:
         about['identity'] = model.observables.identity
     if model.dead_time.any():
         about['dead_time'] = model.dead_time.tolist()
+    if len(model.disturbances):
+        about['disturbances'] = _signals(model.disturbances)
     if model.training_states is not None:
         about['fill_distance'] = model.training_states.fill_distance
     return about
@@ -166,7 +170,8 @@ def _tensors(model: LiftedModel) -> Tensors:
         assert isinstance(lift, PolynomialObservables)
         found = {'exponents': lift.exponents}
     found |= {
-        'A': model.A, 'B': model.B, 'readout': model.readout, 'pre_feedback': model.pre_feedback,
+        'A': model.A, 'B': model.B, 'E': model.E if len(model.disturbances) else None,
+        'readout': model.readout, 'pre_feedback': model.pre_feedback,
         'input_terms': None if terms is None else terms.coefficients,
         'training_states': None if model.training_states is None else (
             model.training_states.states)}
@@ -248,7 +253,10 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
         pre_feedback=tensors.pop('pre_feedback', None),
         verified_loops=tried,
         dead_time=np.array(_of_type(list, about, 'dead_time') if 'dead_time' in about else 0.0,
-                           dtype=np.float64))
+                           dtype=np.float64),
+        disturbances=(_coordinates(about['disturbances']) if 'disturbances' in about
+                      else NO_SIGNALS),
+        E=tensors.pop('E', None))
     if tensors:
         raise ValueError(f'it holds unknown arrays: {", ".join(sorted(tensors))}')
     return model

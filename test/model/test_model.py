@@ -15,6 +15,7 @@ from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.model import (
     Box,
     Coordinates,
+    InputTerms,
     linearised_model,
     NetworkObservables,
     PolynomialObservables,
@@ -293,7 +294,7 @@ def test_a_model_cannot_be_changed():
     model = replace(random_lift(), A=A)
     A[0, 0] = 9.0
     assert model.A[0, 0] == -1.0
-    for array in (model.A, model.B, model.states.center):
+    for array in (model.A, model.B, model.E, model.states.center):
         with pytest.raises(ValueError, match='read-only'):
             array[0] = 1.0
 
@@ -317,6 +318,8 @@ def test_a_model_cannot_be_changed():
     ({'pre_feedback': np.zeros((2, 1))},
      r'incompatible pre_feedback: expected \(1, 2\), got \(2, 1\)'),
     ({'pre_feedback': np.full((1, 2), np.inf)}, 'pre_feedback must be finite'),
+    ({'E': np.ones((2, 1))}, r'incompatible E: expected \(2, 0\), got \(2, 1\)'),
+    ({'disturbances': coordinates('d', 1)}, r'incompatible E: expected \(2, 1\)'),
     ({'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h'"),
     ({'training_states': TrainingStates(np.zeros((1, 3)), 0.0)},
      'incompatible training_states: expected 2 states, got 3'),
@@ -324,6 +327,38 @@ def test_a_model_cannot_be_changed():
 def test_a_model_that_does_not_fit_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         replace(random_lift(), **change)
+
+
+def test_a_measured_disturbance_acts_as_the_input_that_it_was():
+    joined = random_lift(n_u=3)
+    model = joined.with_disturbances(('u2', 'u0'))
+    assert (model.inputs.names, model.disturbances.names) == (('u1',), ('u2', 'u0'))
+    assert '  measured disturbance u2: trained from -279.15 to -271.65 degC' in str(model).splitlines()
+    x, u = np.array([0.3, -0.2]), np.array([4.0, 2.0, -1.0])
+    rate = joined.rate_under(joined.inputs.to_deviation(u))(x)
+    w = model.disturbance_rate(u[[2, 0]])
+    np.testing.assert_allclose(
+        model.rate_under(model.inputs.to_deviation(u[[1]]), w)(x), rate, rtol=1e-12)
+    back = model.joined
+    assert back.inputs.names == ('u1', 'u2', 'u0')
+    np.testing.assert_array_equal(back.B, joined.B[:, [1, 2, 0]])
+    assert not len(back.disturbances)
+    assert back.with_disturbances(('u2', 'u0')).joined.inputs.names == back.inputs.names
+    np.testing.assert_array_equal(model.linearised.E, model.E)
+    # at its nominal value it does nothing
+    np.testing.assert_array_equal(model.disturbance_rate(model.disturbances.center), 0.0)
+    assert joined.with_disturbances(()) is joined is joined.joined
+
+
+@pytest.mark.parametrize(('changes', 'names', 'message'), [
+    ({}, ('x',), 'unknown names x: choose from u0, u1'),
+    ({'input_terms': InputTerms(np.ones((2, 2, 2)))}, ('u1',), 'must not depend on the state'),
+    ({'pre_feedback': np.ones((2, 2))}, ('u1',), 'must not depend on the state'),
+    ({'dead_time': np.array([0.0, 3.0])}, ('u1',), 'has no dead time'),
+])
+def test_an_input_that_cannot_be_a_disturbance_is_refused(changes, names, message):
+    with pytest.raises(ValueError, match=message):
+        replace(random_lift(n_u=2), **changes).with_disturbances(names)
 
 
 @pytest.mark.parametrize(('change', 'message'), [
