@@ -25,7 +25,7 @@ from koopman_ros.execution.training import (
 )
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.model_classes import BEST
-from koopman_ros.parameters.signal_topics import Signals
+from koopman_ros.parameters.signal_topics import described, Signals
 from koopman_ros.parameters.table import ParameterTable
 from koopman_ros.parameters.trainer import trainer_table, TrainerParameters
 from koopman_ros.records import read, Record, RecordedInput, RecordedState
@@ -67,6 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--states', nargs='+', default=(), metavar='STATE', help=f'measured signals, {signal}; '
         'by default those of the model')
     add('--inputs', nargs='+', default=(), metavar='INPUT', help=f'inputs, {signal}')
+    add('--disturbances', nargs='+', default=(), metavar='SIGNAL',
+        help=f'signals that are measured and act, but that nobody manipulates, {signal}')
     add('--time', default='', metavar='COLUMN', help="column of the time, with its unit, as in "
         "'stamp [ms]'; by default the column time")
     add('--period', type=float, default=0.0, metavar='S',
@@ -76,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--test', nargs='+', default=(), metavar='FILE', help='record of the same signals to test '
         'the model on; it takes no part in the training')
     options = parser.add_argument_group('training, by the parameters of the trainer node')
-    for row in (_table(None, ['x [1]'], ['u [1]']).rows[name] for name in _OPTIONS):
+    for row in (_table(None, ('x [1]',), ('u [1]',)).rows[name] for name in _OPTIONS):
         default = _DEFAULTS.get(row.name, row.default)
         many = isinstance(default, tuple)
         notes = '; '.join(filter(None, (
@@ -97,22 +99,23 @@ def _loaded(model: str) -> LiftedModel | None:
 
 def _wanted(options: Mapping[str, Any], present: LiftedModel | None
             ) -> tuple[list[str], list[str]]:
-    """Return states and inputs as named, or else as the present model has them."""
-    named = list(options['states']), list(options['inputs'])
-    if all(named):
-        return named
+    """Return states, and inputs with disturbances, as named or as the present model has them."""
+    states, inputs = list(options['states']), list(options['inputs'])
+    if states and inputs:
+        return states, [*inputs, *options['disturbances']]
     if present is None:
         raise ValueError('the signals are not known: give --states and --inputs, as in --states '
                          "level --inputs 'pump [V]'")
     states, inputs = ([f'{name} [{unit}]' for name, unit in zip(of.names, of.units, strict=True)]
-                      for of in (present.states, present.inputs))
+                      for of in (present.states, present.joined.inputs))
     return states, inputs
 
 
-def _table(present: LiftedModel | None, states: list[str], inputs: list[str]
-           ) -> ParameterTable[TrainerParameters]:
+def _table(present: LiftedModel | None, states: tuple[str, ...], inputs: tuple[str, ...],
+           disturbances: tuple[str, ...] = ()) -> ParameterTable[TrainerParameters]:
     return trainer_table(present, {
-        'system': '', 'states_measured': tuple(states), 'inputs_commanded': tuple(inputs)})
+        'system': '', 'states_measured': states, 'inputs_commanded': inputs,
+        'disturbances_measured': disturbances})
 
 
 def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record,
@@ -122,10 +125,14 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
     from koopman_ros.learning.report import reported
 
     about = record.plant
-    signals = Signals(dict(zip(about.state_names, about.state_units, strict=True)),
-                      dict(zip(about.input_names, about.input_units, strict=True)))
-    table = _table(present, *([f'{name} [{unit}]' for name, unit in some.items()]
-                              for some in (signals.states, signals.inputs)))
+    inputs = dict(zip(about.input_names, about.input_units, strict=True))
+    # they come last
+    named = len(options['disturbances']) or (present and len(present.disturbances)) or 0
+    disturbances = {name: inputs.pop(name) for name in about.input_names[len(inputs) - named:]}
+    signals = Signals(dict(zip(about.state_names, about.state_units, strict=True)), inputs,
+                      disturbances=disturbances)
+    table = _table(present, *(described(some) for some in (
+        signals.states, signals.inputs, disturbances)))
     given = {name: tuple(value) if isinstance(value, list) else value
              for name, value in options.items() if name in _OPTIONS}
     settings = table.snapshot({
@@ -141,7 +148,7 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
         states=tuple(RecordedState(name, unit, place(name, name, unit))
                      for name, unit in signals.states.items()),
         inputs=tuple(RecordedInput(name, unit, place(name, name, unit))
-                     for name, unit in signals.inputs.items()),
+                     for name, unit in {**inputs, **disturbances}.items()),
         **settings.training(signals))
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
 

@@ -73,6 +73,31 @@ def test_a_dead_time_is_found_and_belongs_to_the_model(folder):
     assert f'dead time of pump: {6 * PERIOD:.4g} s' in (folder / 'day.md').read_text()
 
 
+def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
+    decay, rng = np.exp(-0.2 * PERIOD), np.random.default_rng(3)
+    pump, rain = (np.repeat(rng.uniform(0.0, high, N // 10), 10) for high in (10.0, 4.0))
+    level = [2.0]
+    for u, d in zip(pump[:-1], np.roll(rain, 5)[:-1], strict=True):
+        level.append(decay * level[-1] + (1.0 - decay) * (0.5 * u + 0.8 * d))
+    pd.DataFrame({'time [s]': PERIOD * np.arange(N), 'pump [V]': pump, 'rain [mm]': np.roll(
+        rain, 5), 'level [m]': level + 1e-3 * rng.standard_normal(N)}).to_csv(
+            'day.csv', index=False)
+    assert learned('--disturbances', 'rain') == 0
+    model = load(folder / 'day.safetensors')
+    assert (model.inputs.names, model.disturbances.names) == (('pump',), ('rain',))
+    effect = model.E * model.states.scale / model.disturbances.scale
+    assert effect == pytest.approx(0.16, rel=0.02)
+    assert model.dead_time == pytest.approx(0.0)
+    # the present model says which signal it is, and it takes no other role
+    with quick_retraining(8, degrees=(1, 2)):
+        assert learn.main(['day.csv', '--model', 'day.safetensors', '--model_output',
+                           'new.safetensors', '--model_class', 'linear']) == 2
+    assert 'the current model' in capsys.readouterr().out
+    assert load(folder / 'new.refused.safetensors').disturbances.names == ('rain',)
+    assert learned('--disturbances', 'rain', '--input_matrix_degree', '1') == 1
+    assert 'input_matrix_degree' in capsys.readouterr().err
+
+
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
     assert learned('--model_output', 'first.safetensors') == 0
     with quick_retraining(8, degrees=(1, 2)):

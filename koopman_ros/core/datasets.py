@@ -42,6 +42,9 @@ class PlantDescription:
     B: Array | Callable[[Array], Array] | None
     #: degree of the polynomial B(x) that is learned where B is None; 0 for a constant one
     input_matrix_degree: int = 0
+    #: inputs that nobody manipulates: measured disturbances, with an effect that does not depend
+    #: on the state
+    disturbance_names: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -65,6 +68,12 @@ class PlantDescription:
             for field, value in ((f'{kind}_names', names), (f'{kind}_units', units),
                                  (f'nominal_{kind}', nominal)):
                 object.__setattr__(self, field, value)
+        if unknown := [name for name in self.disturbance_names if name not in self.input_names]:
+            raise ValueError(f'disturbance_names has {", ".join(unknown)}, must be some of the '
+                             f'inputs {", ".join(self.input_names)}')
+        if self.disturbance_names and (self.input_matrix_degree or callable(self.B)):
+            raise ValueError(f'the effect of {", ".join(self.disturbance_names)} must not depend '
+                             'on the state: give a constant B, or set input_matrix_degree to 0')
         if self.input_matrix_degree < 0 or (self.input_matrix_degree and self.B is not None):
             raise ValueError(f'input_matrix_degree is {self.input_matrix_degree}, must be at '
                              'least 0, and 0 where B is given')

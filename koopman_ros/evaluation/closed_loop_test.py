@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 import math
@@ -179,11 +179,26 @@ class ClosedLoopTest:
         return f'<ClosedLoopTest: {self}>'
 
 
+@dataclass(frozen=True)
+class _Undisturbed:
+    """A rate of states and manipulated inputs, the measured disturbances at nominal values."""
+
+    rate: Rate
+    model: LiftedModel  # that has them as disturbances
+    order: tuple[int, ...]  # of the inputs of the rate among inputs, then disturbances
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        d = np.broadcast_to(self.model.disturbances.center,
+                            (*u.shape[:-1], len(self.model.disturbances)))
+        return self.rate(x, np.concatenate([u, d], axis=-1)[..., self.order])
+
+
 def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
                           law: type[Law] = StateDependentRiccati,
                           limits: InputLimits | None = None, interval: float = 0.0,
                           loops: int = LOOPS, watch: Callable[[float], bool] = lambda _: False,
-                          backend: Backend | None = None) -> ClosedLoopTest | None:
+                          backend: Backend | None = None, disturbances: Sequence[str] = ()
+                          ) -> ClosedLoopTest | None:
     """
     Let a model's law control a drift that the model was not learned from, where the data are.
 
@@ -210,9 +225,14 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     :param loops: closed loops to run; fewer where these take many samples.
     :param watch: called with the share that is done; True ends the check.
     :param backend: where the loops run, 32 of them side by side; this process by default.
+    :param disturbances: inputs that are measured and not manipulated; they keep their nominal
+        values.
     :return: None where `watch` ended it.
     :raises ValueError: for a model without inputs.
     """
+    if disturbances:
+        names, model = model.inputs.names, model.with_disturbances(disturbances)
+        rate = _Undisturbed(rate, model, tuple(map(model.joined.inputs.names.index, names)))
     if model.n_u == 0:
         raise ValueError('a plant without inputs cannot be controlled')
     tuning = tuning or Tuning.for_model(model, max_gain=_LARGEST_GAIN)

@@ -83,7 +83,8 @@ class HeldOut:
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
         found = evaluate_closed_loops(model, self._found.drift.rate, loops=loops, watch=watch,
-                                      interval=period * self._seconds, backend=backend)
+                                      interval=period * self._seconds, backend=backend,
+                                      disturbances=self._found.disturbances)
         if found is None:
             raise Stopped
         return found

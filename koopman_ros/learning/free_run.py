@@ -172,6 +172,7 @@ def _drift(model: AnyModel, plant: PlantDescription
     if isinstance(model, Trained | ClassComparison):
         model = model.model
     if isinstance(model, LiftedModel):
+        model = model.joined
         return (lifted_rate(model, seconds), model.states, model.inputs,
                 model.dead_time / seconds)
     drift = model.drift if isinstance(model, Identified) else model

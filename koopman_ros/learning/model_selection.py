@@ -290,7 +290,8 @@ def _judge(prepared: PreparedSamples, loops: int, backend: Backend | None) -> Ju
         if not loops or model is None or not model.n_u:
             return one
         law_check = evaluate_closed_loops(model, prepared.reference_drift(model), loops=loops,
-                                          backend=backend)
+                                          backend=backend,
+                                          disturbances=prepared.plant.disturbance_names)
         refused = law_check is not None and not law_check.accepted
         return replace(one, law_check=law_check,
                        refusal=f'does not control the plant: {law_check}' if refused else '')

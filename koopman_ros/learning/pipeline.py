@@ -212,7 +212,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
              given: Record | None, test: Record | None) -> Retrained:
     progress, thresholds = _Progress(on_progress), _checked(task)
-    current, sibling = (load(path) if path else None
+    current, sibling = (load(path).joined if path else None
                         for path in (task.model, task.warm_start_model))
     plant, states, inputs = resolve_signals(task, current)
     methods = methods_of(task.methods, task.method_parameters)
@@ -233,7 +233,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     episodes = [late for episode in episodes
                 if (late := episode.delayed(dead_time / seconds)) is not None]
     found = replace(_estimate(task, plant, episodes, methods, progress, backend),
-                    dead_time=dead_time / seconds)
+                    dead_time=dead_time / seconds, disturbances=plant.disturbance_names)
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(record.episodes), record.account, task.bags)
     if found.hidden:
@@ -247,7 +247,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         plant = replace(plant, state_names=box.states.names, state_units=box.states.units, B=None,
                         nominal_state=box.states.center, nominal_input=box.inputs.center)
     elif found.hidden:
-        plant = replace(current.plant, B=None)
+        plant = replace(current.plant, B=None, disturbance_names=plant.disturbance_names)
     bare = Retrained(task, record.account, found, None, None, (), coverage(episodes, box),
                      plant, current, reduction=record.reduction)
     learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
@@ -264,7 +264,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
           ] * bool(task.model and current is None)))
     progress('decide', 0.9, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
-                             episodes, learned.chosen.name)
+                             episodes, learned.chosen.name
+                             ).with_disturbances(task.disturbances)
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
@@ -296,14 +297,17 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
     given = np.array([task.dead_time.get(name, 0.0) for name in names])
     if not (np.all(np.isfinite(given)) and np.all(given >= 0.0)):
         raise ValueError(f'dead_time is {dict(task.dead_time)}, must be 0 s or more')
-    known = [name in task.dead_time for name in names]
-    late = [one for episode in episodes if (one := episode.delayed(given / seconds)) is not None]
-    if not late:
+    if late := ', '.join(name for name in task.disturbances if task.dead_time.get(name)):
+        raise ValueError(f'dead_time names {late}: a measured disturbance has none')
+    known = [name in task.dead_time or name in task.disturbances for name in names]
+    episodes = [one for episode in episodes
+                if (one := episode.delayed(given / seconds)) is not None]
+    if not episodes:
         raise ValueError(f'no episode is longer than dead_time = {max(given):g} s: record longer')
     if task.physical_model or all(known):
         return given
     return given + seconds * find_dead_times(
-        late, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
+        episodes, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
 
 
 def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | None

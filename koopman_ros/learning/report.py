@@ -192,7 +192,8 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
 def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
     """Return label, rate and colour of the present lift and of the new one, where they are."""
     new = None if retrained.learned is None else retrained.learned.model
-    return [(name, lifted_rate(model, SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]), color)
+    seconds = SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]
+    return [(name, lifted_rate(model.joined, seconds), color)
             for name, model, color in (('present model', retrained.present, 'tab:red'),
                                        ('new model', new, 'tab:green')) if model is not None]
 

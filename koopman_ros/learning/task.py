@@ -51,6 +51,8 @@ class TrainingTask:
     input_matrix_degree: int = 0
     #: dead time of inputs by name, in s; of those not named it is found from the record
     dead_time: Mapping[str, float] = field(default_factory=dict)
+    #: those of the inputs that are measured and not manipulated; they have no dead time
+    disturbances: tuple[str, ...] = ()
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
     #: not compared with the present one, which has other states
     unmeasured_states: int = 0
@@ -81,11 +83,12 @@ class TrainingTask:
         states = tuple(RecordedState(**{**signal, 'place': MessageField(**signal['place'])})
                        for signal in values['states'])
         inputs = tuple(RecordedInput(**{
-            **signal, 'command': MessageField(**signal['command']),
-            'measured': MessageField(**signal['measured']) if signal.get('measured') else None})
+            **signal, **{place: MessageField(**signal[place]) if signal.get(place) else None
+                         for place in ('command', 'measured')}})
             for signal in values['inputs'])
         return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
-                      'inputs': inputs, 'methods': tuple(values.get('methods', cls.methods))})
+                      'inputs': inputs, 'disturbances': tuple(values.get('disturbances', ())),
+                      'methods': tuple(values.get('methods', cls.methods))})
 
 
 def resolve_signals(task: TrainingTask, current: LiftedModel | None
@@ -118,7 +121,8 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
             _unknown(replace(task, states=tuple(states), inputs=tuple(inputs))),
             name=current.plant.name, time_unit=current.plant.time_unit)
     return replace(plant, B=_known_gain(task, plant),
-                   input_matrix_degree=task.input_matrix_degree), states, inputs
+                   input_matrix_degree=task.input_matrix_degree,
+                   disturbance_names=task.disturbances), states, inputs
 
 
 _Signal = TypeVar('_Signal', RecordedState, RecordedInput)

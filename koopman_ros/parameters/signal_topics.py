@@ -36,10 +36,12 @@ DEFAULT_SYSTEM = 'reactor'
 
 LONGEST_FRAME_ID = 256  # characters that are passed on
 
-# The places of signals: of states, then of inputs.
-KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual')
+# The places of signals: of states, then of inputs and of disturbances.
+KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual',
+         'measured_disturbances')
 PLANT_KINDS = ('measured', 'applied', 'commands')
-SIGNALS = ('states_measured', 'inputs_commanded', 'controlled')  # parameters that name them
+# parameters that name them
+SIGNALS = ('states_measured', 'inputs_commanded', 'disturbances_measured', 'controlled')
 
 _PRESETS = 'plants'  # folder of the parameter files of the plants that are shipped
 _NAMED = re.compile(r'([A-Za-z_]\w*)\s*\[(.+)\]')
@@ -100,6 +102,8 @@ class Signals:
     controlled: tuple[str, ...] = ()  #: names of the states that have a set-point
     #: units of all states of the model, in its order; empty where all are measured
     model_states: Mapping[str, str] = field(default_factory=dict)
+    #: units of the measured disturbances, by name
+    disturbances: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def every(self) -> Mapping[str, str]:
@@ -114,10 +118,10 @@ class Signals:
     @property
     def units(self) -> dict[str, str]:
         """Units of all, by name."""
-        return {**self.states, **self.inputs}
+        return {**self.states, **self.inputs, **self.disturbances}
 
     def __post_init__(self) -> None:
-        for name in (*self.states, *self.inputs):
+        for name in self.units:
             if not SIGNAL_NAME.fullmatch(name):
                 raise ConfigurationError(
                     f'{name!r} is the name of a signal, used in topics and parameters: use '
@@ -129,15 +133,17 @@ class Signals:
                 f'choose from {", ".join(self.states)}')
 
     def __str__(self) -> str:
-        """Write states and inputs with units."""
+        """Write states, inputs and disturbances with units."""
         return ' and '.join(
             f'{kind} ' + ', '.join(described(of))
-            for kind, of in (('states', self.states), ('inputs', self.inputs)))
+            for kind, of in (('states', self.states), ('inputs', self.inputs),
+                             ('measured disturbances', self.disturbances))
+            if of or kind != 'measured disturbances')
 
     def defaults(self) -> dict[str, str]:
         """Return the topics of all places, by parameter."""
         alone = len(self.controlled) == 1
-        topics: dict[str, str] = {}
+        topics = {f'{name}.topic': name for name in self.disturbances}
         for name in self.states:
             of = '' if alone else f'{name}/'
             controlled = name in self.controlled
@@ -160,14 +166,14 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     :param controlled: names of states; all that are measured by default.
     :param measured: names of states, in any order; all by default.
     """
-    every, inputs = (dict(zip(of.names, of.units, strict=True))
-                     for of in (model.states, model.inputs))
+    every, inputs, disturbances = (dict(zip(of.names, of.units, strict=True))
+                                   for of in (model.states, model.inputs, model.disturbances))
     # in the order of the states, as the control step wants them
     states = {name: unit for name, unit in every.items() if name in (measured or every)}
     named = tuple(filter(None, controlled))
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
-                   {} if len(states) == len(every) else every)
+                   {} if len(states) == len(every) else every, disturbances)
 
 
 def box_defaults(box: Coordinates, **values: Array) -> dict[str, float]:
@@ -186,9 +192,10 @@ def _role(signals: str, topic: str, *, commanded: bool = False
           ) -> cached_property[dict[str, MessageField]]:
     """Return a property of SignalTopics: the places of some signals, by name."""
     def found(self: SignalTopics) -> dict[str, MessageField]:
-        of_inputs = signals == 'inputs'
-        given, units = ((self.inputs, self.signals.inputs) if of_inputs
-                        else (self.states, self.signals.states))
+        given, units = {
+            'inputs': (self.inputs, self.signals.inputs),
+            'disturbances': (self.disturbances, self.signals.disturbances),
+        }.get(signals, (self.states, self.signals.states))
         names = self.signals.controlled if signals == 'controlled' else given
         field_of = _command_field if commanded else _measured_field
         return {name: _place(getattr(given[name], topic), name, units[name], field_of(given[name]))
@@ -209,6 +216,8 @@ class SignalTopics:
     states: Mapping[str, Any]  #: places of a node's states, by name
     inputs: Mapping[str, Any]  #: places of its inputs, by name
     kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
+    #: places of its measured disturbances, by name
+    disturbances: Mapping[str, Any] = field(default_factory=dict)
 
     #: measurements of the states, and their predictions
     measured = _role('states', 'topic')
@@ -220,6 +229,7 @@ class SignalTopics:
     commands = _role('inputs', 'command_topic', commanded=True)
     manual = _role('inputs', 'manual_topic', commanded=True)
     applied = _role('inputs', 'topic')
+    measured_disturbances = _role('disturbances', 'topic')
 
     def check(self) -> str:
         """Return their defect in words, or an empty string."""
@@ -228,7 +238,8 @@ class SignalTopics:
                 places = getattr(self, kind)
                 if missing := [name for name, found in places.items() if not found.topic]:
                     return f'{missing[0]} has no topic: set one'
-            heard = {found.topic: name for name, found in self.measured.items()}
+            heard = {found.topic: name for name, found in (
+                *self.measured.items(), *self.measured_disturbances.items())}
             for name, found in self.commands.items():
                 if found.topic in heard:
                     return (f'{name} is commanded on {found.topic!r}, the topic on which '

@@ -40,6 +40,7 @@ from koopman_ros.parameters.signal_topics import (
     DIAGNOSTICS,
     EVENT_LOG,
     InputPlaces,
+    MeasuredPlace,
     named_units,
     plant_defaults,
     PREDICTED_TRAJECTORY,
@@ -68,6 +69,10 @@ class TrainerParameters:
         'model.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
         ('',), 'Inputs with their units, e.g. pump [V]; an empty name: those of the model.',
+        read_only=True)
+    disturbances_measured: tuple[str, ...] = parameter(
+        ('',), 'Signals with their units that are measured and act on the plant, but that nobody '
+        'manipulates, e.g. feed_temperature [K]; an empty name: those of the model, or none.',
         read_only=True)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
@@ -147,9 +152,10 @@ class TrainerParameters:
                'cuda.')
     input_matrix: tuple[float, ...] = parameter(
         (0.0,), 'Known input matrix B, row by row: change of the rate of each state, in its unit '
-        'per second, for each input; a single 0: learn it.')
+        'per second, for each input and measured disturbance; a single 0: learn it.')
     input_matrix_degree: int = parameter(
-        0, 'Degree of a learned B(x) as a polynomial in the states; 0: constant B.', '', 0, 5)
+        0, 'Degree of a learned B(x) as a polynomial in the states; 0: constant B, the only one '
+        'with measured disturbances.', '', 0, 5)
     identification_methods: tuple[str, ...] = parameter(
         ('weak_form', 'total_variation'), 'Methods that estimate the drift if all states are '
                                           'measured, compared on held-out segments: weak_form, '
@@ -189,6 +195,7 @@ class TrainerParameters:
     setpoint_max: Array = value_column(
         'states', 0.0, 'Highest set-point of an experiment on set-points.')
     inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    disturbances: Mapping[str, MeasuredPlace] = per_signal(MeasuredPlace)
     experiment_min: Array = value_column('inputs', 0.0, 'Lowest value of a step.')
     experiment_max: Array = value_column('inputs', 0.0, 'Highest value of a step.')
     experiment_rate_limit: Array = column(
@@ -249,9 +256,10 @@ class TrainerParameters:
 
     def training(self, signals: Signals) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.learning.TrainingTask` that are settings."""
-        gains = np.reshape(self.input_matrix, (-1, len(signals.inputs))).tolist() if (
+        columns = (*signals.inputs, *signals.disturbances)
+        gains = np.reshape(self.input_matrix, (-1, len(columns))).tolist() if (
             self.input_matrix != (0.0,)) else []
-        return {'input_gain': {state: dict(zip(signals.inputs, row, strict=True))
+        return {'input_gain': {state: dict(zip(columns, row, strict=True))
                                for state, row in zip(signals.states, gains, strict=False)},
                 'model_class': self.model_class, 'coordinates': self.lifted_dimension,
                 'seed': self.training_seed, 'starts': self.restarts,
@@ -259,6 +267,7 @@ class TrainerParameters:
                 'dead_time': {name: seconds for name, seconds in zip(
                     signals.inputs, self.dead_time.tolist(), strict=True) if seconds >= 0.0},
                 'input_matrix_degree': self.input_matrix_degree,
+                'disturbances': tuple(signals.disturbances),
                 'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
                 'constants': named_ranges(self.estimated_constants),
                 'methods': self.identification_methods,
@@ -299,7 +308,8 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
             methods |= parameters_of(tuple(filter(None, names)))
     return ParameterTable(
         TrainerParameters, partial(_cross_check, signals), partial(_plan, signals),
-        signals={'states': signals.states, 'inputs': signals.inputs}, plugins=methods,
+        signals={'states': signals.states, 'inputs': signals.inputs,
+                 'disturbances': signals.disturbances}, plugins=methods,
         defaults={**defaults, **own, 'system': system})
 
 
@@ -315,7 +325,9 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
     if present is not None and not states:
         return signals_of(present, controlled)
     measured = named_units(states)
-    return Signals(measured, named_units(inputs), controlled or tuple(measured))
+    return Signals(measured, named_units(inputs), controlled or tuple(measured),
+                   disturbances=named_units(tuple(filter(
+                       None, given.get('disturbances_measured', ())))))
 
 
 def _wiring(signals: Signals, given: Mapping[str, Any]) -> SignalTopics:
@@ -327,7 +339,9 @@ def _wiring(signals: Signals, given: Mapping[str, Any]) -> SignalTopics:
                        if f'{name}.{row.name}' in said})
 
     return SignalTopics(signals, {name: own(StatePlaces, name) for name in signals.states},
-                        {name: own(InputPlaces, name) for name in signals.inputs})
+                        {name: own(InputPlaces, name) for name in signals.inputs},
+                        disturbances={name: own(MeasuredPlace, name)
+                                      for name in signals.disturbances})
 
 
 def _plan(signals: Signals, values: TrainerParameters) -> None:
@@ -350,7 +364,10 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
         return f'identification_methods = {list(values.identification_methods)}: {error}'
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
-    n_x, n_u = len(signals.states), len(signals.inputs)
+    n_x, n_u = len(signals.states), len(signals.inputs) + len(signals.disturbances)
+    if values.input_matrix_degree and signals.disturbances:
+        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 with measured '
+                'disturbances, whose effect does not depend on the state')
     if values.input_matrix != (0.0,) and len(values.input_matrix) != n_x * n_u:
         return (f'input_matrix has {len(values.input_matrix)} numbers, must have {n_x} rows of '
                 f'{n_u}, or a single 0 to learn it')
@@ -367,7 +384,8 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
         return ('input_matrix must be a single 0 if physical_model is set, which defines the '
                 'effect of the inputs')
     return (refused(values.physical_model, values.estimated_constants)
-            or SignalTopics(signals, values.states, values.inputs).check())
+            or SignalTopics(signals, values.states, values.inputs,
+                            disturbances=values.disturbances).check())
 
 
 @dataclass(frozen=True)
@@ -423,7 +441,8 @@ def player_table(given: Mapping[str, Any] = MappingProxyType({})
     if (wiring := preset_wiring(system)) is not None:
         defaults |= {
             'topics': tuple(dict.fromkeys(place.topic for places in (
-                wiring.applied, wiring.measured, wiring.setpoints, wiring.manual)
+                wiring.applied, wiring.measured_disturbances, wiring.measured, wiring.setpoints,
+                wiring.manual)
                 for place in places.values())),
             'measurement': tuple(dict.fromkeys(
                 place.topic for place in wiring.measured.values())),

@@ -49,6 +49,7 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: SignalTopic
         return os.path.abspath(model_path(model)) if model else ''
 
     states, inputs = wiring.signals.states, wiring.signals.inputs
+    disturbances = wiring.signals.disturbances
     return {
         'bags': [os.path.abspath(bag) for bag in bags],
         'output': os.path.abspath(settings.model_output),
@@ -60,7 +61,10 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: SignalTopic
         'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
                     'measured': found(wiring.applied[name]),
                     'delay': delay} for (name, unit), delay in zip(
-                        inputs.items(), settings.delay.tolist(), strict=True)],
+                        inputs.items(), settings.delay.tolist(), strict=True)] + [
+            {'name': name, 'unit': unit, 'command': None,
+             'measured': found(wiring.measured_disturbances[name])}
+            for name, unit in disturbances.items()],
         'setpoints': settings.setpoint_ranges(wiring.signals),
         'tolerance': settings.synchronisation_tolerance,
         **settings.training(wiring.signals)}

@@ -333,7 +333,8 @@ def test_a_measured_disturbance_acts_as_the_input_that_it_was():
     joined = random_lift(n_u=3)
     model = joined.with_disturbances(('u2', 'u0'))
     assert (model.inputs.names, model.disturbances.names) == (('u1',), ('u2', 'u0'))
-    assert '  measured disturbance u2: trained from -279.15 to -271.65 degC' in str(model).splitlines()
+    line = '  measured disturbance u2: trained from -279.15 to -271.65 degC'
+    assert line in str(model).splitlines()
     x, u = np.array([0.3, -0.2]), np.array([4.0, 2.0, -1.0])
     rate = joined.rate_under(joined.inputs.to_deviation(u))(x)
     w = model.disturbance_rate(u[[2, 0]])

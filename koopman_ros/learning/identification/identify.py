@@ -147,6 +147,7 @@ class Identified:
     #: (n_u,) by which the inputs of the segments are later than those of the record, in time
     #: units; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
+    disturbances: tuple[str, ...] = ()  #: inputs that are measured disturbances
 
     __repr__ = short_repr
 
@@ -231,7 +232,8 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
                                    monitor=monitor) if OUTPUT_ERROR in score.method else model
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
-                      (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures))
+                      (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
+                      disturbances=plant.disturbance_names)
 
 
 @dataclass(frozen=True)

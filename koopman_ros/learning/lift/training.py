@@ -272,7 +272,7 @@ def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bo
         with contextlib.suppress(KeyboardInterrupt):
             law_check = evaluate_closed_loops(
                 winner.model, prepared.reference_drift(winner.model), loops=loops, watch=watch,
-                backend=backend)
+                backend=backend, disturbances=prepared.plant.disturbance_names)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
             raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} does not control the '
