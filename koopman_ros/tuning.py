@@ -60,6 +60,22 @@ class SensorLimits:
 
 
 @dataclass(frozen=True)
+class DisturbanceLimits:
+    """Limits of the sensors of measured disturbances; where one is broken the value is held."""
+
+    lower: Array = value_column(
+        'disturbances', -UNBOUNDED, 'Lower end of the sensor range.', name='sensor_min')
+    upper: Array = value_column(
+        'disturbances', UNBOUNDED, 'Upper end of the sensor range.', name='sensor_max')
+    rate: Array = column(
+        'disturbances', 0.0, 'Fastest physically possible change; 0: no check.', '{unit}/s',
+        name='max_rate', none=ANY)
+    timeout: Array = column(
+        'disturbances', 60.0, 'Age of the last measurement above which diagnostics warn; its '
+        'value is held. 0: no check.', 's', 0.0, 86400.0, none=ANY)
+
+
+@dataclass(frozen=True)
 class Tuning:
     """
     The tuning of a controller, in the units of the model's signals.
@@ -80,6 +96,7 @@ class Tuning:
         'inputs', -1.0, 'Dead time between this input, as commanded or measured, and its effect; '
         '-1: that of the model.', 's', -1.0, LONGEST_DEAD_TIME)
     sensor: SensorLimits = nested(SensorLimits)
+    disturbances: DisturbanceLimits = nested(DisturbanceLimits)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point, at most as many as there are inputs; an empty '
         'name: all measured signals.', read_only=True)
@@ -172,13 +189,14 @@ class Tuning:
                              f'({", ".join(controlled)}): list at most {len(inputs)} in '
                              'controlled, or leave it empty for a compromise between all states')
         signals = {'states': states, 'measured': measured, 'controlled': controlled,
-                   'inputs': inputs}
+                   'inputs': inputs, 'disturbances': model.disturbances.names}
         made = for_signals(replace(self, controlled=controlled), signals)
         made = replace(made, plugins={
             name: for_signals(own, signals) for name, own in self.plugins.items()})
         if not np.any(made.state_weight > 0.0):
             raise ValueError('state_weight must not be 0 for all states')
-        for limits, kind in ((made.limits, 'input'), (made.sensor, 'sensor')):
+        for limits, kind in ((made.limits, 'input'), (made.sensor, 'sensor'),
+                             (made.disturbances, 'disturbance')):
             if not np.all(limits.lower < limits.upper):
                 raise ValueError(f'{kind} limits must be lower < upper, got '
                                  f'{limits.lower.tolist()} and {limits.upper.tolist()}')

@@ -91,7 +91,8 @@ class Controller(ControlStep):
                 acting, w = self.estimation.level(state.supervisor), np.zeros(self.model.n_x)
                 # where a law acts that needs no model, none is trusted
                 if state.estimate is not None and not acting.law.model_free:
-                    w = self.estimation.transfer_estimate(state.estimate, acting, level).w
+                    w = self.estimation.transfer_estimate(state.estimate, acting, level).under(
+                        self.estimation.feed_forward(state)).w
                 feasible = Feasibility(level, self.order.margins[0], w, state.target)
                 return feasible.infeasibility(
                     goal, (state.setpoint.requested, state.setpoint.active), state.command, whole)
@@ -184,7 +185,8 @@ class Controller(ControlStep):
                         or state.setpoint.active is None):
                     return state
                 now = level.compute(
-                    state.setpoint.active, state.estimate, None, usual_interval(state),
+                    state.setpoint.active, state.estimate.under(
+                        self.estimation.feed_forward(state)), None, usual_interval(state),
                     state.target, state.own_command,
                     self.estimation.pending(state, state.commanded_ns or 0))[1]
                 return state if now.u is None else replace(

@@ -18,7 +18,15 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import check, Estimate, PendingInputs, Standstill, Verdict
+from koopman_ros.estimation import (
+    check,
+    check_disturbances,
+    Estimate,
+    MeasuredDisturbances,
+    PendingInputs,
+    Standstill,
+    Verdict,
+)
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -94,6 +102,39 @@ class StateEstimation:
             u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
         return (replace(state, applied=state.applied.corrected(u)),
                 bool((u == state.command).all()))
+
+    def feed_forward(self, state: State) -> Array | None:
+        """Return the rate (n_x,) due to the measured disturbances; None without any."""
+        return None if state.disturbances is None else (
+            self.model.disturbance_rate(state.disturbances.value))
+
+    def disturbed(self, state: State, values: Array | None, ages: Array | None, time_ns: int
+                  ) -> State:
+        """
+        Check measured disturbances (n_d,), and count with them from the last sample on.
+
+        After a value was held for longer than the time constant of the observer, the change to
+        the new value is already part of the estimated disturbance, and is subtracted there.
+        """
+        signals = self.model.disturbances
+        if not len(signals):
+            return state
+        before = state.disturbances or MeasuredDisturbances(signals.center, (None,) * len(signals))
+        values = np.full(len(signals), np.nan) if values is None else values
+        found = check_disturbances(
+            self.tuning.disturbances, signals, before, values,
+            np.where(np.isnan(values), np.inf, 0.0) if ages is None else ages, time_ns)
+        state, estimate = replace(state, disturbances=found), state.estimate
+        if estimate is None:
+            return state
+        late = before.held_since(time_ns) * self.tuning.observer_bandwidth > 1.0
+        change = np.where(late, found.value - before.value, 0.0)
+        if not change.any():
+            return state
+        level = self.level(state.supervisor)
+        return replace(state, estimate=level.estimator.transferred(
+            estimate, level.model.drift(estimate.x)
+            - self.model.disturbance_rate(signals.center + change)))
 
     def observe(self, state: State, y: Array, time_ns: int, elapsed: float
                 ) -> tuple[State, Observation]:
@@ -176,11 +217,20 @@ class StateEstimation:
         xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
         if predicted is None:
             # the input that acts, it is assumed, held the plant where it is
-            return estimator.restart(
-                None, xi, None if state.command is None else self.acting(state, time_ns))
+            return self._started(
+                state, xi, None if state.command is None else self.acting(state, time_ns))
         if verdict.moved or not elapsed > 0.0 or lost:
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
+
+    def _started(self, state: State, xi: Array, u: Array | None) -> Estimate:
+        """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
+        estimator = self.level(state.supervisor).estimator
+        started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
+        if forward is None or u is None:
+            return started
+        # measured disturbances are a part of what keeps it there
+        return estimator.transferred(started, estimator.model.drift(started.x) - forward)
 
     def _lost(self, state: State, time_ns: int) -> bool:
         """Whether the state is unknown, because no measurement was accepted for too long."""
@@ -201,7 +251,8 @@ class StateEstimation:
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
         estimator = self.level(state.supervisor).estimator
-        predicted: Estimate | None = state.estimate
+        begin = state.estimate.under(self.feed_forward(state))
+        predicted: Estimate | None = begin
         try:
             for seconds, u in state.applied.pieces(
                     time_ns - round(elapsed * NANOSECONDS), time_ns, self.dead_ns):
@@ -209,8 +260,10 @@ class StateEstimation:
                     predicted, self.model.inputs.to_deviation(u), seconds)
         except np.linalg.LinAlgError:
             predicted = None  # so far out that the model gives no rate
-        return predicted if predicted is not None and predicted.finite else replace(
-            state.estimate, covariance=None)
+        if predicted is None or not predicted.finite:
+            return replace(state.estimate, covariance=None)
+        return predicted if begin is state.estimate else replace(
+            predicted, w=state.estimate.w + (predicted.w - begin.w))
 
     def transfer_estimate(self, estimate: Estimate, before: FallbackLevel,
                           now: FallbackLevel) -> Estimate:
@@ -222,6 +275,9 @@ class StateEstimation:
     def take_over(self, predecessor: StateEstimation, state: State) -> State:
         """Carry an estimate over from other settings or another model."""
         estimate, old, new = state.estimate, predecessor.model, self.model
+        before = predecessor.feed_forward(state)
+        if old.disturbances.names != new.disturbances.names:
+            state = replace(state, disturbances=None)
         if estimate is None:
             return state
         now_ns = state.commanded_ns or 0  # the time of the estimate
@@ -234,10 +290,11 @@ class StateEstimation:
         if old.states.names != new.states.names:
             # of what is not measured the new model has a view of its own
             x = self.position(None, predecessor.outputs.of(x))
-            return replace(state, accepted=None, recovery=None, estimate=estimator.restart(
-                None, new.states.to_deviation(x), self.acting(state, now_ns)))
+            return replace(state, accepted=None, recovery=None, estimate=self._started(
+                state, new.states.to_deviation(x), self.acting(state, now_ns)))
         # the rates that the old model estimated, per second, which all models share
-        rate = estimate.w + predecessor.level(state.supervisor).model.drift(estimate.x) + (
+        former = predecessor.level(state.supervisor).model
+        rate = estimate.under(before).w + former.drift(estimate.x) + (
             old.forcing(estimate.x, predecessor.acting(state, now_ns)))
         factor = (old.states.scale / old.seconds_per_time_unit
                   / (new.states.scale / new.seconds_per_time_unit))
@@ -248,6 +305,8 @@ class StateEstimation:
             covariance = covariance * change * change[:, None]
         moved = Estimate(
             x_new, factor * rate - new.forcing(x_new, self.acting(state, now_ns)), covariance)
-        moved = estimator.transferred(moved, np.zeros_like(moved.w))
+        forward = self.feed_forward(state)
+        moved = estimator.transferred(moved, np.zeros_like(moved.w) if forward is None
+                                      else -forward)
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return replace(state, estimate=moved, accepted=None, recovery=None)

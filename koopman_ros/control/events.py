@@ -26,6 +26,10 @@ class Measurement:
     applied: Array | None = None  #: (n_u,) measured input that goes with it, or None
     #: how many of the seconds since the last stamp the rate limit may count, or None for all
     seconds: float | None = None
+    #: (n_d,) measured disturbances, in the model's units; NaN for none, None where there are none
+    disturbances: Array | None = None
+    #: (n_d,) their ages in s, infinity for none; None where they are as new as the measurement
+    ages: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +92,8 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
     match event:
         case Measurement():
             return EventOutcome(*controller.step(state, event.measured, event.stamp_ns,
-                                                 event.applied,
-                                                 event.seconds))
+                                                 event.applied, event.seconds,
+                                                 event.disturbances, event.ages))
         case Silence():
             return EventOutcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():

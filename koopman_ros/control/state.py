@@ -21,7 +21,14 @@ from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.status import Reason
-from koopman_ros.estimation import Accepted, AppliedInputs, Estimate, Estimator, Innovation
+from koopman_ros.estimation import (
+    Accepted,
+    AppliedInputs,
+    Estimate,
+    Estimator,
+    Innovation,
+    MeasuredDisturbances,
+)
 
 
 class Mode(Enum):
@@ -50,6 +57,7 @@ class State:
     accepted: Accepted | None = None  #: the last accepted measurement
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
+    disturbances: MeasuredDisturbances | None = None  #: measured ones; None without any so far
     supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
     recovery: SafeStateRecovery | None = None

@@ -49,7 +49,8 @@ class ControlStep(Configuration):
     """The step of a configured loop; every method is pure and returns a new state."""
 
     def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
-             countable: float | None = None) -> tuple[State, Array, StepReport]:
+             countable: float | None = None, disturbances: Array | None = None,
+             ages: Array | None = None) -> tuple[State, Array, StepReport]:
         """
         Answer one measurement.
 
@@ -63,6 +64,9 @@ class ControlStep(Configuration):
             :meth:`StateEstimation.applied`.
         :param countable: largest number of seconds since the last stamp that ramp and rate limit
             count, from another clock; None for any.
+        :param disturbances: (n_d,) measured disturbances, NaN for one that is not measured, or
+            None; see :func:`koopman_ros.estimation.check_disturbances`.
+        :param ages: (n_d,) their ages in s, or None where they are of that time.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         :raises ValueError: for a measurement or an input of another size.
@@ -70,6 +74,9 @@ class ControlStep(Configuration):
         y = numbers('measurement', y, self.measured.names)
         if applied is not None:
             applied = numbers('applied input', applied, self.model.inputs.names)
+        if disturbances is not None and (signals := self.model.disturbances.names):
+            disturbances = numbers('measured disturbances', disturbances, signals)
+            ages = None if ages is None else numbers('ages of disturbances', ages, signals)
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
             arrival = Arrival.LATE if ahead < 0 else Arrival.REPEATED
@@ -83,6 +90,7 @@ class ControlStep(Configuration):
 
         def calculate() -> tuple[State, Array, StepReport]:
             known, follows = self.estimation.applied(state, applied)
+            known = self.estimation.disturbed(known, disturbances, ages, time_ns)
             now, seen = self.estimation.observe(known, y, time_ns, time.elapsed)
             accepted = seen.verdict.fault is None
             if accepted:
@@ -209,7 +217,8 @@ class ControlStep(Configuration):
             if level is None or state.estimate is None or state.setpoint.active is None:
                 return supervisor, target, result
             estimate = self.estimation.transfer_estimate(
-                state.estimate, self.estimation.level(state.supervisor), level)
+                state.estimate, self.estimation.level(state.supervisor), level
+                ).under(self.estimation.feed_forward(state))
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, memory, time.spacing, state.target,

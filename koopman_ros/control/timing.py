@@ -44,6 +44,7 @@ def afresh(state: State, by_ns: int) -> State:
         state.time_ns, state.former_ns)
     return replace(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
                    applied=state.applied.shifted(by_ns), supervisor=supervisor, recovery=None,
+                   disturbances=state.disturbances and state.disturbances.shifted(by_ns),
                    setpoint=replace(state.setpoint, scheduled=()))
 
 

@@ -76,8 +76,8 @@ def column(signals: str, default: float, description: str, unit: str = '{unit}',
     """
     Declare an array with one number for each of some signals, as ``<signal>.<name>`` in YAML.
 
-    :param signals: ``'states'`` (n_x,), ``'measured'`` (n_y,), ``'controlled'`` (n_c,) or
-        ``'inputs'`` (n_u,).
+    :param signals: ``'states'`` (n_x,), ``'measured'`` (n_y,), ``'controlled'`` (n_c,),
+        ``'inputs'`` (n_u,) or ``'disturbances'`` (n_d,).
     :param default: of each, as in YAML.
     :param unit: ``{unit}`` stands for that of a difference of the signal; ``{shown}`` says that
         the number is a value of the signal, which is converted to the unit of the model.

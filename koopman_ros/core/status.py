@@ -48,6 +48,12 @@ class StatusCode(Enum):
     FROZEN = 'sensor_frozen', (
         'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s while '
         'the model moved by more than {change:change}: the sensor may be stuck; check it')
+    DISTURBANCE_SILENT = 'disturbance_silent', (
+        'no measurement of {signal} for more than {timeout:g} s: its last value {held:value} is '
+        'assumed; check the sensor')
+    DISTURBANCE_UNKNOWN = 'disturbance_unknown', (
+        'no measurement of {signal} yet: its nominal value {held:value} is assumed; check the '
+        'sensor')
     NO_MEASUREMENT = 'no_measurement', 'no measurement received: check sensor and plant'
     STAMPS_STAND = 'stamps_do_not_advance', (
         'measurements are received, but their stamps do not advance: check the clock of the '

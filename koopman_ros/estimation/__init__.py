@@ -16,6 +16,10 @@ from koopman_ros.estimation.disturbance_observer import (
     MeasuredState,
 )
 from koopman_ros.estimation.kalman_filters import ExtendedKalmanFilter, UnscentedKalmanFilter
+from koopman_ros.estimation.measured_disturbances import (
+    check_disturbances,
+    MeasuredDisturbances,
+)
 from koopman_ros.estimation.sensor_checks import Accepted, check, Standstill, Verdict
 
 #: by name
@@ -27,6 +31,6 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
 }
 
 __all__ = ['ESTIMATORS', 'Accepted', 'AppliedInputs', 'DisturbanceObserver', 'Estimate',
-           'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'PendingInputs',
-           'Standstill', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias',
-           'held_means', 'largest_bandwidth']
+           'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredDisturbances',
+           'MeasuredState', 'PendingInputs', 'Standstill', 'UnscentedKalmanFilter', 'Verdict',
+           'check', 'check_disturbances', 'equivalent_bias', 'held_means', 'largest_bandwidth']

@@ -62,7 +62,9 @@ class Estimate:
     State and disturbance of the plant, in scaled deviations and the model's time unit.
 
     dx/dt = f(x) + B u + w with f the model's drift, the same that the target is
-    calculated from: any difference between the two would be left as an offset.
+    calculated from: any difference between the two would be left as an offset. Where a law or a
+    prediction is given it, w includes the effect E d of measured disturbances; what estimators
+    correct does not.
     """
 
     x: Array  #: (n_x,) state
@@ -76,6 +78,10 @@ class Estimate:
         """Whether state, disturbance and covariance are finite numbers."""
         return bool(np.isfinite(self.x).all() and np.isfinite(self.w).all() and (
             self.covariance is None or np.isfinite(self.covariance).all()))
+
+    def under(self, rate: Array | None) -> Estimate:
+        """Return the estimate under a further disturbance (n_x,), or None for none."""
+        return self if rate is None else replace(self, w=self.w + rate)
 
     def check(self, n_x: int) -> None:
         """Raise a TypeError or ValueError unless it has n_x states and is finite."""

@@ -127,7 +127,8 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
              noise: Array | None = None, seed: int = 0, sensor: Sensor = perfect,
              input_sensor: Sensor | None = None, state: State | None = None,
              stamp: Callable[[int], int] = after_a_second,
-             stop: Callable[[Array, Array, StepReport], bool] | None = None) -> Simulation:
+             stop: Callable[[Array, Array, StepReport], bool] | None = None,
+             disturbances: Callable[[float], Array | None] = lambda _: None) -> Simulation:
     """
     Run a controller and a plant, sampled at 0, period, 2 period, ... up to the duration.
 
@@ -146,6 +147,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     :param state: of the controller at the start; knowing nothing by default.
     :param stamp: the stamp of a measurement at a time of the plant, both in ns.
     :param stop: ends the simulation when it is true of state, command and report.
+    :param disturbances: (n_d,) measured at a time in s, NaN for one that is not; None for none.
     :raises ValueError: when arguments do not fit each other, or the controller refuses an event.
     """
     for name, value, fits in (('duration', duration, duration >= 0.0),
@@ -178,7 +180,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
         received = sensor(y, seconds)
         event = Silence(stamp(time_ns)) if received is None else Measurement(
             stamp(time_ns), received, None if input_sensor is None else input_sensor(
-                loop.plant.applied, seconds))
+                loop.plant.applied, seconds), disturbances=disturbances(seconds))
         loop, command, report = _answered(loop, event)
         assert report is not None  # of a measurement as of silence
         reports.append(report)

@@ -118,7 +118,8 @@ class ControllerNode(ManagedNode):
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
         self._counts = status.Counts()
         self._measured = np.full(len(signals.states), np.nan)
-        self._connect(SignalTopics(signals, parameters.states, parameters.inputs))
+        self._connect(SignalTopics(signals, parameters.states, parameters.inputs,
+                                   disturbances=parameters.disturbances))
         self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
         self._diagnostics = self.diagnostics.add_group(self._statuses, status.TASKS)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
@@ -205,7 +206,9 @@ class ControllerNode(ManagedNode):
         # the first command after an activation begins from the measured inputs, or else from the
         # last command before the node became inactive
         present = applied.latest if self._last.command is None else self._last.command
-        event = events.Measurement(stamp_ns, sample.values, measured, countable)
+        event = events.Measurement(
+            stamp_ns, sample.values, measured, countable,
+            *self._measurements.disturbances.with_ages(stamp_ns) or ())
         outcome = self._loop.answer(event, present if measured is None else measured, arrived,
                                     advance is not Advance.OLD)
         if outcome is None or outcome.report is None:

@@ -30,6 +30,7 @@ from koopman_ros.parameters.signal_topics import (
     box_defaults,
     DEFAULT_SYSTEM,
     InputPlaces,
+    MeasuredPlace,
     named_units,
     plant_defaults,
     Signals,
@@ -82,6 +83,7 @@ class ControllerParameters:
         open_minimum=True)
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces, 'measured')
     inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    disturbances: Mapping[str, MeasuredPlace] = per_signal(MeasuredPlace)
     #: names of all states that the tuning is for
     every_state: Mapping[str, NoParameters] = per_signal(NoParameters, 'states')
 
@@ -113,7 +115,8 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
         plugin_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
     except ValueError as error:
         return f'estimator = {tuning.estimator!r}: {error}'
-    return SignalTopics(signals, values.states, values.inputs).check()
+    return SignalTopics(signals, values.states, values.inputs,
+                        disturbances=values.disturbances).check()
 
 
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
@@ -173,7 +176,8 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     found = signals_of(model)
     named = [named_units(tuple(filter(None, given.get(kind, ()))) or own.get(kind, ()))
              for kind in ('states_measured', 'inputs_commanded')]
-    expected = Signals(named[0] or found.states, named[1] or found.inputs)
+    expected = Signals(named[0] or found.states, named[1] or found.inputs,
+                       disturbances=found.disturbances)
     if expected.inputs != found.inputs or not expected.states.items() <= found.states.items():
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
@@ -199,7 +203,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         (('min', 'max'), ('sensor_min', 'sensor_max')),
         signals={'states': signals.every, 'measured': signals.states,
                  'controlled': {name: signals.states[name] for name in signals.controlled},
-                 'inputs': signals.inputs},
+                 'inputs': signals.inputs, 'disturbances': signals.disturbances},
         plugins=_plugin_parameters({**own, **given}), defaults=defaults)
 
 

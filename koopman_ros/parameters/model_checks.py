@@ -99,6 +99,7 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
             'to true to use it anyway')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
+                                    and own.disturbances == signals.disturbances
                                     and signals.states.items() <= own.states.items()):
         raise ModelFileError(
             f'{path} has {own}, but this controller was started for {signals}: choose a model of '

@@ -235,6 +235,10 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         yield MEASUREMENTS, (
             f'measurements are {age:.1f} s old on receipt, max_measurement_age allows '
             f'{oldest:g} s: check the connection and the clocks')
+    if now.state.disturbances is not None:
+        words = words_of(now.signals)
+        for fault in now.state.disturbances.faults:
+            yield MEASUREMENTS, words(fault)
     if report.target is not None and (short := _out_of_reach(now, report.target)):
         yield SETPOINT, short
     if not report.measurement.follows:
@@ -296,6 +300,8 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         **now.model(),
         **values_by_name(signals.states, now.measured.tolist()),
         **labelled(controlled, 'set-point', None if target is None else target.setpoint),
+        **values_by_name(signals.disturbances, [] if state.disturbances is None
+                         else state.disturbances.value.tolist()),
         **values_by_name(inputs, [math.nan] * len(inputs) if state.command is None
                          else state.command.tolist()),
         **labelled(inputs, 'disturbance', None if estimate is None else estimate.disturbance,

@@ -41,6 +41,7 @@ class Measurements:
         self._endpoints = endpoints
         self.assembler = SampleSynchronizer(tuple(signals.states), round(tolerance * NANOSECONDS))
         self.applied = MeasuredInputs(signals.inputs)
+        self.disturbances = MeasuredInputs(signals.disturbances)
         self.frame_id, self._frame_length = '', 0
         # by topic of the measurements with one publisher: the numbers of its messages
         self._sources = {place.topic: TimeBase(late=-1) for place in wiring.measured.values()
@@ -50,6 +51,8 @@ class Measurements:
         # the first command begins from them
         self._wait = InputWait[Sample](node, lambda: (
             not self._begun() and not self.applied.complete and self._inputs.published()), answer)
+        SignalSubscriber(node, endpoints.subscribe, wiring.measured_disturbances,
+                         signals.disturbances, self.disturbances.take)
         measured = SignalSubscriber(
             node, endpoints.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:

@@ -19,7 +19,7 @@ from rclpy.timer import Timer
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import MessageField
-from koopman_ros.core.units import Conversion, conversion, in_steps
+from koopman_ros.core.units import Conversion, conversion, in_steps, NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode, wall_timer
@@ -167,6 +167,14 @@ class MeasuredInputs:
         """Return the last values (n_u,) if all are of about a time, else None."""
         near = all(abs(self.get(name)[0] - stamp_ns) <= tolerance_ns for name in self._names)
         return self.latest if near else None
+
+
+    def with_ages(self, stamp_ns: int) -> tuple[Array, Array] | None:
+        """Return the last values (n,) and their ages in s at a time; None without any signal."""
+        if not self._names:
+            return None
+        stamps, values = zip(*map(self.get, self._names), strict=True)
+        return np.array(values), (stamp_ns - np.array(stamps)) / NANOSECONDS
 
 
 class InputWait(Generic[T]):
