@@ -10,6 +10,7 @@ fixed, so that the same machine writes the same files bit for bit.
 
 import argparse
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 import sys
 
@@ -27,6 +28,7 @@ from koopman_ros.plants import (
     plant_class,
     random_steps,
     RandomStepDesign,
+    ReactorParameters,
 )
 from studies.paper.reactor import SYSTEM, TRAINING, training_samples
 from studies.progress import training_progress
@@ -77,7 +79,8 @@ LIFTS = {
         input_lower=-12.0, input_upper=12.0, state_lower=[-1.3, -5.0], state_upper=[1.3, 5.0],
         hold_time=(0.05, 0.1), sample_period=0.05), 120, 0.5, _FREE),
 }
-NAMES = ('reactor', *LIFTS, SADDLE)
+FEED = 'reactor_feed'  # the reactor of one state, its feed temperature measured
+NAMES = ('reactor', FEED, *LIFTS, SADDLE)
 
 
 def library_system(name: str) -> ControlAffineSystem:
@@ -134,6 +137,28 @@ def reactor_models() -> dict[str, LiftedModel]:
             'reactor_linear': linear_model(lifts[max(lifts)])}
 
 
+def reactor_with_feed() -> ControlAffineSystem:
+    """Return the one-state reactor with its feed temperature as a second input."""
+    constants = ReactorParameters()
+    # B u counts it now
+    feed = constants.dilution_rate * constants.feed_temperature
+    return replace(
+        SYSTEM, input_names=(*SYSTEM.input_names, 'feed_temperature'), input_units=('K', 'K'),
+        drift=lambda x: SYSTEM.drift(x) - feed, drift_jacobian=SYSTEM.drift_jacobian,
+        B=np.array([[constants.cooling_rate, constants.dilution_rate]]),
+        nominal_input=np.array([*SYSTEM.nominal_input, constants.feed_temperature]))
+
+
+def feed_model(loops: int = LOOPS) -> LiftedModel:
+    """Learn a lift of the reactor, and the effects of its coolant and of its feed."""
+    system, names = reactor_with_feed(), ('feed_temperature',)
+    samples = box_episodes(system, replace(
+        TRAINING, input_lower=[281.3, 340.0], input_upper=[301.1, 360.0]), 240, 1.0, SEED)
+    plant = replace(describe(system), B=None, disturbance_names=names)
+    return train(plant, samples, IncrementalTraining(max(LIFTED_SIZES), tolerance=0.0), seed=SEED,
+                 starts=1, loops=loops).model.with_disturbances(names)
+
+
 def saddle_model() -> LiftedModel:
     """Learn the free lift of the reactor at its saddle."""
     # in here: it imports the systems, and these this module
@@ -155,8 +180,8 @@ def main(args: list[str] | None = None) -> int:
                      f'{", ".join(NAMES)}')
     options.output.mkdir(parents=True, exist_ok=True)
     for plant in options.plants:
-        models = reactor_models() if plant == 'reactor' else {
-            plant: saddle_model() if plant == SADDLE else train_lift(plant)}
+        own = {SADDLE: saddle_model, FEED: feed_model}.get(plant, partial(train_lift, plant))
+        models = reactor_models() if plant == 'reactor' else {plant: own()}
         for name, model in models.items():
             save(model, options.output / f'{name}.safetensors')
             metrics = ', '.join(f'{key} {value:.2g}'

@@ -82,7 +82,8 @@ class ControllerNode(ManagedNode):
                 f'{", ".join(bundled_plants())}')
         loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
         self._table = table = table_of(loaded.model, given)
-        self._settings = self.declare_table(table)
+        # in the file of a whole loop; the controller has those of its model
+        self._settings = self.declare_table(table, ('disturbances_measured',))
         self._signals = signals_of(
             loaded.model, self._settings.tuning.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded

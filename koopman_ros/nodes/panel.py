@@ -87,7 +87,8 @@ class PanelNode(LoopNode):
         present = load(model_path(str(name))) if (name := given.get('model')) else None
         self.settings = settings = self.declare_table(panel_table(present, given))
         self._signals = signals = panel_signals(present, given)
-        self._wiring = wiring = SignalTopics(signals, settings.states, settings.inputs)
+        self._wiring = wiring = SignalTopics(signals, settings.states, settings.inputs,
+                                              disturbances=settings.disturbances)
         read = settings.read(signals)
         nodes = {PLANT: PLANT, CONTROLLER: settings.controller, TRAINER: settings.trainer}
         self.view = LoopViewModel(signals, read, settings.span, time.time(), {
@@ -128,6 +129,7 @@ class PanelNode(LoopNode):
     def _subscribe(self) -> None:
         matching = self._matching = topics.EndpointMonitor(self, lambda: None)
         for kind, qos in (('measured', _WATCHING), ('predicted', _WATCHING),
+                          ('measured_disturbances', _WATCHING),
                           ('applied', _WATCHING), ('commands', _WATCHING),
                           ('active_setpoints', topics.LATCHED_QOS)):
             SignalSubscriber(self, lambda topic, hear, of,

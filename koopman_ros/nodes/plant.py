@@ -81,19 +81,23 @@ class PlantNode(ManagedNode):
         self._commanded = dict.fromkeys(signals.inputs, self._wall_start)
 
         self._received: dict[str, float] = {}  # of the commands for the last measurement
-        wiring = SignalTopics(signals, parameters.states, parameters.inputs, PLANT_KINDS)
+        wiring = SignalTopics(signals, parameters.states, parameters.inputs, PLANT_KINDS,
+                              parameters.disturbances)
         # the subscriptions first: a controller that hears the measurement has then seen them, too
         self._endpoints = endpoints = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), {
                 place.topic: f'command the {base_name(name, signals.inputs[name])}'
                 for name, place in wiring.commands.items()} | {
-                place.topic: f'publish the {name}' for name, place in wiring.measured.items()})
+                place.topic: f'publish the {name}' for name, place in (
+                    *wiring.measured.items(), *wiring.measured_disturbances.items())})
         self._command_subscriber = SignalSubscriber(
             self, endpoints.subscribe, wiring.commands, signals.inputs, self._on_command)
         self._clock_publisher = endpoints.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
             parameters.publish_clock and not self._real_time) else None
         # the states last: who has found them has found the inputs, too
         self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
+        self._disturbances = SignalPublisher(
+            wiring.measured_disturbances, signals.disturbances, endpoints.publish)
         self._states = SignalPublisher(wiring.measured, signals.states, endpoints.publish)
         counted = {wiring.measured[name].topic
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
@@ -212,11 +216,12 @@ class PlantNode(ManagedNode):
         self._diagnostics.publish_if_changed()
 
     def _publish(self, sample: int) -> None:
-        """Publish inputs, then states, to which the controller responds."""
+        """Publish inputs and disturbances, then states, to which the controller responds."""
         stamp, frame_id = stamp_message(self._plant.process.time_ns), self._settings.frame_id
         if self._clock_publisher is not None and topics.has_subscribers(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
         self._applied.send(self._plant.process.applied, stamp, frame_id)
+        self._disturbances.send(self._table.measured_disturbances(self._settings), stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
         self._states.send(measured, stamp, frame_id, variance, resolution)
 

@@ -36,7 +36,7 @@ _UNKNOWN = ('', 'none', 'nan')
 
 def training_ranges(model: LiftedModel) -> dict[str, Range]:
     """Return the training range of each signal, in its unit."""
-    return {name: (low, high) for signals in (model.states, model.inputs)
+    return {name: (low, high) for signals in (model.states, model.joined.inputs)
             for name, low, high in zip(signals.names, signals.lower.tolist(),
                                        signals.upper.tolist(), strict=True)}
 

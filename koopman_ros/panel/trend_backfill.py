@@ -17,7 +17,8 @@ from koopman_ros.parameters.signal_topics import EVENT_LOG, SignalTopics
 from koopman_ros.records import BagReadError, read_messages
 from koopman_ros.records.series import stamped_number
 
-_KINDS = ('measured', 'active_setpoints', 'predicted', 'applied', 'commands')
+_KINDS = ('measured', 'active_setpoints', 'predicted', 'applied', 'commands',
+          'measured_disturbances')
 _BUCKETS = 10_000
 _BATCH = 200  # messages between two pauses for other threads
 _PAUSE = 0.001  # s

@@ -63,7 +63,9 @@ class LoopViewModel:
                         for name, unit in signals.states.items()}
         self._inputs = {name: SignalValues(name, unit, read[name])
                         for name, unit in signals.inputs.items()}
-        self._all = {**self._states, **self._inputs}
+        self._disturbances = {name: SignalValues(name, unit, read[name])
+                              for name, unit in signals.disturbances.items()}
+        self._all = {**self._states, **self._inputs, **self._disturbances}
         self._time = math.nan
         self._unplanned = 0
         self._mode = self._level = ''
@@ -82,7 +84,8 @@ class LoopViewModel:
         if kind == 'measured':
             self._take_time(stamp, now)
         for name, value in values.items():
-            read = self._all[name].values[kind] = self._all[name].shown(value)
+            read = self._all[name].shown(value)
+            self._all[name].values[kind.removesuffix('_disturbances')] = read
             # a latched set-point has the stamp of its beginning
             if math.isfinite(read) and kind != 'active_setpoints':
                 self._draw(pen(kind, name), stamp, read)
@@ -270,7 +273,7 @@ class LoopViewModel:
             reason='' if reason == 'none' or no_controller else reason,
             states=tuple(own.state(name in self.signals.controlled, self._bounds(own, 'mpc.{}.{}'),
                                    self._bounds(own, '{}.sensor_{}'), no_plant)
-                         for name, own in self._states.items()),
+                         for name, own in {**self._states, **self._disturbances}.items()),
             inputs=tuple(own.input(self._bounds(own), no_controller)
                          for own in self._inputs.values()),
             estimates=self._estimates, statuses=MappingProxyType(dict(self.conditions.statuses)),

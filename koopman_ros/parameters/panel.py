@@ -14,6 +14,7 @@ from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
     DEFAULT_SYSTEM,
     InputPlaces,
+    MeasuredPlace,
     plant_defaults,
     Signals,
     SignalTopics,
@@ -44,6 +45,13 @@ class ShownInput(InputPlaces):
 
 
 @dataclass(frozen=True)
+class ShownDisturbance(MeasuredPlace):
+    """Topic of a measured disturbance, and its unit on the pages."""
+
+    shown_unit: str = _shown_unit()
+
+
+@dataclass(frozen=True)
 class PanelParameters:
     """Parameters of the panel."""
 
@@ -59,6 +67,9 @@ class PanelParameters:
     inputs_commanded: tuple[str, ...] = parameter(
         ('',), 'Inputs with their units, e.g. pump [V]; an empty name: those of the model.',
         read_only=True)
+    disturbances_measured: tuple[str, ...] = parameter(
+        ('',), 'Measured disturbances with their units, e.g. feed_temperature [K]; an empty name: '
+        'those of the model, or none.', read_only=True)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
     controller: str = parameter(
@@ -90,10 +101,12 @@ class PanelParameters:
         28800.0, 'Length of the trends.', 's', 600.0, 604800.0, read_only=True)
     states: Mapping[str, ShownState] = per_signal(ShownState)
     inputs: Mapping[str, ShownInput] = per_signal(ShownInput)
+    disturbances: Mapping[str, ShownDisturbance] = per_signal(ShownDisturbance)
 
     def read(self, signals: Signals) -> dict[str, str]:
         """Return the units in which people read the signals, by name."""
-        shown: dict[str, ShownState | ShownInput] = {**self.states, **self.inputs}
+        shown: dict[str, ShownState | ShownInput | ShownDisturbance] = {
+            **self.states, **self.inputs, **self.disturbances}
         return {name: shown[name].shown_unit or display_unit(unit)
                 for name, unit in signals.units.items()}
 
@@ -135,8 +148,10 @@ def panel_table(present: LiftedModel | None = None,
             except ValueError as error:
                 return (f'{name}.shown_unit = {read[name]!r} must have the dimension of {unit}: '
                         f'{error}')
-        return SignalTopics(signals, values.states, values.inputs).check()
+        return SignalTopics(signals, values.states, values.inputs,
+                            disturbances=values.disturbances).check()
 
     return ParameterTable(
-        PanelParameters, check, signals={'states': signals.states, 'inputs': signals.inputs},
+        PanelParameters, check, signals={'states': signals.states, 'inputs': signals.inputs,
+                                         'disturbances': signals.disturbances},
         defaults={**signals.defaults(), **plant_defaults(system, 'panel'), 'system': system})

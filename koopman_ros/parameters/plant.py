@@ -13,12 +13,13 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import group, parameter, per_signal, signal_value, UNBOUNDED
-from koopman_ros.core.units import LAST_STAMP_SECONDS
+from koopman_ros.core.units import conversion, LAST_STAMP_SECONDS
 from koopman_ros.parameters.signal_topics import (
     CommandedPlaces,
     DEFAULT_SYSTEM,
     LONGEST_FRAME_ID,
     MeasuredPlace,
+    named_units,
     plant_defaults,
     PLANT_KINDS,
     Signals,
@@ -86,6 +87,9 @@ class PlantParameters:
     measured: tuple[str, ...] = parameter(
         ('',), 'States whose measurements must have subscribers before lock-step starts; an empty '
         'name: all.', read_only=True)
+    disturbances_measured: tuple[str, ...] = parameter(
+        ('',), 'Constants that are published as measured disturbances, with their units, e.g. '
+        'feed_temperature [K]; an empty name: none.', read_only=True)
     autostart: bool = parameter(
         True, 'Configure and activate at start-up; false: left to a lifecycle manager.',
         read_only=True)
@@ -117,6 +121,7 @@ class PlantParameters:
     frame_id: str = parameter('plant', 'frame_id of the messages.', read_only=True)
     states: Mapping[str, StateParameters] = per_signal(StateParameters)
     inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
+    disturbances: Mapping[str, MeasuredPlace] = per_signal(MeasuredPlace)
     #: the plant's constants, in SI
     constants: Mapping[str, float] = group()
 
@@ -136,23 +141,43 @@ class PlantTable(ParameterTable[PlantParameters]):
             reference = build(self.plant, {})
         except ValueError as error:
             raise ConfigurationError(f'system = {system!r}: {error}') from error
+        preset = plant_defaults(system, 'plant')
+        disturbances = named_units(tuple(filter(None, given.get(
+            'disturbances_measured', preset.get('disturbances_measured', ())))))
+        self._si = {item.name: item.unit for item in constants_of(self.plant)}
+        for name, unit in disturbances.items():
+            if name not in self._si:
+                raise ConfigurationError(
+                    f'disturbances_measured names {name}, which is no constant of {system}: '
+                    f'choose from {", ".join(self._si) or "none"}')
+            try:
+                conversion(self._si[name], unit)
+            except ValueError as error:
+                raise ConfigurationError(f'disturbances_measured: {name}: {error}') from error
         self.described = signals = Signals(
             dict(zip(reference.state_names, reference.state_units, strict=True)),
-            dict(zip(reference.input_names, reference.input_units, strict=True)), ())
+            dict(zip(reference.input_names, reference.input_units, strict=True)), (),
+            disturbances=disturbances)
         own = {name: value for name, value in signals.defaults().items()
                if name.rpartition('.')[2] in ('topic', 'command_topic')}
         super().__init__(
             PlantParameters, partial(_cross_check, signals), self._build, (('min', 'max'),),
-            signals={'states': signals.states, 'inputs': signals.inputs},
+            signals={'states': signals.states, 'inputs': signals.inputs,
+                     'disturbances': disturbances},
             groups={'constants': [Specification(
                 item.name, item.default, item.unit, item.description, item.lower, item.upper)
                 for item in constants_of(self.plant)]},
-            defaults={**own, **plant_defaults(system, 'plant'), 'system': system})
+            defaults={**own, **preset, 'system': system})
 
     def system(self, values: PlantParameters, nominal_state: Array | None = None
                ) -> ControlAffineSystem:
         """Build the plant's equations; EquilibriumError where it has no steady state to start."""
         return build(self.plant, values.constants, nominal_state)
+
+    def measured_disturbances(self, values: PlantParameters) -> Array:
+        """Return the constants (n_d,) that are measured, in the units of the signals."""
+        return np.array([conversion(self._si[name], unit)(values.constants[name])
+                         for name, unit in self.described.disturbances.items()])
 
     def actuator(self, values: PlantParameters) -> Actuator:
         """Return the actuators of the inputs, in the plant's units."""
@@ -184,4 +209,5 @@ def _cross_check(signals: Signals, values: PlantParameters) -> str:
     if unknown := set(filter(None, values.measured)) - set(signals.states):
         return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}: choose '
                 f'from the states {", ".join(signals.states)}')
-    return SignalTopics(signals, values.states, values.inputs, PLANT_KINDS).check()
+    return SignalTopics(signals, values.states, values.inputs, PLANT_KINDS,
+                        values.disturbances).check()

@@ -39,7 +39,7 @@ LONGEST_FRAME_ID = 256  # characters that are passed on
 # The places of signals: of states, then of inputs and of disturbances.
 KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual',
          'measured_disturbances')
-PLANT_KINDS = ('measured', 'applied', 'commands')
+PLANT_KINDS = ('measured', 'applied', 'commands', 'measured_disturbances')
 # parameters that name them
 SIGNALS = ('states_measured', 'inputs_commanded', 'disturbances_measured', 'controlled')
 

@@ -290,9 +290,12 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     own = plant_defaults(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
-    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, CONTROLLER_INTERNALS,
-                          PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS, EVENT_LOG,
-                          AUDIT_LOG, DIAGNOSTICS)
+    wiring = _wiring(signals, {**own, **given})
+    # a preset may have more topics than these, but not those of disturbances
+    recorded = own.pop('topics', (*wiring.topics, CONTROLLER_INTERNALS, PREDICTED_TRAJECTORY,
+                                  ACTIVE_CONSTRAINTS, EVENT_LOG, AUDIT_LOG, DIAGNOSTICS))
+    defaults['topics'] = tuple(dict.fromkeys((*recorded, *(
+        place.topic for place in wiring.measured_disturbances.values()))))
     if present is not None:
         states, inputs = present.states, present.inputs
         defaults |= {

@@ -115,7 +115,8 @@ def _wiring(given: Mapping[str, Any]) -> tuple[SignalTopics, tuple[str, ...]]:
     signals = trainer.trainer_signals(
         load(model_path(given['model'])) if 'model' in given else None,
         {**{name: getattr(settings, name) for name in SIGNALS}, **given})
-    return SignalTopics(signals, settings.states, settings.inputs), settings.topics
+    return SignalTopics(signals, settings.states, settings.inputs,
+                        disturbances=settings.disturbances), settings.topics
 
 
 def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Program]:
@@ -133,7 +134,8 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
     return {
         'plant': Program(
             'Simulates a plant: publishes its measurements and takes commands.',
-            publishes=(*topics_of('measured', 'applied'), *unmeasured, topics.CLOCK,
+            publishes=(*topics_of('measured', 'applied', 'measured_disturbances'), *unmeasured,
+                       topics.CLOCK,
                        topics.DIAGNOSTICS, _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
             serves=('~/reset', *lifecycle, *STANDARD_SERVICES), many=_HOSTS),
@@ -143,7 +145,8 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                        topics.CONTROLLER_INTERNALS, topics.PREDICTED_TRAJECTORY,
                        topics.ACTIVE_CONSTRAINTS, topics.EVENT_LOG, topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
-            subscribes=(*topics_of('measured', 'applied', 'setpoints', 'manual'), topics.CLOCK),
+            subscribes=(*topics_of('measured', 'applied', 'measured_disturbances', 'setpoints',
+                                   'manual'), topics.CLOCK),
             serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES),
             many=_HOSTS),
         'trainer': Program(
@@ -161,7 +164,8 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
             'with a controller.',
             '0 if all messages were played or after a signal, 1 if it cannot start or continue, 2 '
             'for an unknown argument',
-            publishes=(*topics_of('applied', 'measured', 'setpoints', 'manual'), topics.CLOCK,
+            publishes=(*topics_of('applied', 'measured_disturbances', 'measured', 'setpoints',
+                                  'manual'), topics.CLOCK,
                        *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
             serves=STANDARD_SERVICES),
@@ -174,8 +178,8 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
             'Browser HMI: shows the loop and forwards the commands of operators.',
             publishes=(*topics_of('setpoints', 'manual'), topics.AUDIT_LOG,
                        topics.DIAGNOSTICS, *STANDARD_TOPICS),
-            subscribes=(*topics_of('measured', 'applied', 'commands', 'active_setpoints',
-                                   'predicted'), topics.CONTROLLER_INTERNALS,
+            subscribes=(*topics_of('measured', 'measured_disturbances', 'applied', 'commands',
+                                   'active_setpoints', 'predicted'), topics.CONTROLLER_INTERNALS,
                         topics.PREDICTED_TRAJECTORY, topics.ACTIVE_CONSTRAINTS,
                         topics.EVENT_LOG, topics.DIAGNOSTICS, '/parameter_events',
                         topics.CLOCK),
