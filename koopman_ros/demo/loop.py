@@ -46,6 +46,8 @@ class Scenario:
     duration: float = 600.0  #: length of the run in s of plant time, 0 for endless
     sample_period: float = 1.0  #: s between measurements
     speed: float = 0.0  #: simulated seconds per second, 0 for as fast as the machine can
+    #: constants of the plant that are measured, with their units
+    disturbances: tuple[str, ...] = ()
     #: further parameters of the nodes
     plant: Mapping[str, object] = field(default_factory=dict)
     controller: Mapping[str, object] = field(default_factory=dict)
@@ -53,7 +55,7 @@ class Scenario:
     @property
     def wiring(self) -> SignalTopics:
         """Where its signals are on the wire."""
-        wiring = preset_wiring(self.system)
+        wiring = preset_wiring(self.system, self.disturbances)
         assert wiring is not None
         return wiring
 
@@ -262,12 +264,15 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                 f'{found}; stop them, or use another domain: '
                 f'ROS_DOMAIN_ID={(int(domain) + 1) % 102} make demo')
         operator = Operator(scenario, harness, on_row)
+        shared: dict[str, object] = {'system': scenario.system} | (
+            {'disturbances_measured': list(scenario.disturbances)}
+            if scenario.disturbances else {})
         harness.start('controller', {'system': scenario.system, **scenario.controller})
-        harness.start('trainer', {'system': scenario.system, **trainer})
+        harness.start('trainer', {**shared, **trainer})
         harness.wait_until(lambda: operator.found_loop,
                            'controller and trainer did not discover each other')
         if panel is not None:
-            shown = harness.start('panel', {'system': scenario.system, **panel})
+            shown = harness.start('panel', {**shared, **panel})
             address = harness.wait_until(lambda: re.search(r'the panel is at (\S+)',
                                                            shown.output()))
             assert address is not None
@@ -275,7 +280,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
         if scenario.setpoints:
             operator.request_setpoints(scenario.setpoints, scenario.step_time)
         plant = harness.start('plant', {
-            'system': scenario.system, **scenario.plant,
+            **shared, **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
             'sample_period': scenario.sample_period, 'start_time': _START_TIME,
             # controller, trainer and operator: nobody misses the first measurement

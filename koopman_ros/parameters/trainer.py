@@ -454,8 +454,9 @@ def player_table(given: Mapping[str, Any] = MappingProxyType({})
     return ParameterTable(PlayerParameters, _check_player, defaults=defaults)
 
 
-def preset_wiring(system: str) -> SignalTopics | None:
+def preset_wiring(system: str, disturbances: tuple[str, ...] = ()) -> SignalTopics | None:
     """Return the places of the signals of a plant that is shipped, or None for another."""
     if not (own := plant_defaults(system, 'trainer')):
         return None
+    own |= {'disturbances_measured': disturbances}
     return _wiring(trainer_signals(None, own), own)

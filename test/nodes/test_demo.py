@@ -16,7 +16,9 @@ import rclpy
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo import retraining_demo, setpoint_demo
-from koopman_ros.records import summary
+from koopman_ros.event_log.records import parse
+from koopman_ros.event_log.run import replay_records
+from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess, reserved_output
 
@@ -44,6 +46,25 @@ def test_demo_leaves_bag_picture_and_summary(
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
     assert f'{signal} set-point [' in done.stdout
     assert len(re.findall(r'^ +[\d.]+ +', done.stdout, re.MULTILINE)) >= 20
+
+
+def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_less(
+        tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, '-m', 'koopman_ros.demo.disturbance', '--speed', '0', '--output',
+         tmp_path], capture_output=True, text=True, timeout=240, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+    result = json.loads((tmp_path / 'summary.json').read_text())
+    assert result['peak_unmeasured_kelvin'] == pytest.approx(0.85, abs=0.1)
+    assert result['peak_ratio'] < 1.0 / 3.0
+    assert result['peak_measured_kelvin'] < 0.15
+    assert (tmp_path / 'disturbance.png').read_bytes().startswith(b'\x89PNG')
+    # the records of the loop give its commands again
+    replayed = replay_records(
+        parse(entry.message.data) for entry in read_messages(
+            tmp_path / 'measured.mcap', [f'/{topics.EVENT_LOG}']))
+    assert len(replayed.samples) > 240
+    assert all(one.recorded == one.replayed for one in replayed.samples)
 
 
 def test_demo_says_in_one_line_why_it_cannot_run(
