@@ -44,9 +44,10 @@ class _Run:
 
     @property
     def peak(self) -> float:
-        """Largest distance of the temperature from that at the step, in K."""
-        kelvin = self.loop.measured[reactor.TEMPERATURE][self.loop.seconds >= self.step]
-        return float(np.max(np.abs(kelvin - kelvin[0])))
+        """Largest distance of the temperature from that before the step, in K."""
+        kelvin = self.loop.measured[reactor.TEMPERATURE]
+        before = kelvin[self.loop.seconds < self.step][-1]
+        return float(np.max(np.abs(kelvin - before)))
 
 
 def run_disturbance(output: Path, speed: float) -> dict[str, object]:

@@ -361,6 +361,27 @@ def test_a_plant_that_never_rested_is_tried_at_the_nearest_steady_states():
     assert found.accepted
 
 
+def test_measured_disturbances_keep_their_nominal_values():
+    """Loops are those of the model and the plant without them, wherever they are listed."""
+    both = linearised_model(TWO.scale[:, None] * A / TWO.scale, TWO.scale[:, None] * B, TWO,
+                            INPUTS, 'min', Provenance('two'))
+    for name, column in (('u', 1), ('v', 0)):
+        own = INPUTS.names[column]
+        alone = replace(both, B=both.B[:, [column]], inputs=INPUTS.only((own,)),
+                        dead_time=np.zeros(1))
+
+        def rate(x, u, column=column):
+            whole = np.tile(INPUTS.center, (len(u), 1))
+            whole[:, [column]] = u
+            return two_state_rate(x, whole)
+
+        found = evaluate_closed_loops(both, two_state_rate, loops=16, disturbances=(name,))
+        expected = evaluate_closed_loops(alone, rate, loops=16)
+        np.testing.assert_array_equal(found.excess, expected.excess)
+        np.testing.assert_array_equal(found.setpoints, expected.setpoints)
+        assert found.loops == expected.loops > 8
+
+
 def test_loops_that_cannot_be_tried_have_a_reason():
     found = evaluate_closed_loops(cascade(), cascade_rate, loops=16,
                                   limits=InputLimits(*(np.full(1, bound) for bound in (

@@ -206,7 +206,8 @@ def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, do
 
 def test_a_task_survives_json():
     task = TrainingTask(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
-                        (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)),
+                        (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5),
+                         replace(INPUTS[0], name='feed', command=None)), disturbances=('feed',),
                         seed=3, input_gain={'temperature': {'other': 2.1}})
     assert TrainingTask.of(json.loads(json.dumps(asdict(task)))) == task
     with pytest.raises(TypeError, match='nonsense'):
@@ -235,6 +236,9 @@ def test_a_task_survives_json():
     ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
      BagReadError, "has no topic '/other'"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),
+    ({'disturbances': ('feed',)}, ValueError, 'disturbance_names has feed, must be some of'),
+    ({'disturbances': ('coolant_temperature',), 'input_matrix_degree': 1}, ValueError,
+     'must not depend on the state: give a constant B'),
     ({'model': '', 'input_gain': {'temperature': {'steam': 1.0}}}, ValueError,
      'names steam acting on temperature: the lift has the st'),
 ])

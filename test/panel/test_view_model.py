@@ -74,6 +74,22 @@ def status(own: LoopViewModel, *given: Any) -> None:
 # Faceplates.
 
 
+def test_a_measured_disturbance_has_a_faceplate_and_a_trend_without_a_set_point() -> None:
+    own = view(replace(REACTOR, disturbances={'feed': 'K'}))
+    own.take_signals('measured_disturbances', {'feed': to_kelvin(76.0)}, 1.0, NOW + 1.0)
+    # the plant is silent all the same
+    assert math.isnan(own.snapshot(NOW + 1.0).time)
+    measure(own, 51.8, 2.0)
+    own.take_signals('measured_disturbances', {'feed': to_kelvin(77.0)}, 2.0, NOW + 2.0)
+    own.take_model({'feed': (to_kelvin(66.0), to_kelvin(76.5))}, {})
+    state, feed = own.snapshot(NOW + 2.0).states
+    assert (state.name, feed.name, feed.controlled) == ('temperature', 'feed', False)
+    assert feed.measured == pytest.approx(77.0)
+    assert feed.abnormal == 'above the trained range'
+    times, values = own.trends.window(['feed'], 0.0, 10.0, 10)['feed']
+    assert (list(times), list(values)) == ([2.0], [pytest.approx(77.0)])
+
+
 def test_values_are_in_the_units_that_people_read() -> None:
     own = view()
     measure(own, 51.8, 1.0)

@@ -28,7 +28,7 @@ from koopman_ros.parameters.table import (
     per_signal,
     Specification,
 )
-from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.plants import build, plant_class
 from koopman_ros.ros.node import LoopNode, range_of
 from koopman_ros.ros.node_descriptions import main, POLICY_FILE, tables
@@ -338,6 +338,32 @@ def test_values_that_do_not_fit_together_are_refused(
         node: str, given: dict[str, Any], words: str) -> None:
     table = TABLES[node]
     assert re.search(words, table.check(table.snapshot(given)))
+
+
+def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> None:
+    named = {'system': 'reactor', 'disturbances_measured': ('feed_temperature [K]',)}
+    trainer = trainer_table(load(model_path(reactor.MODEL)), named)
+    settings = trainer.snapshot({'input_matrix': (0.1, 0.2)})
+    assert not trainer.check(settings)
+    assert settings.topics[-1] == 'feed_temperature'
+    signals = trainer_signals(None, {**plant_defaults('reactor', 'trainer'), **named})
+    task = settings.training(signals)
+    assert task['disturbances'] == ('feed_temperature',)
+    assert task['input_gain'] == {'temperature': {
+        'coolant_temperature': 0.1, 'feed_temperature': 0.2}}
+    assert 'must have 1 rows of 2' in trainer.check(trainer.snapshot({'input_matrix': (0.1,) * 3}))
+    assert 'with measured' in trainer.check(trainer.snapshot({'input_matrix_degree': 1}))
+    # of the controller those of its model
+    rows = table_of(load(model_path('reactor_feed')), {'system': 'reactor'}).rows
+    assert rows['feed_temperature.topic'].default == 'feed_temperature'
+    assert rows['feed_temperature.sensor_max'].unit == 'degC'
+    assert rows['feed_temperature.timeout'].default == 60.0
+    plant = PlantTable(named)
+    values = plant.snapshot({'constants.feed_temperature': 80.0})
+    assert plant.measured_disturbances(values) == pytest.approx([353.15])
+    for given, words in (('spin [1]', 'no constant of reactor'), ('volume [K]', 'volume: ')):
+        with pytest.raises(ConfigurationError, match=words):
+            PlantTable({**named, 'disturbances_measured': (given,)})
 
 
 def test_equations_of_a_trainer_are_those_of_its_task() -> None:

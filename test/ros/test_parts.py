@@ -32,10 +32,11 @@ from koopman_ros.parameters.signal_topics import Signals, signals_of
 from koopman_ros.records import BagWriter, read_messages
 from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.controller_messages import active_constraints, planned
-from koopman_ros.ros.controller_status import statuses
+from koopman_ros.ros.controller_status import Counts, statuses
 from koopman_ros.ros.diagnostics import Severity
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
+from koopman_ros.ros.signals import MeasuredInputs, SignalSample
 from koopman_ros.testing import Harness
 from support.nodes import temperature, TIMEOUT
 
@@ -168,3 +169,35 @@ def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
                                no_news=lambda _: None))
     found = statuses(now)['measurements']
     assert (found.level is Severity.WARN) is warned
+
+
+def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
+    model = load(model_path('reactor_feed'))
+    signals = signals_of(model)
+    own = built(table_of(model, {'system': 'reactor'}).snapshot({}), model)
+    heard = MeasuredInputs(signals.disturbances)
+    assert MeasuredInputs(()).with_ages(0) is None
+    state = State()
+    for k, (kelvin, words) in enumerate((
+            (None, 'no measurement of feed_temperature yet: its nominal value 76.85 degC'),
+            (351.0, ''), (math.nan, 'the measured feed_temperature is nan, not finite')), 1):
+        if kelvin is not None:
+            heard.take(SignalSample(Time(sec=k), '', {'feed_temperature': kelvin}, True))
+        state, _, report = own.step(state, model.states.center, k * NANOSECONDS, None, None,
+                                    *heard.with_ages(k * NANOSECONDS))
+        now = SimpleNamespace(
+            report=report, state=state, controller=own, signals=signals, complaint='', unheard=(),
+            parameters=SimpleNamespace(
+                max_measurement_age=5.0, measurement_timeout=0.0, tuning=own.tuning),
+            unheard_for=0.0, request='', model_refused='', input='coolant', model=dict, reason='',
+            measured=model.states.center, setpoint_received=True,
+            counts=Counts(measurements=k), assembler=SimpleNamespace(
+                awaited='', late={}, missing={}, duplicated={}),
+            timing=SimpleNamespace(
+                silence=0.0, wall_silence=0.0, paused=False, without_clock=False, age=0.0,
+                busy=False, answer_seconds=0.0, no_news=lambda _: None))
+        found = statuses(now)
+        assert found['measurements'].message.startswith(words or 'in order')
+        assert found['control'].level is (Severity.WARN if words else Severity.OK)
+        assert found['control'].values()['feed_temperature [degC]'] == pytest.approx(
+            76.85 if k == 1 else 77.85)
