@@ -26,8 +26,10 @@ from studies import saddle
 from studies.paper import reactor
 from studies.paper.reactor import SETPOINT, SYSTEM, training_samples
 from studies.shipped_models import (
+    FEED,
     library_system,
     LIFTS,
+    reactor_with_feed,
     SADDLE,
     SEED,
     train_lift,
@@ -104,6 +106,20 @@ def assert_promise(model, episodes):
 @pytest.mark.parametrize('n_z', [3, 4])
 def test_shipped_lifts_keep_their_promise_on_fresh_data(n_z, episodes):
     assert_promise(shipped(f'nz{n_z}'), episodes)
+
+
+def test_the_lift_with_the_feed_temperature_knows_its_effect():
+    """q/V is 1/min, whatever the temperatures; along episodes in which both of them step."""
+    model, system = load(model_path(FEED)), reactor_with_feed()
+    assert (model.inputs.names, model.disturbances.names) == (
+        SYSTEM.input_names, ('feed_temperature',))
+    assert model.E * model.states.scale / model.disturbances.scale == pytest.approx(1.0, abs=1e-5)
+    assert model.provenance.metrics['rw'] <= PROMISED_FIT[4]
+    design = RandomStepDesign(
+        input_lower=[282.0, 341.0], input_upper=[301.0, 359.0], state_lower=305.0,
+        state_upper=327.0, hold_time=(0.5, 5.0), sample_period=SAMPLE_PERIOD)
+    assert roll_out_error(model.joined, [
+        random_steps(system, design, 15.0, 7001)]) <= PROMISED_KELVIN[4]
 
 
 def test_the_linear_model_is_the_linearisation_and_predicts_far_worse(episodes):
