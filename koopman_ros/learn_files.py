@@ -45,13 +45,14 @@ def main(arguments: list[str] | None = None) -> int:
     options = vars(_parser().parse_args(arguments))
     try:
         present = _loaded(options.get('model', ''))
-        record, test = (read(files, *_wanted(options, present), time=options['time'],
+        states, inputs, disturbances = _wanted(options, present)
+        record, test = (read(files, states, [*inputs, *disturbances], time=options['time'],
                              period=options['period'], linear=options['linear'],
                              tolerance=options.get('synchronisation_tolerance', 0.0))
                         if files else None for files in (options['record'], options['test']))
         assert record is not None
         print(record, flush=True)
-        return _learned(options, present, record, test)
+        return _learned(options, present, record, len(inputs), test)
     except (OSError, ValueError, ImportError) as error:
         print(f'learn: {" ".join(str(error).split())}', file=sys.stderr)
         return 1
@@ -97,18 +98,17 @@ def _loaded(model: str) -> LiftedModel | None:
     return load(model_path(model)) if model else None
 
 
-def _wanted(options: Mapping[str, Any], present: LiftedModel | None
-            ) -> tuple[list[str], list[str]]:
-    """Return states, and inputs with disturbances, as named or as the present model has them."""
-    states, inputs = list(options['states']), list(options['inputs'])
-    if states and inputs:
-        return states, [*inputs, *options['disturbances']]
+def _wanted(options: Mapping[str, Any], present: LiftedModel | None) -> list[list[str]]:
+    """Return states, inputs and disturbances as named, or as the present model has them."""
+    named = [list(options[kind]) for kind in ('states', 'inputs', 'disturbances')]
     if present is None:
-        raise ValueError('the signals are not known: give --states and --inputs, as in --states '
-                         "level --inputs 'pump [V]'")
-    states, inputs = ([f'{name} [{unit}]' for name, unit in zip(of.names, of.units, strict=True)]
-                      for of in (present.states, present.joined.inputs))
-    return states, inputs
+        if not (named[0] and named[1]):
+            raise ValueError('the signals are not known: give --states and --inputs, as in '
+                             "--states level --inputs 'pump [V]'")
+        return named
+    own = [[f'{name} [{unit}]' for name, unit in zip(of.names, of.units, strict=True)]
+           for of in (present.states, present.inputs, present.disturbances)]
+    return [*(named[:2] if named[0] and named[1] else own[:2]), named[2] or own[2]]
 
 
 def _table(present: LiftedModel | None, states: tuple[str, ...], inputs: tuple[str, ...],
@@ -118,17 +118,15 @@ def _table(present: LiftedModel | None, states: tuple[str, ...], inputs: tuple[s
         'disturbances_measured': disturbances})
 
 
-def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record,
+def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record, n_u: int,
              test: Record | None) -> int:
     # not before it is clear that there is something to learn: torch takes seconds
     from koopman_ros.learning import retrain, TrainingTask
     from koopman_ros.learning.report import reported
 
     about = record.plant
-    inputs = dict(zip(about.input_names, about.input_units, strict=True))
-    # they come last
-    named = len(options['disturbances']) or (present and len(present.disturbances)) or 0
-    disturbances = {name: inputs.pop(name) for name in about.input_names[len(inputs) - named:]}
+    acting = dict(zip(about.input_names, about.input_units, strict=True))
+    inputs, disturbances = dict(list(acting.items())[:n_u]), dict(list(acting.items())[n_u:])
     signals = Signals(dict(zip(about.state_names, about.state_units, strict=True)), inputs,
                       disturbances=disturbances)
     table = _table(present, *(described(some) for some in (
@@ -148,7 +146,7 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
         states=tuple(RecordedState(name, unit, place(name, name, unit))
                      for name, unit in signals.states.items()),
         inputs=tuple(RecordedInput(name, unit, place(name, name, unit))
-                     for name, unit in {**inputs, **disturbances}.items()),
+                     for name, unit in acting.items()),
         **settings.training(signals))
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
 

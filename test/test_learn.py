@@ -91,7 +91,8 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
     # the present model says which signal it is, and it takes no other role
     with quick_retraining(8, degrees=(1, 2)):
         assert learn.main(['day.csv', '--model', 'day.safetensors', '--model_output',
-                           'new.safetensors', '--model_class', 'linear']) == 2
+                           'new.safetensors', '--model_class', 'linear', '--states', 'level',
+                           '--inputs', 'pump']) == 2
     assert 'the current model' in capsys.readouterr().out
     assert load(folder / 'new.refused.safetensors').disturbances.names == ('rain',)
     assert learned('--disturbances', 'rain', '--input_matrix_degree', '1') == 1

@@ -328,9 +328,10 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
     if present is not None and not states:
         return signals_of(present, controlled)
     measured = named_units(states)
+    disturbances = named_units(tuple(filter(None, given.get('disturbances_measured', ()))))
     return Signals(measured, named_units(inputs), controlled or tuple(measured),
-                   disturbances=named_units(tuple(filter(
-                       None, given.get('disturbances_measured', ())))))
+                   disturbances=disturbances or (
+                       {} if present is None else signals_of(present).disturbances))
 
 
 def _wiring(signals: Signals, given: Mapping[str, Any]) -> SignalTopics:

@@ -353,7 +353,9 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
         'coolant_temperature': 0.1, 'feed_temperature': 0.2}}
     assert 'must have 1 rows of 2' in trainer.check(trainer.snapshot({'input_matrix': (0.1,) * 3}))
     assert 'with measured' in trainer.check(trainer.snapshot({'input_matrix_degree': 1}))
-    # of the controller those of its model
+    # those of the model where none are named
+    assert trainer_signals(load(model_path('reactor_feed')), plant_defaults(
+        'reactor', 'trainer')).disturbances == {'feed_temperature': 'K'}
     rows = table_of(load(model_path('reactor_feed')), {'system': 'reactor'}).rows
     assert rows['feed_temperature.topic'].default == 'feed_temperature'
     assert rows['feed_temperature.sensor_max'].unit == 'degC'
