@@ -45,7 +45,7 @@ class MeasurementBuffer:
         self._impulse: Array | float = 0.0  # integral of the inputs since that row, in ns
 
     def add(self, event: Measurement, report: MeasurementReport, command: Array | None,
-            seconds: float) -> None:
+            seconds: float, disturbances: Array | None = None) -> None:
         """
         Take a measurement of all states into account; one that is older restarts the history.
 
@@ -53,11 +53,14 @@ class MeasurementBuffer:
         :param command: (n_u,) in force before it, or None; where the input is measured, that
             counts.
         :param seconds: how much is to be remembered.
+        :param disturbances: (n_d,) measured ones that act, or None where there are none.
         """
         if report.arrival not in (Arrival.ACCEPTED, Arrival.REJECTED):
             return
         known = event.applied is not None and bool(np.isfinite(event.applied).all())
         u = event.applied if known else command
+        if u is not None and disturbances is not None:
+            u = np.concatenate((u, disturbances))
         if event.stamp_ns <= self._time_ns or u is None:
             self._rows.clear()
         elif self._rows:
@@ -97,7 +100,7 @@ class PredictionWindows:
     """N measurements in M windows of K steps each."""
 
     x: Array  #: (N, n_y) measured, in units
-    u: Array  #: (N - 1, n_u) inputs applied between them, in units
+    u: Array  #: (N - 1, n_u + n_d) inputs and disturbances that acted between them, in units
     steps: Array  #: (N - 1,) time between them, in s
     places: NDArray[np.intp]  #: (M, K) which steps are in a window
 
@@ -114,7 +117,7 @@ class PredictionWindows:
 
     def delayed(self, dead_time: Array) -> PredictionWindows:
         """
-        Return the windows with the inputs that acted, each (n_u,) seconds after its application.
+        Return the windows with the inputs that acted, each (n_u + n_d,) seconds later.
 
         The first one is taken to have been applied before, too.
         """
@@ -137,6 +140,7 @@ class PredictionWindows:
 
         :param size: (n_x,) in which errors of the states are weighed, in units.
         """
+        model = model.joined
         n, (M, K) = model.n_x, self.places.shape
         every = np.full((M, n), np.inf)
         x, eye = model.states.to_deviation(self.x), np.eye(n)
@@ -181,12 +185,14 @@ def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
     """
     model, outputs = controller.model, controller.measured
     estimator = next(iter(controller.levels.values())).estimator
-    inputs, steps = model.inputs.to_deviation(windows.u), windows.steps.tolist()
+    inputs, steps = model.inputs.to_deviation(windows.u[:, :model.n_u]), windows.steps.tolist()
+    rates = model.disturbance_rate(windows.u[:, model.n_u:])
     estimate = estimator.restart(
         None, model.states.to_deviation(controller.position(windows.x[0])), inputs[0])
-    known = [estimate]
-    for y, u, seconds in zip(windows.x[1:], inputs, steps, strict=True):
-        predicted = estimator.predict(estimate, u, seconds) or estimate
+    known = [estimate := estimate.under(-rates[0])]
+    for y, u, rate, seconds in zip(windows.x[1:], inputs, rates, steps, strict=True):
+        predicted = (estimator.predict(estimate.under(rate), u, seconds)
+                     or estimate.under(rate)).under(-rate)
         x = outputs.state(y, model.states.to_physical(predicted.x))
         estimate = estimator.correct(predicted, model.states.to_deviation(x), seconds)
         known.append(estimate)
@@ -198,7 +204,8 @@ def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
         ahead: Estimate | None = known[places[0]]
         errors = []
         for k in places:
-            ahead = ahead and simulated(model, ahead, inputs[k], steps[k])
+            ahead = ahead and simulated(model, ahead.under(rates[k]), inputs[k], steps[k])
+            ahead = ahead and ahead.under(-rates[k])
             if ahead is None or not bool(np.isfinite(ahead.x).all()):
                 break
             errors.append(windows.x[k + 1] - outputs.of(model.states.to_physical(ahead.x)))
@@ -252,7 +259,9 @@ def compare(present: Controller, candidate: Controller,
     with np.errstate(all='ignore'):
         own, new = (acted.squares(one.model, negligible) if whole else _predicted(one, acted)
                     for one in (present, candidate)
-                    for acted in (windows.delayed(one.tuning.dead_times(one.model)),))
+                    for acted in (windows.delayed(np.append(
+                        one.tuning.dead_times(one.model), np.zeros(len(one.model.disturbances)))),
+                                  ))
     known = np.isfinite(own).all(axis=1)
     if not known.any():
         return None

@@ -218,8 +218,10 @@ class ControllerNode(ManagedNode):
                 'watchdog waits: choose a smaller model', throttle_duration_sec=1.0)
             return
         report = outcome.report
+        acting = outcome.state.disturbances
         self._recent.add(
-            event, report.measurement, before.command, self._settings.model_check_length)
+            event, report.measurement, before.command, self._settings.model_check_length,
+            None if acting is None else acting.value)
         self._measured = sample.values
         self._counts.take(report)
         self._report_command(Commanded(report, stamp_ns))

@@ -138,6 +138,25 @@ def test_models_are_told_apart_by_their_dead_time(known, accepted):
     assert bool(np.all(found.ratio <= 2.0)) is accepted
 
 
+@pytest.mark.parametrize('outputs', [None, Outputs(('x1',), ('1',), np.array([[1.0, 0.0]]))])
+@pytest.mark.parametrize(('factor', 'accepted'), [(1.02, True), (0.0, False), (-1.0, False)])
+def test_models_are_told_apart_by_their_measured_disturbances(factor, accepted, outputs):
+    def disturbed(factor):
+        d = Coordinates(('d',), ('1',), *np.array([[5.0], [2.0], [3.0], [7.0]]))
+        return replace(model(), disturbances=d, E=factor * E)
+
+    u, d = random_steps(201), random_steps(201, 1)
+    E = np.array([[0.05], [0.0]])
+    # before a sample acts what was measured at its end
+    x = two_lags(u) + two_lags(d, B=E) + 3.0
+    found = MeasurementBuffer()
+    for k, (value, held, acting) in enumerate(zip(
+            x if outputs is None else x[:, :1], u + 3.0, d + 5.0, strict=True)):
+        found.add(Measurement(round((1 + k) * SECOND), value), ACCEPTED, held, 200.0, acting)
+    ratio = compare(disturbed(1.0), disturbed(factor), found.windows(200.0), outputs).ratio
+    assert bool((ratio < 2.0).all()) is accepted
+
+
 def test_steady_noise_tells_nothing():
     noise = 0.1 * np.random.default_rng(3).normal(size=(300, 2))
     held = np.full((300, 1), 3.0)
