@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import math
 from pathlib import Path
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.signal_topics import plant_defaults, Signals
+from koopman_ros.parameters.signal_topics import plant_defaults, Signals, SignalTopics
 from koopman_ros.parameters.table import (
     ConfigurationError,
     group,
@@ -32,6 +33,7 @@ from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.plants import build, plant_class
 from koopman_ros.ros.node import LoopNode, range_of
 from koopman_ros.ros.node_descriptions import main, POLICY_FILE, tables
+from koopman_ros.ros.training import task_fields
 from koopman_ros.testing import Harness
 
 TABLES = tables()
@@ -351,6 +353,12 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
     assert task['disturbances'] == ('feed_temperature',)
     assert task['input_gain'] == {'temperature': {
         'coolant_temperature': 0.1, 'feed_temperature': 0.2}}
+    wiring = SignalTopics(signals, settings.states, settings.inputs,
+                          disturbances=settings.disturbances)
+    *_, feed = task_fields(SimpleNamespace(resolve_topic_name='/{}'.format), settings, wiring, ()
+                           )['inputs']
+    assert (feed['name'], feed['command']) == ('feed_temperature', None)
+    assert (feed['measured']['topic'], feed['measured']['unit']) == ('/feed_temperature', 'degC')
     assert 'must have 1 rows of 2' in trainer.check(trainer.snapshot({'input_matrix': (0.1,) * 3}))
     assert 'with measured' in trainer.check(trainer.snapshot({'input_matrix_degree': 1}))
     # those of the model where none are named
