@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         'by default those of the model')
     add('--inputs', nargs='+', default=(), metavar='INPUT', help=f'inputs, {signal}')
     add('--disturbances', nargs='+', default=(), metavar='SIGNAL',
-        help=f'signals that are measured and act, but that nobody manipulates, {signal}')
+        help=f'measured disturbances: signals that act but are not manipulated, {signal}')
     add('--time', default='', metavar='COLUMN', help="column of the time, with its unit, as in "
         "'stamp [ms]'; by default the column time")
     add('--period', type=float, default=0.0, metavar='S',

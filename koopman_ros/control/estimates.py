@@ -111,9 +111,9 @@ class StateEstimation:
     def disturbed(self, state: State, values: Array | None, ages: Array | None, time_ns: int
                   ) -> State:
         """
-        Check measured disturbances (n_d,), and count with them from the last sample on.
+        Check measured disturbances (n_d,), which act from the last sample on.
 
-        After a value was held for longer than the time constant of the observer, the change to
+        After a sensor was lost for longer than the time constant of the observer, the change to
         the new value is already part of the estimated disturbance, and is subtracted there.
         """
         signals = self.model.disturbances
@@ -127,8 +127,8 @@ class StateEstimation:
         state, estimate = replace(state, disturbances=found), state.estimate
         if estimate is None:
             return state
-        late = before.held_since(time_ns) * self.tuning.observer_bandwidth > 1.0
-        change = np.where(late, found.value - before.value, 0.0)
+        lost = before.lost_for(signals.names, time_ns) * self.tuning.observer_bandwidth > 1.0
+        change = np.where(lost, found.value - before.value, 0.0)
         if not change.any():
             return state
         level = self.level(state.supervisor)

@@ -42,7 +42,7 @@ class PlantDescription:
     B: Array | Callable[[Array], Array] | None
     #: degree of the polynomial B(x) that is learned where B is None; 0 for a constant one
     input_matrix_degree: int = 0
-    #: inputs that nobody manipulates: measured disturbances, with an effect that does not depend
+    #: inputs that are not manipulated: measured disturbances, with an effect that does not depend
     #: on the state
     disturbance_names: tuple[str, ...] = ()
 

@@ -30,7 +30,7 @@ _BEFORE = 20.0  # s before the step that are drawn
 
 
 @dataclass(frozen=True)
-class _Run:
+class _DisturbedRun:
     """A recorded loop, with the feed temperature; times in s since the first measurement."""
 
     loop: DemoRun
@@ -77,16 +77,16 @@ def run_disturbance(output: Path, speed: float) -> dict[str, object]:
     return result
 
 
-def _read(scenario: Scenario, bag: Path) -> _Run:
+def _read(scenario: Scenario, bag: Path) -> _DisturbedRun:
     wiring = scenario.wiring
     loop = read_run(wiring, bag)
     place = wiring.measured_disturbances[FEED]
     series = read_series(bag, replace(place, topic=f'/{place.topic}'))
-    return _Run(loop, (series.stamp_ns - FIRST_STAMP_NS) / NANOSECONDS,
+    return _DisturbedRun(loop, (series.stamp_ns - FIRST_STAMP_NS) / NANOSECONDS,
                 conversion(place.unit, 'K')(series.values))
 
 
-def _draw(path: Path, runs: dict[str, _Run]) -> None:
+def _draw(path: Path, runs: dict[str, _DisturbedRun]) -> None:
     """Draw feed, temperature and coolant of both loops over the time since the step."""
     with drawing(path, 3, 1, size=(9.0, 8.0), sharex=True) as (figure, panels):
         for (name, run), color in zip(runs.items(), ('tab:green', 'tab:red'), strict=True):

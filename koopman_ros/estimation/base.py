@@ -62,9 +62,8 @@ class Estimate:
     State and disturbance of the plant, in scaled deviations and the model's time unit.
 
     dx/dt = f(x) + B u + w with f the model's drift, the same that the target is
-    calculated from: any difference between the two would be left as an offset. Where a law or a
-    prediction is given it, w includes the effect E d of measured disturbances; what estimators
-    correct does not.
+    calculated from: any difference between the two would be left as an offset. For a law or a
+    prediction w includes the effect E d of measured disturbances; for a correction it does not.
     """
 
     x: Array  #: (n_x,) state

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from koopman_ros.tuning import DisturbanceLimits
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDisturbances:
-    """The values that the controller counts with, and what keeps it from newer ones."""
+    """The values in use, and the reasons for which newer ones are not accepted."""
 
     value: Array  #: (n_d,) last accepted, in their units; the nominal ones before the first
     #: (n_d,) stamps of the accepted measurements; None before the first
@@ -31,10 +32,12 @@ class MeasuredDisturbances:
         return replace(self, times_ns=tuple(
             None if time is None else time + by_ns for time in self.times_ns))
 
-    def held_since(self, time_ns: int) -> Array:
-        """Return for how many seconds (n_d,) each value has been held; infinity for a nominal."""
+    def lost_for(self, names: Sequence[str], time_ns: int) -> Array:
+        """Return for how many seconds (n_d,) each was not measured; infinity before the first."""
+        faulty = {fault.values['signal'] for fault in self.faults}
         return np.array([np.inf if time is None else (time_ns - time) / NANOSECONDS
-                         for time in self.times_ns])
+                         if name in faulty else 0.0
+                         for name, time in zip(names, self.times_ns, strict=True)])
 
 
 def check_disturbances(limits: DisturbanceLimits, signals: Coordinates,

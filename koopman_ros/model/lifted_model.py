@@ -81,7 +81,7 @@ class LiftedModel:
     A lift z = N(x) with dz/dt = A z + J_N(x) B(x) u (paper, equation for control-affine systems).
 
     B is constant without `input_terms`. Measured disturbances d add J_N(x) E d, 0 at their nominal
-    values; they are no inputs, since nobody manipulates them.
+    values; unlike inputs they are not manipulated.
 
     With a pre-feedback K the lift is one of the plant under it, f(x) + B K x, for which there is
     an A where the plant alone is unstable: dz/dt = A z - J_N(x) B K x + J_N(x) B(x) u. Inputs and

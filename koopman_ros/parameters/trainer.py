@@ -71,8 +71,8 @@ class TrainerParameters:
         ('',), 'Inputs with their units, e.g. pump [V]; an empty name: those of the model.',
         read_only=True)
     disturbances_measured: tuple[str, ...] = parameter(
-        ('',), 'Signals with their units that are measured and act on the plant, but that nobody '
-        'manipulates, e.g. feed_temperature [K]; an empty name: those of the model, or none.',
+        ('',), 'Measured disturbances with their units: signals that act on the plant but are not '
+        'manipulated, e.g. feed_temperature [K]; an empty name: those of the model, or none.',
         read_only=True)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)

@@ -110,7 +110,7 @@ def test_a_lost_sensor_holds_the_last_value_and_the_loop_runs_on(measure, code, 
 
 def test_a_sensor_that_comes_back_brings_no_bump():
     """After the observer has compensated the step, its measurement is nothing new."""
-    back = 150
+    back = 150  # s
     found, error = run(controller(), lambda kelvin, seconds: (
         kelvin if seconds < BEGIN or seconds >= back else math.nan), duration=200)
     assert not found.loop.state.disturbances.faults
@@ -121,6 +121,20 @@ def test_a_sensor_that_comes_back_brings_no_bump():
     _, error = run(controller(), lambda kelvin, seconds: (
         kelvin if not BEGIN <= seconds < BEGIN + 3 else math.nan))
     assert np.abs(error).max() < 0.5 * UNMEASURED_PEAK
+
+
+@pytest.mark.parametrize(('timeout', 'moves'), [(np.inf, True), (60.0, False)])
+def test_a_sensor_that_reports_changes_alone_is_not_lost(timeout, moves):
+    """Where a time-out says that it was, the observer has compensated the change already."""
+    loop = controller(limits=DisturbanceLimits(timeout=np.array([timeout])))
+    state = loop.initialise(State(), np.array([300.0]))
+    for second in range(101):
+        old = second < 100
+        state, command, _ = loop.step(
+            state, np.array([START]), (second + 1) * SECOND, None, None,
+            np.array([NOMINAL if old else NOMINAL + STEP]), np.array([float(second) * old]))
+    # as fast as the coolant may
+    assert command == pytest.approx(299.0 if moves else 300.0, abs=0.01)
 
 
 def test_a_model_takes_over_and_a_record_keeps_the_disturbance():
