@@ -130,6 +130,9 @@ class Tuning:
     recovery_time: float = parameter(
         10.0, 'Time for which a better law must be available before it takes over again.', 's',
         0.0, 86400.0)
+    safe_latch: bool = parameter(
+        False, 'Keep the safe inputs, once commanded, until an operator clears them by '
+               '~/clear_safe_state, also over a restart.')
     bumpless_transfer_time: float = parameter(
         0.0, 'Time constant of the bumpless transfer after a change of law, model, tuning or '
              'mode.',

@@ -5,6 +5,7 @@
 
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import (
+    ClearSafeState,
     Event,
     Initialisation,
     ManualCommand,
@@ -26,6 +27,7 @@ __all__ = [
     'MANUAL',
     'SAFE',
     'Arrival',
+    'ClearSafeState',
     'Controller',
     'Event',
     'Feedback',

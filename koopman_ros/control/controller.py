@@ -145,8 +145,27 @@ class Controller(ControlStep):
         except BaseException as error:
             contained(error)
             estimate = None  # the next measurement starts it
-        return replace(state, mode=mode, manual_input=None, supervisor=Supervisor(),
+        supervisor = replace(
+            state.supervisor, better_since_ns=None) if state.supervisor.latched else Supervisor()
+        return replace(state, mode=mode, manual_input=None, supervisor=supervisor,
                        recovery=None, estimate=estimate)
+
+    def clear_safe_state(self, state: State) -> tuple[State, Reason | None]:
+        """
+        Let the laws act again after the safe state has latched.
+
+        In automatic mode one of them must have been possible for `recovery_time`.
+
+        :return: as :meth:`request_setpoint`.
+        """
+        latched, why = state.supervisor.latched, state.supervisor.reason
+        if not latched or why is None:
+            return state, reason(StatusCode.NOT_LATCHED)
+        if state.mode is Mode.AUTOMATIC and why.code is not StatusCode.LATCH_CLEARABLE:
+            return state, reason(
+                StatusCode.LATCH_KEPT, recovery_time=self.order.recovery_time,
+                cause=why if why.cause is None else why.cause)
+        return replace(state, supervisor=Supervisor()), None
 
     # Start and exchange of the controller itself.
 

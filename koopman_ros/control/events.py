@@ -68,8 +68,13 @@ class Initialisation:
     applied: Array  #: (n_u,) measured input in the model's units
 
 
-Event: TypeAlias = (
-    Measurement | Silence | SetpointRequest | ManualCommand | ModeChange | Initialisation)
+@dataclass(frozen=True, slots=True)
+class ClearSafeState:
+    """The operator lets the laws act again after the safe state has latched."""
+
+
+Event: TypeAlias = (Measurement | Silence | SetpointRequest | ManualCommand | ModeChange
+                    | Initialisation | ClearSafeState)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,3 +108,6 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
             return EventOutcome(controller.set_mode(state, event.mode))
         case Initialisation():
             return EventOutcome(controller.initialise(state, event.applied))
+        case ClearSafeState():
+            state, refused = controller.clear_safe_state(state)
+            return EventOutcome(state, refused=refused)

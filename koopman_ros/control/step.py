@@ -231,7 +231,8 @@ class ControlStep(Configuration):
     def _recovery(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> SafeStateRecovery | None:
         """Return how far the plant has come back where the safe input keeps it outside."""
-        if supervisor.level != SAFE or verdict.fault is not None or verdict.accepted is None:
+        if (supervisor.level != SAFE or supervisor.latched or verdict.fault is not None
+                or verdict.accepted is None):
             return None
         if outside > 0.0 and not moves_toward_nominal(
                 self.model, self.estimation.position(state.estimate, verdict.accepted.value),

@@ -61,6 +61,17 @@ class StatusCode(Enum):
     LAW_FAILED = 'law_failed', 'the {level:level} failed: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
     RECOVERING = 'recovering', '{cause} (cleared; waiting for recovery_time)'
+    SAFE_LATCHED = 'safe_latched', (
+        '{cause}; the safe state is latched: remove the cause, then clear it on the panel or by '
+        'the service clear_safe_state')
+    LATCH_CLEARABLE = 'latch_clearable', (
+        '{cause} (gone); the safe state is latched: clear it on the panel or by the service '
+        'clear_safe_state')
+    LATCHED_BEFORE = 'latched_before', 'the safe state was reached before the restart'
+    NOT_LATCHED = 'not_latched', 'the safe state is not latched: there is nothing to clear'
+    LATCH_KEPT = 'latch_kept', (
+        'the safe state stays latched until a control law has been possible for '
+        '{recovery_time:g} s: {cause}')
     LOST_HERE = 'lost_here', (
         'in the acceptance test the {level:level} did not reach the set-point from a state like '
         'this one, but a linear law did')

@@ -33,7 +33,8 @@ VERSION = 1
 EVENTS: dict[str, type[events.Event]] = {
     'measurement': events.Measurement, 'silence': events.Silence,
     'setpoint': events.SetpointRequest, 'manual_command': events.ManualCommand,
-    'mode': events.ModeChange, 'initialisation': events.Initialisation}
+    'mode': events.ModeChange, 'initialisation': events.Initialisation,
+    'clear_safe_state': events.ClearSafeState}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
 _FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
 _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
@@ -98,7 +99,8 @@ def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, d
             'command': _written(outcome.command),
             'setpoint': None if report.target is None else numbers(report.target.setpoint),
             'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
-    elif isinstance(event, (events.SetpointRequest, events.ManualCommand)):
+    elif isinstance(event, (
+            events.SetpointRequest, events.ManualCommand, events.ClearSafeState)):
         written |= {'accepted': outcome.refused is None, 'reason': _codes(outcome.refused)}
     return name, written
 

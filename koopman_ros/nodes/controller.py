@@ -46,6 +46,7 @@ from koopman_ros.ros.controller_messages import RecordPublisher, ReportPublisher
 from koopman_ros.ros.diagnostics import TaskReport
 from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
+from koopman_ros.ros.latch_file import LatchFile
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.measurements import Measurements, Sample
 from koopman_ros.ros.model_reload import ModelReload
@@ -88,6 +89,7 @@ class ControllerNode(ManagedNode):
         self._loaded: LoadedModel | None = loaded
         # before the node became inactive: its last command is still in force at the plant
         self._last = State()
+        self._latch = LatchFile(self)
 
     def configure(self) -> None:
         """Load the model and create the loop, which does not command yet."""
@@ -155,7 +157,8 @@ class ControllerNode(ManagedNode):
         """Begin to command, from the present inputs; earlier set-point requests are kept."""
         with self._loop.lock:
             self._timing, self._received = Timing(self), time.monotonic()
-            self._loop.begin(self._timing, self._last)
+            self._loop.begin(self._timing, self._last,
+                             self._settings.tuning.safe_latch and self._latch.marked)
             self._measurements.begin(
                 self._timing, lambda: self._settings.measurement_timeout or _SOURCES_WINDOW,
                 lambda: self._loop.state.command is not None)
@@ -166,6 +169,7 @@ class ControllerNode(ManagedNode):
         with self._loop.lock:
             self._loop.active = False
             self._measurements.end()
+            self._latch.update(self._loop.state.supervisor.latched)
             if self._loop.state.command is not None:
                 self._last = self._loop.state
 
@@ -230,6 +234,8 @@ class ControllerNode(ManagedNode):
         if self._loop.state.command is None or not self.active or all(
                 map(topics.has_subscribers, self._commands.publishers)):
             self._received = time.monotonic()
+        if self.active:
+            self._latch.update(self._loop.state.supervisor.latched)
         if self._status_pending:
             self._publish_status(self._report, time.monotonic())
         with self._loop.lock:

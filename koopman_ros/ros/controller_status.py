@@ -34,6 +34,7 @@ TASKS = (CONTROL, *CONDITIONS)
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
 _WAY_BACK = 'recovering: the {} moves from its safe value towards the nominal one'
 _INACTIVE = 'inactive'
+_LATCHED = 'the safe state is latched'
 
 
 @dataclass
@@ -158,6 +159,7 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
             now.timing.busy and now.timing.wall_silence > timeout)):
         command = now.state.command
         doing = '' if command is None else f', {now.commanded(command)}'
+        doing += f', {_LATCHED}' if now.state.supervisor.latched else ''
         action = 'manual mode' if mode is Mode.MANUAL else (
             _ACTIONS[HOLD] if report.depth == 0 else _action(now))
         if now.timing.busy:
@@ -177,6 +179,9 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
         level = Severity.ERROR if report.level in _ACTIONS else Severity.WARN
         action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
         return level, f'{action}: {now.reason}'
+    if now.state.supervisor.latched:
+        return Severity.WARN, (f'{mode.value}: {_LATCHED}, and is commanded in automatic mode: '
+                               'clear it on the panel or by the service clear_safe_state')
     return Severity.OK, ''
 
 
@@ -293,6 +298,8 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'active law': level_words(report.level),
         'law': law.form or 'none',
         'reason': now.reason or 'none',
+        **({'safe state': 'latched' if state.supervisor.latched else 'not latched'}
+           if now.parameters.tuning.safe_latch else {}),
         **now.model(),
         **values_by_name(signals.states, now.measured.tolist()),
         **labelled(controlled, 'set-point', None if target is None else target.setpoint),

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 from rclpy.node import Node
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.control import events, Mode
 from koopman_ros.core.arrays import Array
@@ -47,6 +47,7 @@ class OperatorRequests:
             SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.inputs,
                              self._on_manual)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
+        node.create_service(Trigger, '~/clear_safe_state', self._on_clear_safe_state)
 
     @property
     def complaint(self) -> str:
@@ -87,6 +88,15 @@ class OperatorRequests:
         self._change(events.ModeChange(mode))
         response.success, response.message = True, f'{mode.value} mode'
         self._log.info(response.message)
+        self._changed()
+        return response
+
+    def _on_clear_safe_state(self, _: Trigger.Request, response: Trigger.Response
+                             ) -> Trigger.Response:
+        response.success = self._change(events.ClearSafeState())
+        response.message = 'safe state cleared' if response.success else self._note
+        if response.success:
+            self._log.info(response.message)
         self._changed()
         return response
 

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 import itertools
 import math
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,6 +15,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
@@ -329,6 +331,27 @@ def test_what_the_operator_requests_is_done_without_measurements(ros: Harness) -
     for before, after in itertools.pairwise(own):
         passed = seconds(after) - seconds(before)
         assert abs(after.temperature - before.temperature) <= 4.0 * min(passed, 1.0) + 1e-6
+
+
+def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
+        ros: Harness, tmp_path: Path) -> None:
+    ros.environment['ROS_HOME'] = str(tmp_path)
+    patience = {'safe_latch': True, 'recovery_time': 2.0}
+    bench = Bench(ros, {**patience, 'measurement_timeout': 0.3, 'hold_timeout': 0.2})
+    found = bench.status(lambda s: 'the safe state is latched' in s.message)
+    assert (value(found, 'safe state'), found.level) == ('latched', DiagnosticStatus.ERROR)
+    assert bench.process.stop() == 0
+    bench = Bench(ros, patience)
+    answer = ros.call(Trigger, 'controller/clear_safe_state', Trigger.Request())
+    assert not answer.success
+    assert 'the safe state was reached before the restart' in answer.message
+    for k in range(2, 5):
+        assert bench.measure(STEADY, float(k)).temperature < STEADY
+    bench.status(lambda s: 'clear it on the panel or by the service' in s.message)
+    assert ros.call(Trigger, 'controller/clear_safe_state', Trigger.Request()).success
+    bench.measure(STEADY, 5.0)
+    assert value(bench.status(), 'active law') == 'learned law'
+    ros.wait_until(lambda: not [*tmp_path.rglob('*.latched')])
 
 
 def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(
