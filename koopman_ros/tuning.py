@@ -54,9 +54,20 @@ class SensorLimits:
         'measured', 0.0, 'Largest change between two measurements due to noise alone; 0: no '
                          'check.',
         name='max_step', none=ANY)
+    report_on_change: Array = column(
+        'measured', 0.0, 'Heartbeat of a sensor that reports changes only: the signal counts as '
+                         'unchanged for so long after each message; 0: it reports each sample.',
+        's', maximum=86400.0, read_only=True)
+    deadband: Array = column(
+        'measured', 0.0, 'Largest change that such a sensor does not report.')
     stuck_sensor_timeout: float = parameter(
         20.0, 'Time after which an unchanged measurement counts as a stuck sensor, if the model '
               'moved by more than half of max_step; 0: no check.', 's', 0.0, 86400.0)
+
+    @property
+    def unreported(self) -> Array:
+        """The largest change (n_y,) that a sensor does not report."""
+        return np.where(self.report_on_change > 0.0, self.deadband, 0.0)
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,8 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         max(slowest, 1.0 / _LONGEST))
     noise = np.where(tuning.measurement_noise > 0.0, tuning.measurement_noise, np.where(
         recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half))
+    # the error of a value that is not reported is uniformly distributed
+    noise = np.hypot(noise, tuning.sensor.unreported / math.sqrt(3.0))
     dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
     if dead_time > 0.0:
         # at one sample a second the bandwidth of a filter is the root of the ratio between the

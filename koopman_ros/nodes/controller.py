@@ -139,8 +139,7 @@ class ControllerNode(ManagedNode):
         self._commands = SignalPublisher(wiring.commands, self._signals.inputs, endpoints.publish)
         self._reports = ReportPublisher(endpoints, wiring)
         self._measurements = Measurements(
-            self, endpoints, wiring, exclusive, self._settings.synchronisation_tolerance,
-            self._answer)
+            self, endpoints, wiring, exclusive, self._settings, self._answer)
         self._requests = OperatorRequests(
             self, endpoints, wiring, self._loop, self._measurements.applied,
             lambda: self._diagnostics.publish_if_changed())
@@ -292,7 +291,8 @@ class ControllerNode(ManagedNode):
         loop = self._loop
         situation = status.StatusContext(
             loop.controller, self._settings, self._signals, loop.state, self._report,
-            self._counts, self._timing, self._measurements.assembler, self._measured,
+            self._counts, self._timing, self._measurements.assembler, self._measurements.awaited,
+            self._measured,
             complaint=self._endpoints.complaint or self._measurements.complaint,
             unheard=[publisher.topic_name for publisher in self._commands.publishers
                      if not topics.has_subscribers(publisher)],

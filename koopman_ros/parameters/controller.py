@@ -64,6 +64,9 @@ class ControllerParameters:
         0.0, 'Largest difference between the stamps of messages that belong to one '
              'measurement.', 's',
         0.0, 10.0, read_only=True)
+    sample_time: float = parameter(
+        1.0, 'Time between two commands if all measured signals have a report_on_change.', 's',
+        0.01, 3600.0, read_only=True)
     tuning: Tuning = nested(Tuning)
     measurement_timeout: float = parameter(
         10.0, 'Plant time without a newer measurement after which the inputs are held and '
@@ -144,6 +147,8 @@ def _dynamics(model: LiftedModel) -> dict[str, Any]:
     # a window, a fifth of it, is to show the slowest mode, and not to let an unstable one run off
     shown = max(slowest, 0.1 * fastest, float(np.max(modes.real)), 1e-3)
     return {**levels,
+            'sample_time': (
+                min(max(float(f'{0.1 / fastest:.2g}'), 0.01), 1.0) if fastest > 0.0 else 1.0),
             'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
             'bumpless_transfer_time': (
                 min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0),

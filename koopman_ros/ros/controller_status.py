@@ -72,6 +72,7 @@ class StatusContext:
     counts: Counts
     timing: Timing
     assembler: SampleSynchronizer  #: of the measurements
+    missing: str  #: parts of a measurement that are missing, or empty
     measured: Array  #: (n_y,) last measured, in the units of the signals
     complaint: str  #: problem on the graph, e.g. a second controller; or empty
     unheard: Sequence[str]  #: topics of the commands without a subscriber
@@ -94,7 +95,7 @@ class StatusContext:
     @property
     def awaited(self) -> str:
         """Parts of a measurement that are missing, or empty."""
-        return f' of {self.assembler.awaited}' if self.assembler.awaited else ''
+        return f' of {self.missing}' if self.missing else ''
 
     def commanded(self, command: Array) -> str:
         """Write a command (n_u,) with names and units."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The latch of the safe state over a restart of the process, which may be nobody's decision."""
+"""The latch of the safe state, kept over a restart of the process, e.g. a respawn."""
 
 import os
 from pathlib import Path

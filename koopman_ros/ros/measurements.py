@@ -6,10 +6,13 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, SignalTopics
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
@@ -29,17 +32,32 @@ class Measurements:
     """
     Hand over measurements when they are complete.
 
+    A signal that is reported on change has its last value until its heartbeat is over. If all
+    signals are, there is a measurement every `sample_time`.
+
     :param exclusive: topics on which only one node may publish.
-    :param tolerance: s by which stamps of one measurement may differ.
     :param answer: called with each measurement.
     """
 
     def __init__(self, node: HostedNode, endpoints: topics.EndpointMonitor, wiring: SignalTopics,
-                 exclusive: Mapping[str, str], tolerance: float,
+                 exclusive: Mapping[str, str], settings: ControllerParameters,
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals
-        self._endpoints = endpoints
-        self.assembler = SampleSynchronizer(tuple(signals.states), round(tolerance * NANOSECONDS))
+        self._endpoints, self._names = endpoints, tuple(signals.states)
+        #: ns for which the last value holds, by signal that is reported on change
+        self._heartbeats = {
+            name: round(seconds * NANOSECONDS) for name, seconds in zip(
+                signals.states, settings.tuning.sensor.report_on_change.tolist(), strict=True)
+            if seconds > 0.0}
+        self._clock = node.get_clock()
+        self._reported: dict[str, tuple[int, float]] = {}  # when it came, in ns, and value
+        self.assembler = SampleSynchronizer(
+            tuple(name for name in signals.states if name not in self._heartbeats),
+            round(settings.synchronisation_tolerance * NANOSECONDS))
+        if not self.assembler.names:
+            self._ticked_ns = -1
+            self._shortest_ns = round(0.5 * settings.sample_time * NANOSECONDS)
+            node.create_timer(settings.sample_time, node.guarded(self._on_sample_time))
         self.applied = MeasuredInputs(signals.inputs)
         self.frame_id, self._frame_length = '', 0
         # by topic of the measurements with one publisher: the numbers of its messages
@@ -76,6 +94,16 @@ class Measurements:
         self._wait.clear()
 
     @property
+    def awaited(self) -> str:
+        """The signals that are missing in the next measurement, or an empty string."""
+        return self.assembler.awaited or ', '.join(self._silent(self._clock.now().nanoseconds))
+
+    def _silent(self, now_ns: int) -> list[str]:
+        """Return the signals whose heartbeat is over."""
+        return [name for name, heartbeat_ns in self._heartbeats.items() if name not in
+                self._reported or now_ns - self._reported[name][0] > heartbeat_ns]
+
+    @property
     def complaint(self) -> str:
         """The defect of the messages, or an empty string."""
         return '' if self._frame_length <= LONGEST_FRAME_ID else (
@@ -86,7 +114,13 @@ class Measurements:
         self.frame_id = received.frame_id[:LONGEST_FRAME_ID]
         self._frame_length = len(received.frame_id)
         late = self.assembler.late.total()
-        complete = self.assembler.take(received.stamp_ns, received.values)
+        sampled = {name: value for name, value in received.values.items()
+                   if name not in self._heartbeats}
+        complete = self.assembler.take(received.stamp_ns, sampled) if sampled else None
+        if self._heartbeats:
+            now_ns = self._clock.now().nanoseconds
+            self._reported |= {name: (now_ns, value) for name, value in received.values.items()
+                               if name in self._heartbeats}
         if not self._active:
             return
         source, at = self._sources.get(received.topic), self._timing.now()
@@ -94,12 +128,26 @@ class Measurements:
             source.take(received.number, at[0], self._window())
         if self.assembler.late.total() > late:
             self._timing.ignore(at)
-        if complete is None:
+        if complete is not None:
+            self._sampled(complete[0], dict(zip(
+                self.assembler.names, complete[1].tolist(), strict=True)))
+
+    def _on_sample_time(self) -> None:
+        now_ns = self._clock.now().nanoseconds
+        # simulated time may stand between two calls that are late
+        if self._active and not 0 <= now_ns - self._ticked_ns < self._shortest_ns:
+            self._ticked_ns = now_ns
+            self._sampled(now_ns, {})
+
+    def _sampled(self, stamp_ns: int, sampled: Mapping[str, float]) -> None:
+        """Hand over a measurement, unless a signal is missing."""
+        if self._heartbeats and self._silent(self._clock.now().nanoseconds):
             return
-        sample = Sample(*complete, two_sources=any(
-            one.conflict or (one.newest is None and self._endpoints.shared(topic))
-            for topic, one in self._sources.items()))
-        self._wait.take(sample)
+        values = {**sampled, **{name: value for name, (_, value) in self._reported.items()}}
+        self._wait.take(Sample(
+            stamp_ns, np.array([values[name] for name in self._names]), two_sources=any(
+                one.conflict or (one.newest is None and self._endpoints.shared(topic))
+                for topic, one in self._sources.items())))
 
     def _on_applied(self, received: SignalSample) -> None:
         self.applied.take(received)

@@ -15,6 +15,7 @@ from koopman_ros.control import (
     Controller,
     Initialisation,
     InputLimits,
+    SensorLimits,
     SetpointRequest,
     State,
     Tuning,
@@ -285,9 +286,12 @@ def test_noise_that_is_not_given_is_that_of_the_record():
     known = replace(model, provenance=replace(
         model.provenance, metrics={f'noise_{name}': 0.125}))
     half = 0.5 * (model.states.upper[0] - model.states.lower[0])
-    for noise, one, expected in ((0.0, model, 1e-3 * half), (0.0, known, 0.125),
-                                 (0.5, known, 0.5)):
-        given = Tuning.for_model(one, measurement_noise=noise)
+    for noise, one, deadband, expected in (
+            (0.0, model, 0.0, 1e-3 * half), (0.0, known, 0.0, 0.125), (0.5, known, 0.0, 0.5),
+            (0.3, known, 0.4 * np.sqrt(3.0), 0.5)):
+        given = Tuning.for_model(one, measurement_noise=noise, sensor=SensorLimits(
+            np.full(1, -1e9), np.full(1, 1e9), report_on_change=np.ones(1),
+            deadband=np.array([deadband])))
         assert uncertainty(one, outputs, given)[0] == pytest.approx([expected], rel=1e-12)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
@@ -352,6 +352,67 @@ def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
     bench.measure(STEADY, 5.0)
     assert value(bench.status(), 'active law') == 'learned law'
     ros.wait_until(lambda: not [*tmp_path.rglob('*.latched')])
+
+
+def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: Harness) -> None:
+    ros.start('controller', {
+        'temperature.report_on_change': 60.0, 'temperature.deadband': 0.2, 'sample_time': 0.5,
+        'measurement_timeout': 5.0, 'coolant_temperature.rate_limit': 0.0, 'use_sim_time': True})
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    clock, ask, manual, thermometer = (
+        ros.speak(kind, topic, to='controller') for kind, topic in (
+            (Clock, topics.CLOCK), (Temperature, reactor.SETPOINT),
+            (Temperature, reactor.MANUAL_COOLANT_SETPOINT), (Temperature, reactor.TEMPERATURE)))
+    now = 10.0
+
+    def pass_until(condition: Callable[[], bool], step: float = 0.25) -> None:
+        def found() -> bool:
+            nonlocal now
+            now += step
+            clock.publish(Clock(clock=temperature(0.0, now).header.stamp))
+            return condition()
+
+        ros.wait_until(found)
+
+    def told(level: bytes, words: str) -> bool:
+        status = ros.last_status(STATUS)
+        return status is not None and status.level == level and words in status.message
+
+    # stamped by another clock, and the only one
+    thermometer.publish(temperature(STEADY, 5.0))
+    pass_until(lambda: len(commands) > 5)
+    assert np.diff([seconds(m) for m in commands]).min() >= 0.25
+    held = commands[-1].temperature
+    ask.publish(temperature(STEADY - 5.0))
+    pass_until(lambda: commands[-1].temperature < held - 1.0)
+    ros.set_bool('controller/set_automatic', False)
+    manual.publish(temperature(20.0))
+    pass_until(lambda: commands[-1].temperature == pytest.approx(20.0))
+    pass_until(lambda: told(DiagnosticStatus.OK, 'manual'))
+    # behind its heartbeat the signal is missing
+    pass_until(lambda: told(
+        DiagnosticStatus.ERROR, 'no measurement of temperature for more than 5 s'), 2.0)
+    assert now > 60.0 + 5.0
+
+
+def test_a_signal_that_is_reported_on_change_is_in_each_measurement(ros: Harness) -> None:
+    ros.start('controller', {'system': 'two_tanks', 'level_1.report_on_change': 100.0})
+    commands = ros.listen(JointState, 'pump_1_setpoint')
+    sensors = {name: ros.speak(JointState, name, to='controller')
+               for name in ('level_1', 'level_2')}
+
+    def send(name: str, metres: float, time: float) -> None:
+        message = JointState(name=[name], position=[metres])
+        message.header.stamp = temperature(0.0, time).header.stamp
+        sensors[name].publish(message)
+
+    send('level_2', 0.15, 1.0)
+    ros.wait_for_status(STATUS, lambda s: 'first measurement of level_1' in s.message)
+    send('level_1', 0.12, 0.5)
+    ros.meet('controller')
+    for time in (2.0, 3.0, 4.0):
+        send('level_2', 0.15, time)
+    ros.wait_until(lambda: [seconds(message) for message in commands] == [2.0, 3.0, 4.0])
 
 
 def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(
