@@ -116,6 +116,9 @@ class Tuning:
     measurement_noise: Array = column(
         'measured', 0.0, 'Standard deviation of the measurement noise (Kalman filters); 0: that '
                          'of the training data.')
+    uncertain_noise_factor: float = parameter(
+        3.0, 'Factor of the measurement noise of a signal while its quality is uncertain (Kalman '
+             'filters).', '', 1.0, 1e6)
     disturbance_noise: Array = column(
         'inputs', 0.0, "Standard deviation of the input disturbance's random walk in one minute "
                        '(Kalman filters); 0: derived from the model.')

@@ -16,7 +16,7 @@ from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import StatusCode
+from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import check, Estimate, PendingInputs, Standstill, Verdict
 from koopman_ros.model import LiftedModel
@@ -33,6 +33,7 @@ class Observation:
     outside: float  #: its distance from the training data, in half-ranges
 
 
+UNCERTAIN = 1  #: quality of a measurement; better is 0, worse are bad
 # After so many time constants without an accepted measurement the state is not known.
 _LOST = 2.0
 # So many intervals between measurements are a gap.
@@ -95,12 +96,13 @@ class StateEstimation:
         return (replace(state, applied=state.applied.corrected(u)),
                 bool((u == state.command).all()))
 
-    def observe(self, state: State, y: Array, time_ns: int, elapsed: float
-                ) -> tuple[State, Observation]:
+    def observe(self, state: State, y: Array, time_ns: int, elapsed: float,
+                quality: tuple[int, ...] | None = None) -> tuple[State, Observation]:
         """
         Check a measurement (n_y,) and take it into account.
 
         :param elapsed: seconds since the last command.
+        :param quality: (n_y,) as of :class:`~koopman_ros.control.Measurement`.
         :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
         before, last = state.estimate, state.accepted
@@ -121,14 +123,17 @@ class StateEstimation:
             assert moved is not None
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
 
-        verdict = check(self.tuning.sensor, self.outputs, last, y, time_ns, w, travel)
+        bad = [name for name, level in zip(self.outputs.names, quality or (), strict=False)
+               if level > UNCERTAIN]
+        verdict = Verdict(last, reason(StatusCode.BAD_QUALITY, signal=bad[0])) if bad else check(
+            self.tuning.sensor, self.outputs, last, y, time_ns, w, travel)
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
             far = outside > max(level.law.margin for level in self.levels.values())
             predicted = self._corrected(
                 state, predicted, verdict, x, time_ns, elapsed,
-                far or self._lost(state, time_ns))
+                far or self._lost(state, time_ns), quality)
             if not isinstance(predicted, Estimate):
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
@@ -167,13 +172,17 @@ class StateEstimation:
         return x
 
     def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   time_ns: int, elapsed: float, lost: bool) -> Estimate:
+                   time_ns: int, elapsed: float, lost: bool, quality: tuple[int, ...] | None
+                   ) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
         :param lost: whether the model's prediction is worth nothing, after so long or so far out.
         """
         xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
+        if quality is not None:
+            estimator = estimator.with_noise(np.where(
+                np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0))
         if predicted is None:
             # the input that acts, it is assumed, held the plant where it is
             return estimator.restart(

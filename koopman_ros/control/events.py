@@ -26,6 +26,8 @@ class Measurement:
     applied: Array | None = None  #: (n_u,) measured input that goes with it, or None
     #: how many of the seconds since the last stamp the rate limit may count, or None for all
     seconds: float | None = None
+    #: (n_y,) 0 good, 1 uncertain, more bad, which counts as missing; None for good
+    quality: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +95,7 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
     match event:
         case Measurement():
             return EventOutcome(*controller.step(state, event.measured, event.stamp_ns,
-                                                 event.applied,
-                                                 event.seconds))
+                                                 event.applied, event.seconds, event.quality))
         case Silence():
             return EventOutcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():

@@ -103,6 +103,7 @@ class MeasurementReport:
     #: whether its stamp was earlier than the last by more than 1 s, which resets time
     clock_went_back: bool = False
     follows: bool = True  #: whether the applied input, if measured, equals the command
+    uncertain: tuple[str, ...] = ()  #: signals of uncertain quality
 
 
 NOTHING_MEASURED = MeasurementReport()

@@ -18,6 +18,7 @@ import numpy as np
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
 from koopman_ros.control.configuration import Configuration
+from koopman_ros.control.estimates import UNCERTAIN
 from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws.base import LawResult, Target
 from koopman_ros.control.recovery import moves_toward_nominal, SafeStateRecovery
@@ -49,7 +50,8 @@ class ControlStep(Configuration):
     """The step of a configured loop; every method is pure and returns a new state."""
 
     def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
-             countable: float | None = None) -> tuple[State, Array, StepReport]:
+             countable: float | None = None, quality: tuple[int, ...] | None = None
+             ) -> tuple[State, Array, StepReport]:
         """
         Answer one measurement.
 
@@ -63,6 +65,8 @@ class ControlStep(Configuration):
             :meth:`StateEstimation.applied`.
         :param countable: largest number of seconds since the last stamp that ramp and rate limit
             count, from another clock; None for any.
+        :param quality: (n_y,) 0 good, 1 uncertain, more bad, which counts as missing; None for
+            good.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         :raises ValueError: for a measurement or an input of another size.
@@ -83,14 +87,16 @@ class ControlStep(Configuration):
 
         def calculate() -> tuple[State, Array, StepReport]:
             known, follows = self.estimation.applied(state, applied)
-            now, seen = self.estimation.observe(known, y, time_ns, time.elapsed)
+            now, seen = self.estimation.observe(known, y, time_ns, time.elapsed, quality)
             accepted = seen.verdict.fault is None
             if accepted:
                 now = self._advanced(now, seen.x, time)
             return self._command(now, seen.verdict, MeasurementReport(
                 Arrival.ACCEPTED if accepted else Arrival.REJECTED,
                 seen.outside if accepted else self._outside(state.estimate, y), seen.expected,
-                missed, back, follows), time)
+                missed, back, follows, tuple(
+                    name for name, level in zip(self.measured.names, quality or (), strict=False)
+                    if level == UNCERTAIN)), time)
 
         return self._contained(
             calculate, state, MeasurementReport(

@@ -48,6 +48,8 @@ class StatusCode(Enum):
     FROZEN = 'sensor_frozen', (
         'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s while '
         'the model moved by more than {change:change}: the sensor may be stuck; check it')
+    BAD_QUALITY = 'bad_quality', (
+        'the quality of the measured {signal} is bad: check the sensor')
     NO_MEASUREMENT = 'no_measurement', 'no measurement received: check sensor and plant'
     STAMPS_STAND = 'stamps_do_not_advance', (
         'measurements are received, but their stamps do not advance: check the clock of the '

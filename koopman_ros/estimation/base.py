@@ -142,6 +142,10 @@ class Estimator(ABC):
         :param u: (n_u,) input that is assumed to hold the plant there, or None.
         """
 
+    def with_noise(self, factor: Array) -> Estimator:
+        """Return the estimator for measurements with (n_y,) times the noise; itself by default."""
+        return self
+
     def transferred(self, estimate: Estimate, rate: Array) -> Estimate:
         """
         Take over an estimate from another model, so that the plant's estimated rate stays.

@@ -3,6 +3,7 @@
 
 """Nonlinear Kalman filters on the model's drift: states that are not measured, disturbances."""
 
+import copy
 from dataclasses import replace
 from functools import cached_property
 import math
@@ -216,6 +217,12 @@ class ExtendedKalmanFilter(Estimator):
         return Estimate(
             predicted.x + step[:n], self.bounded(predicted.w + step[n:]), 0.5 * (P + P.T),
             _averaged(predicted.innovation, innovation / np.sqrt(np.diag(S)), square))
+
+    def with_noise(self, factor: Array) -> Estimator:
+        """Return the filter for measurements with (n_y,) times the noise."""
+        other = copy.copy(self)
+        other._R = np.diag((factor * self._noise) ** 2)
+        return other
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
         """Start from a state (n_x,) with the measured outputs; see the observer's."""

@@ -110,7 +110,8 @@ def event_of(record: EventRecord) -> events.Event:
     if record.event not in EVENTS:
         raise ValueError(f'unknown event {record.event!r}')
     kind = EVENTS[record.event]
-    return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]})
+    return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]
+                   if name in record.fields})
 
 
 def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
@@ -143,8 +144,8 @@ def _read(name: str, value: Any) -> Any:
         return Mode[value.upper()]
     if name == 'cause':
         return None if value is None else StatusCode(value)
-    if name == 'signals':
-        return None if value is None else tuple(map(str, value))
+    if name in ('signals', 'quality'):
+        return None if value is None else tuple(map(str if name == 'signals' else int, value))
     return value if value is None or isinstance(value, (int, float)) else float_array(value)
 
 

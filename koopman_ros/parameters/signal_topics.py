@@ -34,10 +34,13 @@ CLOCK = '/clock'
 #: the default system
 DEFAULT_SYSTEM = 'reactor'
 
+QUALITY = '1'  #: unit of a quality
+
 LONGEST_FRAME_ID = 256  # characters that are passed on
 
 # The places of signals: of states, then of inputs.
-KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual')
+KINDS = ('measured', 'quality', 'setpoints', 'active_setpoints', 'predicted', 'applied',
+         'commands', 'manual')
 PLANT_KINDS = ('measured', 'applied', 'commands')
 SIGNALS = ('states_measured', 'inputs_commanded', 'controlled')  # parameters that name them
 
@@ -64,6 +67,11 @@ class MeasuredPlace:
 class StatePlaces(MeasuredPlace):
     """Where a measured state is; its set-points and prediction have the same type and field."""
 
+    quality_topic: str = _topic('Topic of the quality of the measurements, as levels of '
+                                'DiagnosticStatus: 0 good, 1 uncertain, above bad; empty: none.')
+    quality_type: str = parameter(
+        'std_msgs/msg/UInt8', 'Message type of the quality.', read_only=True,
+        choices=('std_msgs/msg/UInt8', 'diagnostic_msgs/msg/DiagnosticStatus'))
     setpoint_topic: str = _topic('Topic of requested set-points.')
     active_setpoint_topic: str = _topic('Topic of the active set-point.')
     predicted_topic: str = _topic('Topic of the predicted measurement.')
@@ -220,6 +228,12 @@ class SignalTopics:
     commands = _role('inputs', 'command_topic', commanded=True)
     manual = _role('inputs', 'manual_topic', commanded=True)
     applied = _role('inputs', 'topic')
+
+    @cached_property
+    def quality(self) -> dict[str, MessageField]:
+        """Qualities of the measurements that have one."""
+        return {name: _place(given.quality_topic, name, QUALITY, {'type': given.quality_type})
+                for name, given in self.states.items() if given.quality_topic}
 
     def check(self) -> str:
         """Return their defect in words, or an empty string."""

@@ -281,9 +281,11 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     own = plant_defaults(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
-    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, CONTROLLER_INTERNALS,
-                          PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS, EVENT_LOG,
-                          AUDIT_LOG, DIAGNOSTICS)
+    wiring = _wiring(signals, {**own, **given})
+    usual = (*wiring.topics, CONTROLLER_INTERNALS, PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS,
+             EVENT_LOG, AUDIT_LOG, DIAGNOSTICS)
+    own['topics'] = tuple(dict.fromkeys((*own.get('topics', usual), *(
+        place.topic for place in wiring.quality.values()))))
     if present is not None:
         states, inputs = present.states, present.inputs
         defaults |= {
@@ -423,7 +425,7 @@ def player_table(given: Mapping[str, Any] = MappingProxyType({})
     if (wiring := preset_wiring(system)) is not None:
         defaults |= {
             'topics': tuple(dict.fromkeys(place.topic for places in (
-                wiring.applied, wiring.measured, wiring.setpoints, wiring.manual)
+                wiring.applied, wiring.quality, wiring.measured, wiring.setpoints, wiring.manual)
                 for place in places.values())),
             'measurement': tuple(dict.fromkeys(
                 place.topic for place in wiring.measured.values())),

@@ -220,6 +220,10 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         yield MEASUREMENTS, (
             f'the last measurement is {now.timing.silence:.0f} s old: commands are based on the '
             'model only; check sensor and plant')
+    if report.measurement.uncertain:
+        yield MEASUREMENTS, (
+            f'the quality of {" and ".join(report.measurement.uncertain)} is uncertain: a Kalman '
+            f'filter assumes {tuning.uncertain_noise_factor:g} times the noise; check the sensor')
     if now.timing.without_clock:
         yield MEASUREMENTS, (
             'use_sim_time is set, but /clock is not published: time-outs use the wall clock; set '

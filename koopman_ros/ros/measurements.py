@@ -13,7 +13,7 @@ from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, SignalTopics
+from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, QUALITY, SignalTopics
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.signals import InputWait, MeasuredInputs, SignalSample, SignalSubscriber
@@ -26,6 +26,7 @@ class Sample(NamedTuple):
     stamp_ns: int
     values: Array  #: (n_y,) in the units of the signals
     two_sources: bool  #: whether several publishers send such measurements in turn
+    quality: tuple[int, ...] | None  #: (n_y,) as of an event; None where all are good
 
 
 class Measurements:
@@ -68,6 +69,10 @@ class Measurements:
         # the first command begins from them
         self._wait = InputWait[Sample](node, lambda: (
             not self._begun() and not self.applied.complete and self._inputs.published()), answer)
+        self._quality: dict[str, float] = {}
+        SignalSubscriber(node, endpoints.subscribe, wiring.quality,
+                         dict.fromkeys(wiring.quality, QUALITY),
+                         lambda received: self._quality.update(received.values))
         measured = SignalSubscriber(
             node, endpoints.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:
@@ -144,10 +149,11 @@ class Measurements:
         if self._heartbeats and self._silent(self._clock.now().nanoseconds):
             return
         values = {**sampled, **{name: value for name, (_, value) in self._reported.items()}}
+        quality = tuple(int(self._quality.get(name, 0)) for name in self._names)
         self._wait.take(Sample(
-            stamp_ns, np.array([values[name] for name in self._names]), two_sources=any(
+            stamp_ns, np.array([values[name] for name in self._names]), any(
                 one.conflict or (one.newest is None and self._endpoints.shared(topic))
-                for topic, one in self._sources.items())))
+                for topic, one in self._sources.items()), quality if any(quality) else None))
 
     def _on_applied(self, received: SignalSample) -> None:
         self.applied.take(received)

@@ -23,6 +23,7 @@ from koopman_ros.control import (
 from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import (
     Estimate,
     Estimator,
@@ -36,6 +37,7 @@ from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel
+from support.closed_loops import content, SECOND
 from support.random_lifts import coordinates, random_lift
 
 FILTERS = [ExtendedKalmanFilter, UnscentedKalmanFilter]
@@ -293,6 +295,25 @@ def test_noise_that_is_not_given_is_that_of_the_record():
             np.full(1, -1e9), np.full(1, 1e9), report_on_change=np.ones(1),
             deadband=np.array([deadband])))
         assert uncertainty(one, outputs, given)[0] == pytest.approx([expected], rel=1e-12)
+
+
+def test_an_uncertain_measurement_has_more_noise_and_a_bad_one_is_missing():
+    model, outputs = oscillator(), first(oscillator(), 1)
+
+    def filtered(noise: float) -> Controller:
+        return Controller(model, Tuning.for_model(
+            model, controlled=(outputs.names[0],), measurement_noise=np.array([noise]),
+            uncertain_noise_factor=4.0, estimator='extended_kalman_filter'), outputs)
+
+    own, noisy = filtered(0.1), filtered(0.4)
+    state, *_ = own.step(State(), model.states.center[:1], SECOND)
+    y = model.states.center[:1] + 0.2
+    after, _, report = own.step(state, y, 2 * SECOND, quality=(1,))
+    assert content(after.estimate) == content(noisy.step(state, y, 2 * SECOND)[0].estimate)
+    assert report.measurement.uncertain == outputs.names
+    assert content(after.estimate) != content(own.step(state, y, 2 * SECOND)[0].estimate)
+    *_, report = own.step(state, y, 2 * SECOND, quality=(2,))
+    assert (report.level, report.reason.code) == ('hold', StatusCode.BAD_QUALITY)
 
 
 def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_all():

@@ -15,6 +15,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
@@ -22,7 +23,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, STATUS, STEADY, TABLE
+from support.controller_bench import Bench, reproduced, STATUS, STEADY, TABLE
 from support.nodes import seconds, temperature, value
 
 CONTROLLER = '/controller'
@@ -352,6 +353,24 @@ def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
     bench.measure(STEADY, 5.0)
     assert value(bench.status(), 'active law') == 'learned law'
     ros.wait_until(lambda: not [*tmp_path.rglob('*.latched')])
+
+
+def test_the_quality_of_a_measurement_is_taken_into_account_and_recorded(ros: Harness) -> None:
+    records = ros.listen(String, topics.EVENT_LOG)
+    bench = Bench(ros, {'temperature.quality_topic': 'temperature_quality', 'temperature'
+                        '.quality_type': 'diagnostic_msgs/msg/DiagnosticStatus'})
+    quality = ros.speak(DiagnosticStatus, 'temperature_quality', to='controller')
+    for time, level, severity, words in (
+            (2.0, DiagnosticStatus.ERROR, DiagnosticStatus.ERROR, 'temperature is bad'),
+            (3.0, DiagnosticStatus.WARN, DiagnosticStatus.WARN, 'temperature is uncertain'),
+            (4.0, DiagnosticStatus.OK, DiagnosticStatus.OK, 'automatic')):
+        quality.publish(DiagnosticStatus(level=level))
+        ros.meet('controller')
+        bench.measure(STEADY, time)
+        assert bench.status(lambda s, words=words: words in s.message).level == severity
+    ros.wait_until(lambda: '"stamp_ns":4000000000' in ''.join(m.data for m in records))
+    assert [record.fields['quality'] for record in reproduced(records)[0]
+            if record.event == 'measurement'][-3:] == [[2], [1], None]
 
 
 def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: Harness) -> None:
