@@ -125,6 +125,13 @@ class Tuning:
     initial_error: Array = column(
         'states', 0.0, 'Standard deviation of the initial estimate of this state (Kalman '
                        'filters); 0: a quarter of the trained range.')
+    analysis_delay: Array = column(
+        'states', 0.0, 'Largest delay of a value on analysis_topic, which corrects a Kalman '
+                       'filter at its stamp (within the last 300 samples); 0: no such values.',
+        's', maximum=86400.0)
+    analysis_noise: Array = column(
+        'states', 0.0, 'Standard deviation of the noise of such a value; 0: a hundredth of the '
+                       'trained range.')
     fallback_order: tuple[str, ...] = parameter(
         ('sdre', 'linear'), 'Control laws, best first: mpc (model predictive), sdre '
                             '(state-dependent Riccati equation), linear (LQR), pi, or '

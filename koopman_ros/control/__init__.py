@@ -5,6 +5,7 @@
 
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import (
+    AnalysisValue,
     ClearSafeState,
     Event,
     Initialisation,
@@ -26,6 +27,7 @@ __all__ = [
     'LAWS',
     'MANUAL',
     'SAFE',
+    'AnalysisValue',
     'Arrival',
     'ClearSafeState',
     'Controller',

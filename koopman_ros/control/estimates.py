@@ -18,7 +18,16 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import check, Estimate, PendingInputs, Standstill, Verdict
+from koopman_ros.estimation import (
+    Analysis,
+    check,
+    Estimate,
+    History,
+    Instant,
+    PendingInputs,
+    Standstill,
+    Verdict,
+)
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -36,6 +45,7 @@ class Observation:
 UNCERTAIN = 1  #: quality of a measurement; better is 0, worse are bad
 # After so many time constants without an accepted measurement the state is not known.
 _LOST = 2.0
+_ANALYSIS_NOISE = 0.01  # of the trained range, where it is not given
 # So many intervals between measurements are a gap.
 _GAP = 1.5
 
@@ -105,9 +115,9 @@ class StateEstimation:
         :param quality: (n_y,) as of :class:`~koopman_ros.control.Measurement`.
         :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
-        before, last = state.estimate, state.accepted
+        before, last, history = state.estimate, state.accepted, state.history
         predicted = self.predict(state, time_ns, elapsed)
-        x = self.position(predicted, y)
+        x = x_measured = self.position(predicted, y)
         outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
 
@@ -131,9 +141,10 @@ class StateEstimation:
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
             far = outside > max(level.law.margin for level in self.levels.values())
+            lost = far or self._lost(state, time_ns)
+            fresh = predicted is None or verdict.moved or not elapsed > 0.0 or lost
             predicted = self._corrected(
-                state, predicted, verdict, x, time_ns, elapsed,
-                far or self._lost(state, time_ns), quality)
+                state, predicted, verdict, x, time_ns, elapsed, lost, quality)
             if not isinstance(predicted, Estimate):
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
@@ -141,12 +152,18 @@ class StateEstimation:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
                 outside = self.model.distance(x)
+            if fresh:
+                history = History()
         elif (verdict.fault.code is StatusCode.FROZEN and predicted is not None
                 and last is not None):
             # what the observer made of a sensor that does not move is no disturbance
-            predicted = replace(predicted, w=last.standstill.w)
-        return replace(
-            state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted
+            predicted, history = replace(predicted, w=last.standstill.w), History()
+        now = replace(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted,
+                      history=history)
+        corrected_by = None if verdict.fault is not None else (
+            self.model.states.to_deviation(x_measured))
+        return self._remembering(
+            now, state, time_ns, elapsed, corrected_by, self._factor(quality)
         ), Observation(verdict, expected, x, outside)
 
     def position(self, known: Estimate | None, y: Array) -> Array:
@@ -180,9 +197,8 @@ class StateEstimation:
         :param lost: whether the model's prediction is worth nothing, after so long or so far out.
         """
         xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
-        if quality is not None:
-            estimator = estimator.with_noise(np.where(
-                np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0))
+        if (factor := self._factor(quality)) is not None:
+            estimator = estimator.with_noise(factor)
         if predicted is None:
             # the input that acts, it is assumed, held the plant where it is
             return estimator.restart(
@@ -190,6 +206,43 @@ class StateEstimation:
         if verdict.moved or not elapsed > 0.0 or lost:
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
+
+    def _factor(self, quality: tuple[int, ...] | None) -> Array | None:
+        """Return the factor (n_y,) of the noise, or None for 1."""
+        return None if quality is None else np.where(
+            np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0)
+
+    def _remembering(self, now: State, before: State, time_ns: int, elapsed: float,
+                     x: Array | None = None, factor: Array | None = None) -> State:
+        """Return a state with its estimate in its history, if there may be late values."""
+        if not self._longest_ns or now.estimate is None:
+            return now
+        pieces = () if before.command is None or not elapsed > 0.0 else tuple(
+            (seconds, self.model.inputs.to_deviation(u)) for seconds, u in before.applied.pieces(
+                time_ns - round(elapsed * NANOSECONDS), time_ns, self.dead_ns))
+        return replace(now, history=now.history.followed_by(
+            Instant(time_ns, now.estimate, pieces, x, factor), self._longest_ns))
+
+    @cached_property
+    def _longest_ns(self) -> int:
+        return round(float(np.max(self.tuning.analysis_delay)) * NANOSECONDS)
+
+    def predicted(self, state: State, time_ns: int, elapsed: float) -> State:
+        """Return the state at a time without a measurement; arguments as in :meth:`observe`."""
+        now = replace(state, estimate=self.predict(state, time_ns, elapsed))
+        return self._remembering(now, state, time_ns, elapsed)
+
+    def corrected(self, state: State, index: int, value: float, stamp_ns: int) -> State | None:
+        """Return the state with a late value of a state taken into account; None for too late."""
+        states, noise = self.model.states, float(self.tuning.analysis_noise[index])
+        x = states.to_physical(np.zeros(len(states)))
+        x[index] = value
+        history = state.history.corrected(stamp_ns, Analysis(
+            index, float(states.to_deviation(x)[index]), noise / float(states.scale[index]) or (
+                _ANALYSIS_NOISE * 2.0 * float(states.half_widths[index]))),
+            self.level(state.supervisor).estimator)
+        return None if history is None else replace(
+            state, history=history, estimate=history.instants[-1].estimate)
 
     def _lost(self, state: State, time_ns: int) -> bool:
         """Whether the state is unknown, because no measurement was accepted for too long."""

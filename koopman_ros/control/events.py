@@ -71,12 +71,21 @@ class Initialisation:
 
 
 @dataclass(frozen=True, slots=True)
+class AnalysisValue:
+    """A value of a state that comes late, as from a laboratory."""
+
+    stamp_ns: int  #: of the sample
+    signal: str  #: name of the state
+    value: float  #: in its unit
+
+
+@dataclass(frozen=True, slots=True)
 class ClearSafeState:
     """The operator lets the laws act again after the safe state has latched."""
 
 
 Event: TypeAlias = (Measurement | Silence | SetpointRequest | ManualCommand | ModeChange
-                    | Initialisation | ClearSafeState)
+                    | Initialisation | AnalysisValue | ClearSafeState)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +118,10 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
             return EventOutcome(controller.set_mode(state, event.mode))
         case Initialisation():
             return EventOutcome(controller.initialise(state, event.applied))
+        case AnalysisValue():
+            state, refused = controller.take_analysis(
+                state, event.signal, event.value, event.stamp_ns)
+            return EventOutcome(state, refused=refused)
         case ClearSafeState():
             state, refused = controller.clear_safe_state(state)
             return EventOutcome(state, refused=refused)

@@ -21,7 +21,14 @@ from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.status import Reason
-from koopman_ros.estimation import Accepted, AppliedInputs, Estimate, Estimator, Innovation
+from koopman_ros.estimation import (
+    Accepted,
+    AppliedInputs,
+    Estimate,
+    Estimator,
+    History,
+    Innovation,
+)
 
 
 class Mode(Enum):
@@ -50,6 +57,7 @@ class State:
     accepted: Accepted | None = None  #: the last accepted measurement
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
+    history: History = field(default_factory=History)  #: of the estimate, for late values
     supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
     recovery: SafeStateRecovery | None = None
@@ -65,8 +73,8 @@ class State:
 
     def restarted(self, time_ns: int | None) -> State:
         """Return the state after a measurement, without the parts that may have made it fail."""
-        return replace(self, **WITHOUT_LAW, estimate=None, recovery=None, target=None,
-                       time_ns=time_ns)
+        return replace(self, **WITHOUT_LAW, estimate=None, history=History(),
+                       recovery=None, target=None, time_ns=time_ns)
 
     @property
     def own_command(self) -> Array | None:

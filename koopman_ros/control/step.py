@@ -42,7 +42,7 @@ from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import LATE_NANOSECONDS
-from koopman_ros.estimation import Estimate, Verdict
+from koopman_ros.estimation import Estimate, History, Verdict
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,7 @@ class ControlStep(Configuration):
         time = time_of_silence(state, time_ns)
 
         def calculate() -> tuple[State, Array, StepReport]:
-            now = replace(state, estimate=self.estimation.predict(
-                state, time.now_ns, time.elapsed))
+            now = self.estimation.predicted(state, time.now_ns, time.elapsed)
             if cause is not None or state.mode is Mode.MANUAL:
                 fault = None if cause is None else reason(cause)
                 return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
@@ -185,9 +184,10 @@ class ControlStep(Configuration):
             why = supervisor.reason
             changes |= {'supervisor': supervisor, 'recovery': recovery}
             if state.estimate is not None:
-                changes['estimate'] = self.estimation.transfer_estimate(
-                    state.estimate, self.estimation.level(state.supervisor),
-                    self.estimation.level(supervisor))
+                levels = [self.estimation.level(one) for one in (state.supervisor, supervisor)]
+                changes['estimate'] = self.estimation.transfer_estimate(state.estimate, *levels)
+                if levels[0] is not levels[1]:
+                    changes['history'] = History()
             if target is not None and not self.best.controls_all:
                 changes['target'] = read_only(np.concatenate((
                     self.model.states.to_physical(target.x),

@@ -15,6 +15,7 @@ from koopman_ros.estimation.disturbance_observer import (
     equivalent_bias,
     MeasuredState,
 )
+from koopman_ros.estimation.history import Analysis, History, Instant
 from koopman_ros.estimation.kalman_filters import ExtendedKalmanFilter, UnscentedKalmanFilter
 from koopman_ros.estimation.sensor_checks import Accepted, check, Standstill, Verdict
 
@@ -26,7 +27,7 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
     'unscented_kalman_filter': UnscentedKalmanFilter,
 }
 
-__all__ = ['ESTIMATORS', 'Accepted', 'AppliedInputs', 'DisturbanceObserver', 'Estimate',
-           'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredState', 'PendingInputs',
-           'Standstill', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias',
-           'held_means', 'largest_bandwidth']
+__all__ = ['ESTIMATORS', 'Accepted', 'Analysis', 'AppliedInputs', 'DisturbanceObserver',
+           'Estimate', 'Estimator', 'ExtendedKalmanFilter', 'History', 'Innovation', 'Instant',
+           'MeasuredState', 'PendingInputs', 'Standstill', 'UnscentedKalmanFilter', 'Verdict',
+           'check', 'equivalent_bias', 'held_means', 'largest_bandwidth']

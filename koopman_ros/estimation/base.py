@@ -146,6 +146,15 @@ class Estimator(ABC):
         """Return the estimator for measurements with (n_y,) times the noise; itself by default."""
         return self
 
+    def with_analysis(self, predicted: Estimate, index: int, x: float, deviation: float
+                      ) -> Estimate:
+        """
+        Correct by a value of one state alone, a scaled deviation with its standard deviation.
+
+        :raises NotImplementedError: by default; then such values are refused.
+        """
+        raise NotImplementedError
+
     def transferred(self, estimate: Estimate, rate: Array) -> Estimate:
         """
         Take over an estimate from another model, so that the plant's estimated rate stays.

@@ -220,8 +220,20 @@ class ExtendedKalmanFilter(Estimator):
 
     def with_noise(self, factor: Array) -> Estimator:
         """Return the filter for measurements with (n_y,) times the noise."""
+        return self._observing(self._H, factor * self._noise)
+
+    def with_analysis(self, predicted: Estimate, index: int, x: float, deviation: float
+                      ) -> Estimate:
+        """Correct by a value of one state; the innovation stays that of the measurements."""
+        H, measured = np.eye(self.model.n_x)[[index]], predicted.x.copy()
+        measured[index] = x
+        found = self._observing(H, np.array([deviation])).correct(predicted, measured, 0.0)
+        return replace(found, innovation=predicted.innovation)
+
+    def _observing(self, H: Array, noise: Array) -> Estimator:
+        """Return the filter for other outputs (n, n_x) of scaled deviations with noise (n,)."""
         other = copy.copy(self)
-        other._R = np.diag((factor * self._noise) ** 2)
+        other._H, other._R = H, np.diag(noise ** 2)
         return other
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:

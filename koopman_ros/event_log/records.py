@@ -34,7 +34,7 @@ EVENTS: dict[str, type[events.Event]] = {
     'measurement': events.Measurement, 'silence': events.Silence,
     'setpoint': events.SetpointRequest, 'manual_command': events.ManualCommand,
     'mode': events.ModeChange, 'initialisation': events.Initialisation,
-    'clear_safe_state': events.ClearSafeState}
+    'analysis': events.AnalysisValue, 'clear_safe_state': events.ClearSafeState}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
 _FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
 _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
@@ -100,7 +100,8 @@ def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, d
             'setpoint': None if report.target is None else numbers(report.target.setpoint),
             'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
     elif isinstance(event, (
-            events.SetpointRequest, events.ManualCommand, events.ClearSafeState)):
+            events.SetpointRequest, events.ManualCommand, events.AnalysisValue,
+            events.ClearSafeState)):
         written |= {'accepted': outcome.refused is None, 'reason': _codes(outcome.refused)}
     return name, written
 
@@ -146,7 +147,7 @@ def _read(name: str, value: Any) -> Any:
         return None if value is None else StatusCode(value)
     if name in ('signals', 'quality'):
         return None if value is None else tuple(map(str if name == 'signals' else int, value))
-    return value if value is None or isinstance(value, (int, float)) else float_array(value)
+    return value if value is None or isinstance(value, (int, float, str)) else float_array(value)
 
 
 def _codes(reason: Reason | None) -> list[str]:

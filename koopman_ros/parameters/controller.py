@@ -17,7 +17,6 @@ from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
 from koopman_ros.core.declaration import (
     nested,
-    NoParameters,
     of_other_states,
     parameter,
     per_signal,
@@ -27,6 +26,7 @@ from koopman_ros.core.signals import Outputs
 from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
+    AnalysisPlaces,
     box_defaults,
     DEFAULT_SYSTEM,
     InputPlaces,
@@ -85,8 +85,8 @@ class ControllerParameters:
         open_minimum=True)
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces, 'measured')
     inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
-    #: names of all states that the tuning is for
-    every_state: Mapping[str, NoParameters] = per_signal(NoParameters, 'states')
+    #: of all states that the tuning is for
+    every_state: Mapping[str, AnalysisPlaces] = per_signal(AnalysisPlaces, 'states')
 
 
 def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
@@ -116,7 +116,7 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
         plugin_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
     except ValueError as error:
         return f'estimator = {tuning.estimator!r}: {error}'
-    return SignalTopics(signals, values.states, values.inputs).check()
+    return SignalTopics(signals, values.states, values.inputs, analyses=values.every_state).check()
 
 
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:

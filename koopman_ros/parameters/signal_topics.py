@@ -39,7 +39,7 @@ QUALITY = '1'  #: unit of a quality
 LONGEST_FRAME_ID = 256  # characters that are passed on
 
 # The places of signals: of states, then of inputs.
-KINDS = ('measured', 'quality', 'setpoints', 'active_setpoints', 'predicted', 'applied',
+KINDS = ('measured', 'quality', 'late', 'setpoints', 'active_setpoints', 'predicted', 'applied',
          'commands', 'manual')
 PLANT_KINDS = ('measured', 'applied', 'commands')
 SIGNALS = ('states_measured', 'inputs_commanded', 'controlled')  # parameters that name them
@@ -75,6 +75,17 @@ class StatePlaces(MeasuredPlace):
     setpoint_topic: str = _topic('Topic of requested set-points.')
     active_setpoint_topic: str = _topic('Topic of the active set-point.')
     predicted_topic: str = _topic('Topic of the predicted measurement.')
+
+
+@dataclass(frozen=True)
+class AnalysisPlaces:
+    """Where values of a state come that are rare and late, as from a laboratory."""
+
+    analysis_topic: str = _topic('Topic of rare values that come late, as of an analyser; empty: '
+                                 'none.')
+    analysis_type: str = _topic('Message type of these values; empty: the usual type.')
+    analysis_field: str = _topic('Message field that holds the value; empty: the usual field.')
+    analysis_unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 
 @dataclass(frozen=True)
@@ -217,6 +228,8 @@ class SignalTopics:
     states: Mapping[str, Any]  #: places of a node's states, by name
     inputs: Mapping[str, Any]  #: places of its inputs, by name
     kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
+    #: places of late values, by name of the state
+    analyses: Mapping[str, AnalysisPlaces] = field(default_factory=dict)
 
     #: measurements of the states, and their predictions
     measured = _role('states', 'topic')
@@ -234,6 +247,13 @@ class SignalTopics:
         """Qualities of the measurements that have one."""
         return {name: _place(given.quality_topic, name, QUALITY, {'type': given.quality_type})
                 for name, given in self.states.items() if given.quality_topic}
+
+    @cached_property
+    def late(self) -> dict[str, MessageField]:
+        """Late values of states that have some."""
+        return {name: _place(given.analysis_topic, name, self.signals.every[name], {
+            kind: getattr(given, f'analysis_{kind}') for kind in ('type', 'field', 'unit')})
+            for name, given in self.analyses.items() if given.analysis_topic}
 
     def check(self) -> str:
         """Return their defect in words, or an empty string."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Requests of the operator to a controller: set-points, manual commands, the mode."""
+"""Requests to a controller: set-points, manual commands, the mode, and values of a laboratory."""
 
 from collections.abc import Callable
 import math
@@ -46,6 +46,8 @@ class OperatorRequests:
         for name, place in wiring.manual.items():
             SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.inputs,
                              self._on_manual)
+        SignalSubscriber(node, endpoints.subscribe, wiring.late, wiring.signals.every,
+                         self._on_analysis)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
         node.create_service(Trigger, '~/clear_safe_state', self._on_clear_safe_state)
 
@@ -67,6 +69,11 @@ class OperatorRequests:
             self._log.info(
                 f'set-point {quantity_text(value, unit)} of {name} accepted{when}',
                 throttle_duration_sec=1.0)
+        self._changed()
+
+    def _on_analysis(self, received: SignalSample) -> None:
+        for name, value in received.values.items():
+            self._change(events.AnalysisValue(received.stamp_ns, name, value))
         self._changed()
 
     def _on_manual(self, received: SignalSample) -> None:

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
+from koopman_ros.event_log.records import parse
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
@@ -414,14 +415,20 @@ def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: 
     assert now > 60.0 + 5.0
 
 
-def test_a_signal_that_is_reported_on_change_is_in_each_measurement(ros: Harness) -> None:
-    ros.start('controller', {'system': 'two_tanks', 'level_1.report_on_change': 100.0})
+def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(
+        ros: Harness) -> None:
+    ros.start('controller', {
+        'system': 'two_tanks', 'level_1.report_on_change': 100.0,
+        'estimator': 'extended_kalman_filter', 'level_2.analysis_topic': 'laboratory',
+        'level_2.analysis_delay': 60.0})
+    records = ros.listen(String, topics.EVENT_LOG)
     commands = ros.listen(JointState, 'pump_1_setpoint')
     sensors = {name: ros.speak(JointState, name, to='controller')
-               for name in ('level_1', 'level_2')}
+               for name in ('level_1', 'level_2', 'laboratory')}
 
     def send(name: str, metres: float, time: float) -> None:
-        message = JointState(name=[name], position=[metres])
+        message = JointState(name=['level_2' if name == 'laboratory' else name],
+                             position=[metres])
         message.header.stamp = temperature(0.0, time).header.stamp
         sensors[name].publish(message)
 
@@ -432,6 +439,11 @@ def test_a_signal_that_is_reported_on_change_is_in_each_measurement(ros: Harness
     for time in (2.0, 3.0, 4.0):
         send('level_2', 0.15, time)
     ros.wait_until(lambda: [seconds(message) for message in commands] == [2.0, 3.0, 4.0])
+    for time in (2.5, 1.0):
+        send('laboratory', 0.16, time)
+    ros.wait_until(lambda: [record.fields['accepted'] for record in map(
+        parse, (message.data for message in records)) if record.event == 'analysis'] == [
+            True, False])
 
 
 def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(
