@@ -376,7 +376,16 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
 class PlayerParameters:
     """Snapshot of the player's parameters."""
 
-    bag: str = parameter('run_1', 'Bag to play: a .mcap file or a bag folder.', read_only=True)
+    bag: str = parameter(
+        'run_1', 'Bag to play: a .mcap file or a bag folder; or a .csv of set-points with the '
+        'columns time [s] and <signal> [unit].', read_only=True)
+    setpoint_ramps: bool = parameter(
+        False, 'Ramps between the rows of a .csv, in place of steps.', read_only=True)
+    ramp_period: float = parameter(
+        1.0, 'Time between two set-points of a ramp.', 's', 0.01, 3600.0, read_only=True)
+    setpoint_lead: float = parameter(
+        0.0, 'Time by which set-points of a .csv are sent ahead, with the stamp from which they '
+        'hold, so that the law mpc knows them; 0: not ahead.', 's', 0.0, 3600.0, read_only=True)
     system: str = parameter(
         DEFAULT_SYSTEM, 'Bundled plant whose topics are the defaults; any other name: no '
         'defaults.', read_only=True)
@@ -414,6 +423,8 @@ class PlayerParameters:
 
 
 def _check_player(values: PlayerParameters) -> str:
+    if values.bag.endswith('.csv') and values.rate == 0.0:
+        return 'rate = 0 plays in lock-step, which a .csv of set-points cannot: set rate above 0'
     return refusal(values.topics) or refusal((*values.measurement, values.answer))
 
 
