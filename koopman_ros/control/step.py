@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -219,7 +220,9 @@ class ControlStep(Configuration):
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, memory, time.spacing, state.target,
-                state.own_command, self.estimation.pending(state, time.command_ns))
+                state.own_command, self.estimation.pending(state, time.command_ns),
+                partial(setpoints.ahead, state.setpoint, self.controlled,
+                        self.tuning.setpoint_ramp, self.tuning.setpoint_filter_time, time.now_ns))
             if result.failure is not None:
                 requested = self._failed(level, result.failure, result.passing)
                 continue
