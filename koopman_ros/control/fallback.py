@@ -128,7 +128,7 @@ class FallbackLevel:
         This is the one place where an exception of a law, or a result that is none, becomes a
         failure with a reason.
 
-        :param ahead: returns later set-points of so many seconds, with the seconds until then.
+        :param ahead: returns the set-points within a horizon in s, with the time until each.
         """
         target = None
         try:

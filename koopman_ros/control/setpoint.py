@@ -106,10 +106,10 @@ def ahead(setpoint: Setpoint, box: Coordinates, ramp: Array, lag: float, now_ns:
         return []
     if lag > 0.0 or np.isfinite(ramp).any() or len(times) > MAX_AHEAD:
         times = horizon * np.arange(1, MAX_AHEAD + 1) / MAX_AHEAD
-    found, before = [], 0.0
+    found, before, active = [], 0.0, setpoint.active
     for seconds in times.tolist():
-        setpoint = advance(setpoint, setpoint.active, box, ramp,
-                           now_ns + round(seconds * NANOSECONDS), seconds - before, lag)
+        setpoint = advance(setpoint, active, box, ramp, now_ns + round(seconds * NANOSECONDS),
+                           seconds - before, lag)
         assert setpoint.active is not None
         found.append((seconds, setpoint.active))
         before = seconds

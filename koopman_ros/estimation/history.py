@@ -63,7 +63,7 @@ class History:
     instants: tuple[Instant, ...] = ()
 
     def followed_by(self, instant: Instant, longest_ns: int) -> History:
-        """Append an instant, and drop those that are not needed for so long a delay."""
+        """Append an instant, and drop those before the longest delay."""
         instants = (*self.instants, instant)
         begin = bisect_right([one.time_ns for one in instants], instant.time_ns - longest_ns)
         return History(instants[max(begin - 1, len(instants) - _LONGEST, 0):])
@@ -88,7 +88,7 @@ class History:
 
 
 def _split(pieces: Pieces, seconds: float) -> tuple[Pieces, Pieces]:
-    """Divide pieces after so many seconds."""
+    """Divide pieces at a time from their start."""
     ends = np.cumsum([length for length, _ in pieces])
     first = tuple((min(length, seconds - (end - length)), u)
                   for (length, u), end in zip(pieces, ends, strict=True)
