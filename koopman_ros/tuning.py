@@ -54,9 +54,20 @@ class SensorLimits:
         'measured', 0.0, 'Largest change between two measurements due to noise alone; 0: no '
                          'check.',
         name='max_step', none=ANY)
+    report_on_change: Array = column(
+        'measured', 0.0, 'Heartbeat of a sensor that reports changes only: the signal counts as '
+                         'unchanged for so long after each message; 0: it reports each sample.',
+        's', maximum=86400.0, read_only=True)
+    deadband: Array = column(
+        'measured', 0.0, 'Largest change that such a sensor does not report.')
     stuck_sensor_timeout: float = parameter(
         20.0, 'Time after which an unchanged measurement counts as a stuck sensor, if the model '
               'moved by more than half of max_step; 0: no check.', 's', 0.0, 86400.0)
+
+    @property
+    def unreported(self) -> Array:
+        """The largest change (n_y,) that a sensor does not report."""
+        return np.where(self.report_on_change > 0.0, self.deadband, 0.0)
 
 
 @dataclass(frozen=True)
@@ -122,12 +133,22 @@ class Tuning:
     measurement_noise: Array = column(
         'measured', 0.0, 'Standard deviation of the measurement noise (Kalman filters); 0: that '
                          'of the training data.')
+    uncertain_noise_factor: float = parameter(
+        3.0, 'Factor of the measurement noise of a signal while its quality is uncertain (Kalman '
+             'filters).', '', 1.0, 1e6)
     disturbance_noise: Array = column(
         'inputs', 0.0, "Standard deviation of the input disturbance's random walk in one minute "
                        '(Kalman filters); 0: derived from the model.')
     initial_error: Array = column(
         'states', 0.0, 'Standard deviation of the initial estimate of this state (Kalman '
                        'filters); 0: a quarter of the trained range.')
+    analysis_delay: Array = column(
+        'states', 0.0, 'Largest delay of a value on analysis_topic, which corrects a Kalman '
+                       'filter at its stamp (within the last 300 samples); 0: no such values.',
+        's', maximum=86400.0)
+    analysis_noise: Array = column(
+        'states', 0.0, 'Standard deviation of the noise of such a value; 0: a hundredth of the '
+                       'trained range.')
     fallback_order: tuple[str, ...] = parameter(
         ('sdre', 'linear'), 'Control laws, best first: mpc (model predictive), sdre '
                             '(state-dependent Riccati equation), linear (LQR), pi, or '
@@ -147,6 +168,9 @@ class Tuning:
     recovery_time: float = parameter(
         10.0, 'Time for which a better law must be available before it takes over again.', 's',
         0.0, 86400.0)
+    safe_latch: bool = parameter(
+        False, 'Keep the safe inputs, once commanded, until an operator clears them by '
+               '~/clear_safe_state, also over a restart.')
     bumpless_transfer_time: float = parameter(
         0.0, 'Time constant of the bumpless transfer after a change of law, model, tuning or '
              'mode.',

@@ -5,6 +5,8 @@
 
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import (
+    AnalysisValue,
+    ClearSafeState,
     Event,
     Initialisation,
     ManualCommand,
@@ -25,7 +27,9 @@ __all__ = [
     'LAWS',
     'MANUAL',
     'SAFE',
+    'AnalysisValue',
     'Arrival',
+    'ClearSafeState',
     'Controller',
     'Event',
     'Feedback',

@@ -56,7 +56,7 @@ class Configuration:
         """The order of all levels."""
         return FallbackOrder(
             tuple(self.levels), tuple(level.law.margin for level in self.levels.values()),
-            self.tuning.hold_timeout, self.tuning.recovery_time)
+            self.tuning.hold_timeout, self.tuning.recovery_time, self.tuning.safe_latch)
 
     @cached_property
     def best(self) -> FallbackLevel:

@@ -24,7 +24,8 @@ from koopman_ros.core.arrays import Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode, UNMEASURED
-from koopman_ros.estimation import equivalent_bias, Estimate
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.estimation import equivalent_bias, Estimate, History
 
 
 @dataclass(frozen=True)
@@ -146,8 +147,51 @@ class Controller(ControlStep):
         except BaseException as error:
             contained(error)
             estimate = None  # the next measurement starts it
-        return replace(state, mode=mode, manual_input=None, supervisor=Supervisor(),
-                       recovery=None, estimate=estimate)
+        supervisor = replace(
+            state.supervisor, better_since_ns=None) if state.supervisor.latched else Supervisor()
+        return replace(state, mode=mode, manual_input=None, supervisor=supervisor,
+                       recovery=None, estimate=estimate, history=History())
+
+    def take_analysis(self, state: State, signal: str, value: float, stamp_ns: int
+                      ) -> tuple[State, Reason | None]:
+        """
+        Correct the estimate by a late value of a state, in its unit, at the time of its stamp.
+
+        :return: as :meth:`request_setpoint`.
+        :raises ValueError: for a signal that is no state.
+        """
+        history, states = state.history, self.model.states
+        index = states.names.index(signal)
+        newest_ns, oldest_ns = (history.instants[at].time_ns if history.instants else stamp_ns
+                                for at in (-1, 0))
+        found = None
+        if math.isfinite(value) and newest_ns - stamp_ns <= (
+                self.tuning.analysis_delay[index] * NANOSECONDS):
+            try:
+                with np.errstate(all='ignore'):
+                    found = self.estimation.corrected(state, index, value, stamp_ns)
+            except BaseException as error:
+                contained(error)
+        return (state, reason(
+            StatusCode.ANALYSIS_REFUSED, signal=signal, age=(newest_ns - stamp_ns) / NANOSECONDS,
+            reach=(newest_ns - oldest_ns) / NANOSECONDS)) if found is None else (found, None)
+
+    def clear_safe_state(self, state: State) -> tuple[State, Reason | None]:
+        """
+        Let the laws act again after the safe state has latched.
+
+        In automatic mode one of them must have been possible for `recovery_time`.
+
+        :return: as :meth:`request_setpoint`.
+        """
+        latched, why = state.supervisor.latched, state.supervisor.reason
+        if not latched or why is None:
+            return state, reason(StatusCode.NOT_LATCHED)
+        if state.mode is Mode.AUTOMATIC and why.code is not StatusCode.LATCH_CLEARABLE:
+            return state, reason(
+                StatusCode.LATCH_KEPT, recovery_time=self.order.recovery_time,
+                cause=why if why.cause is None else why.cause)
+        return replace(state, supervisor=Supervisor()), None
 
     # Start and exchange of the controller itself.
 
@@ -174,6 +218,7 @@ class Controller(ControlStep):
         """
         same = self.controlled.names == predecessor.controlled.names
         every = self.best.controls_all and predecessor.best.controls_all
+        state = replace(state, history=History())
         try:
             with np.errstate(all='ignore'):
                 state = self.estimation.take_over(predecessor.estimation, state)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,12 +17,15 @@ from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.status import StatusCode
+from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import (
+    Analysis,
     check,
     check_disturbances,
     Estimate,
+    History,
+    Instant,
     MeasuredDisturbances,
     PendingInputs,
     Standstill,
@@ -41,8 +45,10 @@ class Observation:
     outside: float  #: its distance from the training data, in half-ranges
 
 
+UNCERTAIN = 1  #: quality of a measurement; better is 0, worse are bad
 # After so many time constants without an accepted measurement the state is not known.
 _LOST = 2.0
+_ANALYSIS_NOISE = 0.01  # of the trained range, where it is not given
 # So many intervals between measurements are a gap.
 _GAP = 1.5
 
@@ -136,17 +142,18 @@ class StateEstimation:
             estimate, level.model.drift(estimate.x)
             - self.model.disturbance_rate(signals.center + change)))
 
-    def observe(self, state: State, y: Array, time_ns: int, elapsed: float
-                ) -> tuple[State, Observation]:
+    def observe(self, state: State, y: Array, time_ns: int, elapsed: float,
+                quality: tuple[int, ...] | None = None) -> tuple[State, Observation]:
         """
         Check a measurement (n_y,) and take it into account.
 
         :param elapsed: seconds since the last command.
+        :param quality: (n_y,) as of :class:`~koopman_ros.control.Measurement`.
         :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
-        before, last = state.estimate, state.accepted
+        before, last, history = state.estimate, state.accepted, state.history
         predicted = self.predict(state, time_ns, elapsed)
-        x = self.position(predicted, y)
+        x = x_measured = self.position(predicted, y)
         outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
 
@@ -162,14 +169,18 @@ class StateEstimation:
             assert moved is not None
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
 
-        verdict = check(self.tuning.sensor, self.outputs, last, y, time_ns, w, travel)
+        bad = [name for name, level in zip(self.outputs.names, quality or (), strict=False)
+               if level > UNCERTAIN]
+        verdict = Verdict(last, reason(StatusCode.BAD_QUALITY, signal=bad[0])) if bad else check(
+            self.tuning.sensor, self.outputs, last, y, time_ns, w, travel)
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
             far = outside > max(level.law.margin for level in self.levels.values())
+            lost = far or self._lost(state, time_ns)
+            fresh = predicted is None or verdict.moved or not elapsed > 0.0 or lost
             predicted = self._corrected(
-                state, predicted, verdict, x, time_ns, elapsed,
-                far or self._lost(state, time_ns))
+                state, predicted, verdict, x, time_ns, elapsed, lost, quality)
             if not isinstance(predicted, Estimate):
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
@@ -177,12 +188,18 @@ class StateEstimation:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
                 outside = self.model.distance(x)
+            if fresh:
+                history = History()
         elif (verdict.fault.code is StatusCode.FROZEN and predicted is not None
                 and last is not None):
             # what the observer made of a sensor that does not move is no disturbance
-            predicted = replace(predicted, w=last.standstill.w)
-        return replace(
-            state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted
+            predicted, history = replace(predicted, w=last.standstill.w), History()
+        now = replace(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted,
+                      history=history)
+        corrected_by = None if verdict.fault is not None else (
+            self.model.states.to_deviation(x_measured))
+        return self._remembering(
+            now, state, time_ns, elapsed, corrected_by, self._factor(quality)
         ), Observation(verdict, expected, x, outside)
 
     def position(self, known: Estimate | None, y: Array) -> Array:
@@ -208,13 +225,16 @@ class StateEstimation:
         return x
 
     def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   time_ns: int, elapsed: float, lost: bool) -> Estimate:
+                   time_ns: int, elapsed: float, lost: bool, quality: tuple[int, ...] | None
+                   ) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
         :param lost: whether the model's prediction is worth nothing, after so long or so far out.
         """
         xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
+        if (factor := self._factor(quality)) is not None:
+            estimator = estimator.with_noise(factor)
         if predicted is None:
             # the input that acts, it is assumed, held the plant where it is
             return self._started(
@@ -231,6 +251,43 @@ class StateEstimation:
             return started
         # measured disturbances are a part of what keeps it there
         return estimator.transferred(started, estimator.model.drift(started.x) - forward)
+
+    def _factor(self, quality: tuple[int, ...] | None) -> Array | None:
+        """Return the factor (n_y,) of the noise, or None for 1."""
+        return None if quality is None else np.where(
+            np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0)
+
+    def _remembering(self, now: State, before: State, time_ns: int, elapsed: float,
+                     x: Array | None = None, factor: Array | None = None) -> State:
+        """Return a state with its estimate in its history, if there may be late values."""
+        if not self._longest_ns or now.estimate is None:
+            return now
+        pieces = () if before.command is None or not elapsed > 0.0 else tuple(
+            self._pieces(before, time_ns, elapsed))
+        return replace(now, history=now.history.followed_by(
+            Instant(time_ns, now.estimate, pieces, self.feed_forward(before), x, factor),
+            self._longest_ns))
+
+    @cached_property
+    def _longest_ns(self) -> int:
+        return round(float(np.max(self.tuning.analysis_delay)) * NANOSECONDS)
+
+    def predicted(self, state: State, time_ns: int, elapsed: float) -> State:
+        """Return the state at a time without a measurement; arguments as in :meth:`observe`."""
+        now = replace(state, estimate=self.predict(state, time_ns, elapsed))
+        return self._remembering(now, state, time_ns, elapsed)
+
+    def corrected(self, state: State, index: int, value: float, stamp_ns: int) -> State | None:
+        """Return the state with a late value of a state taken into account; None for too late."""
+        states, noise = self.model.states, float(self.tuning.analysis_noise[index])
+        x = states.to_physical(np.zeros(len(states)))
+        x[index] = value
+        history = state.history.corrected(stamp_ns, Analysis(
+            index, float(states.to_deviation(x)[index]), noise / float(states.scale[index]) or (
+                _ANALYSIS_NOISE * 2.0 * float(states.half_widths[index]))),
+            self.level(state.supervisor).estimator)
+        return None if history is None else replace(
+            state, history=history, estimate=history.instants[-1].estimate)
 
     def _lost(self, state: State, time_ns: int) -> bool:
         """Whether the state is unknown, because no measurement was accepted for too long."""
@@ -251,19 +308,19 @@ class StateEstimation:
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
         estimator = self.level(state.supervisor).estimator
-        begin = state.estimate.under(self.feed_forward(state))
-        predicted: Estimate | None = begin
         try:
-            for seconds, u in state.applied.pieces(
-                    time_ns - round(elapsed * NANOSECONDS), time_ns, self.dead_ns):
-                predicted = predicted and estimator.predict(
-                    predicted, self.model.inputs.to_deviation(u), seconds)
+            predicted = estimator.predict_over(
+                state.estimate, self._pieces(state, time_ns, elapsed), self.feed_forward(state))
         except np.linalg.LinAlgError:
             predicted = None  # so far out that the model gives no rate
-        if predicted is None or not predicted.finite:
-            return replace(state.estimate, covariance=None)
-        return predicted if begin is state.estimate else replace(
-            predicted, w=state.estimate.w + (predicted.w - begin.w))
+        return predicted if predicted is not None and predicted.finite else replace(
+            state.estimate, covariance=None)
+
+    def _pieces(self, state: State, time_ns: int, elapsed: float) -> Iterator[tuple[float, Array]]:
+        """Yield the inputs that acted since the last measurement, with the time of each in s."""
+        for seconds, u in state.applied.pieces(
+                time_ns - round(elapsed * NANOSECONDS), time_ns, self.dead_ns):
+            yield seconds, self.model.inputs.to_deviation(u)
 
     def transfer_estimate(self, estimate: Estimate, before: FallbackLevel,
                           now: FallbackLevel) -> Estimate:

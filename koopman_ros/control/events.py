@@ -30,6 +30,8 @@ class Measurement:
     disturbances: Array | None = None
     #: (n_d,) their ages in s, infinity for none; None where they are as new as the measurement
     ages: Array | None = None
+    #: (n_y,) 0 good, 1 uncertain, more bad, which counts as missing; None for good
+    quality: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,22 @@ class Initialisation:
     applied: Array  #: (n_u,) measured input in the model's units
 
 
-Event: TypeAlias = (
-    Measurement | Silence | SetpointRequest | ManualCommand | ModeChange | Initialisation)
+@dataclass(frozen=True, slots=True)
+class AnalysisValue:
+    """A value of a state that comes late, as from a laboratory."""
+
+    stamp_ns: int  #: of the sample
+    signal: str  #: name of the state
+    value: float  #: in its unit
+
+
+@dataclass(frozen=True, slots=True)
+class ClearSafeState:
+    """The operator lets the laws act again after the safe state has latched."""
+
+
+Event: TypeAlias = (Measurement | Silence | SetpointRequest | ManualCommand | ModeChange
+                    | Initialisation | AnalysisValue | ClearSafeState)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +109,8 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
         case Measurement():
             return EventOutcome(*controller.step(state, event.measured, event.stamp_ns,
                                                  event.applied, event.seconds,
-                                                 event.disturbances, event.ages))
+                                                 event.disturbances, event.ages,
+                                                 event.quality))
         case Silence():
             return EventOutcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():
@@ -107,3 +124,10 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
             return EventOutcome(controller.set_mode(state, event.mode))
         case Initialisation():
             return EventOutcome(controller.initialise(state, event.applied))
+        case AnalysisValue():
+            state, refused = controller.take_analysis(
+                state, event.signal, event.value, event.stamp_ns)
+            return EventOutcome(state, refused=refused)
+        case ClearSafeState():
+            state, refused = controller.clear_safe_state(state)
+            return EventOutcome(state, refused=refused)

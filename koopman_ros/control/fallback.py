@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 import itertools
@@ -115,7 +116,8 @@ class FallbackLevel:
             inputs.to_deviation(self.limits.upper), y)
 
     def compute(self, setpoint: Array, estimate: Estimate, memory: object, interval: float,
-                start: Array | None, previous: Array | None, pending: PendingInputs | None = None
+                start: Array | None, previous: Array | None, pending: PendingInputs | None = None,
+                ahead: Callable[[float], list[tuple[float, Array]]] | None = None
                 ) -> tuple[Target | None, LawResult]:
         """
         Evaluate the law towards a target, see :meth:`target`, for an estimate of its model.
@@ -125,6 +127,8 @@ class FallbackLevel:
 
         This is the one place where an exception of a law, or a result that is none, becomes a
         failure with a reason.
+
+        :param ahead: returns the set-points within a horizon in s, with the time until each.
         """
         target = None
         try:
@@ -132,6 +136,13 @@ class FallbackLevel:
             if target is None:
                 return None, LawResult(None, reason(StatusCode.NO_STEADY_STATE))
             target = self._within_reach(target, estimate.w)
+            horizon = self.law.horizon(interval) if interval > 0.0 else 0.0
+            if ahead is not None and horizon > 0.0:
+                horizon += max(pending.dead_ns) / NANOSECONDS if pending else 0.0
+                target = replace(target, later=tuple(
+                    (seconds, self._within_reach(found, estimate.w))
+                    for seconds, later in ahead(horizon)
+                    if (found := self.target(later, estimate.w, start)) is not None))
             if pending is not None and any(pending.dead_ns) and pending.applied.values:
                 return target, self._ahead(estimate, target, memory, interval, previous, pending)
             return target, self._checked(
@@ -156,6 +167,7 @@ class FallbackLevel:
         dead_ns = np.array(pending.dead_ns)
         shortest, longest = int(dead_ns.min()), int(dead_ns.max())
         estimate = self._predicted(estimate, pending.between(0, shortest))
+        target = target.after(shortest / NANOSECONDS)
         planned = None if shortest == longest else self.law.compute_later(
             estimate, target, memory, interval, previous, LaterInputs(
                 (dead_ns - shortest) / NANOSECONDS, pending.between(shortest, longest)))

@@ -17,6 +17,7 @@ from koopman_ros.model import Coordinates
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS
 MAX_SCHEDULED = 1000
+MAX_AHEAD = 30  # set-points that a law looks ahead to
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,30 @@ def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
         # nobody knows yet; the first measurement decides
         return effective_ns > 0
     return now_ns < effective_ns <= now_ns + HORIZON_NANOSECONDS
+
+
+def ahead(setpoint: Setpoint, box: Coordinates, ramp: Array, lag: float, now_ns: int,
+          horizon: float) -> list[tuple[float, Array]]:
+    """
+    Return the active set-points (n_c,) of the next seconds, if one is scheduled for then.
+
+    :param box: as `ramp` and `lag` of :func:`advance`.
+    :return: seconds from now, at most :data:`MAX_AHEAD`, with the set-point from then on.
+    """
+    times = np.array([(at_ns - now_ns) / NANOSECONDS for at_ns, _ in setpoint.scheduled])
+    times = times[(times > 0.0) & (times <= horizon)]
+    if setpoint.active is None or not len(times):
+        return []
+    if lag > 0.0 or np.isfinite(ramp).any() or len(times) > MAX_AHEAD:
+        times = horizon * np.arange(1, MAX_AHEAD + 1) / MAX_AHEAD
+    found, before, active = [], 0.0, setpoint.active
+    for seconds in times.tolist():
+        setpoint = advance(setpoint, active, box, ramp, now_ns + round(seconds * NANOSECONDS),
+                           seconds - before, lag)
+        assert setpoint.active is not None
+        found.append((seconds, setpoint.active))
+        before = seconds
+    return found
 
 
 def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, now_ns: int,

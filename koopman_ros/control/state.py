@@ -26,6 +26,7 @@ from koopman_ros.estimation import (
     AppliedInputs,
     Estimate,
     Estimator,
+    History,
     Innovation,
     MeasuredDisturbances,
 )
@@ -58,6 +59,7 @@ class State:
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
     disturbances: MeasuredDisturbances | None = None  #: measured ones; None without any so far
+    history: History = field(default_factory=History)  #: of the estimate, for late values
     supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
     recovery: SafeStateRecovery | None = None
@@ -73,8 +75,8 @@ class State:
 
     def restarted(self, time_ns: int | None) -> State:
         """Return the state after a measurement, without the parts that may have made it fail."""
-        return replace(self, **WITHOUT_LAW, estimate=None, recovery=None, target=None,
-                       time_ns=time_ns)
+        return replace(self, **WITHOUT_LAW, estimate=None, history=History(),
+                       recovery=None, target=None, time_ns=time_ns)
 
     @property
     def own_command(self) -> Array | None:
@@ -111,6 +113,7 @@ class MeasurementReport:
     #: whether its stamp was earlier than the last by more than 1 s, which resets time
     clock_went_back: bool = False
     follows: bool = True  #: whether the applied input, if measured, equals the command
+    uncertain: tuple[str, ...] = ()  #: signals of uncertain quality
 
 
 NOTHING_MEASURED = MeasurementReport()

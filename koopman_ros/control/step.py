@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
 from koopman_ros.control.configuration import Configuration
+from koopman_ros.control.estimates import UNCERTAIN
 from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws.base import LawResult, Target
 from koopman_ros.control.recovery import moves_toward_nominal, SafeStateRecovery
@@ -41,7 +43,7 @@ from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import LATE_NANOSECONDS
-from koopman_ros.estimation import Estimate, Verdict
+from koopman_ros.estimation import Estimate, History, Verdict
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class ControlStep(Configuration):
 
     def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
              countable: float | None = None, disturbances: Array | None = None,
-             ages: Array | None = None) -> tuple[State, Array, StepReport]:
+             ages: Array | None = None, quality: tuple[int, ...] | None = None
+             ) -> tuple[State, Array, StepReport]:
         """
         Answer one measurement.
 
@@ -67,6 +70,8 @@ class ControlStep(Configuration):
         :param disturbances: (n_d,) measured disturbances, NaN for one that is not measured, or
             None; see :func:`koopman_ros.estimation.check_disturbances`.
         :param ages: (n_d,) their ages in s, or None where they are of that time.
+        :param quality: (n_y,) 0 good, 1 uncertain, more bad, which counts as missing; None for
+            good.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         :raises ValueError: for a measurement or an input of another size.
@@ -91,14 +96,16 @@ class ControlStep(Configuration):
         def calculate() -> tuple[State, Array, StepReport]:
             known, follows = self.estimation.applied(state, applied)
             known = self.estimation.disturbed(known, disturbances, ages, time_ns)
-            now, seen = self.estimation.observe(known, y, time_ns, time.elapsed)
+            now, seen = self.estimation.observe(known, y, time_ns, time.elapsed, quality)
             accepted = seen.verdict.fault is None
             if accepted:
                 now = self._advanced(now, seen.x, time)
             return self._command(now, seen.verdict, MeasurementReport(
                 Arrival.ACCEPTED if accepted else Arrival.REJECTED,
                 seen.outside if accepted else self._outside(state.estimate, y), seen.expected,
-                missed, back, follows), time)
+                missed, back, follows, tuple(
+                    name for name, level in zip(self.measured.names, quality or (), strict=False)
+                    if level == UNCERTAIN)), time)
 
         return self._contained(
             calculate, state, MeasurementReport(
@@ -121,8 +128,7 @@ class ControlStep(Configuration):
         time = time_of_silence(state, time_ns)
 
         def calculate() -> tuple[State, Array, StepReport]:
-            now = replace(state, estimate=self.estimation.predict(
-                state, time.now_ns, time.elapsed))
+            now = self.estimation.predicted(state, time.now_ns, time.elapsed)
             if cause is not None or state.mode is Mode.MANUAL:
                 fault = None if cause is None else reason(cause)
                 return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
@@ -187,9 +193,10 @@ class ControlStep(Configuration):
             why = supervisor.reason
             changes |= {'supervisor': supervisor, 'recovery': recovery}
             if state.estimate is not None:
-                changes['estimate'] = self.estimation.transfer_estimate(
-                    state.estimate, self.estimation.level(state.supervisor),
-                    self.estimation.level(supervisor))
+                levels = [self.estimation.level(one) for one in (state.supervisor, supervisor)]
+                changes['estimate'] = self.estimation.transfer_estimate(state.estimate, *levels)
+                if levels[0] is not levels[1]:
+                    changes['history'] = History()
             if target is not None and not self.best.controls_all:
                 changes['target'] = read_only(np.concatenate((
                     self.model.states.to_physical(target.x),
@@ -222,7 +229,9 @@ class ControlStep(Configuration):
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, memory, time.spacing, state.target,
-                state.own_command, self.estimation.pending(state, time.command_ns))
+                state.own_command, self.estimation.pending(state, time.command_ns),
+                partial(setpoints.ahead, state.setpoint, self.controlled,
+                        self.tuning.setpoint_ramp, self.tuning.setpoint_filter_time, time.now_ns))
             if result.failure is not None:
                 requested = self._failed(level, result.failure, result.passing)
                 continue
@@ -240,7 +249,8 @@ class ControlStep(Configuration):
     def _recovery(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> SafeStateRecovery | None:
         """Return how far the plant has come back where the safe input keeps it outside."""
-        if supervisor.level != SAFE or verdict.fault is not None or verdict.accepted is None:
+        if (supervisor.level != SAFE or supervisor.latched or verdict.fault is not None
+                or verdict.accepted is None):
             return None
         if outside > 0.0 and not moves_toward_nominal(
                 self.model, self.estimation.position(state.estimate, verdict.accepted.value),

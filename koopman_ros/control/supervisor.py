@@ -35,6 +35,7 @@ class FallbackOrder:
     hold_timeout: float = 60.0
     #: seconds that a better level must have been possible before it is taken
     recovery_time: float = 10.0
+    safe_latch: bool = False  #: whether the safe input, once reached, stays until it is cleared
 
     def __post_init__(self) -> None:
         if list(self.margins) != sorted(self.margins):
@@ -86,6 +87,13 @@ class Supervisor:
     resumes: str | None = None  #: the level that follows when a passing reason is gone, or None
     bad_since_ns: int | None = None  #: since when no law could act, or None
     better_since_ns: int | None = None  #: since when a better level has been possible, or None
+    latched: bool = False  #: whether the safe input stays until an operator clears it
+
+    @classmethod
+    def latched_before(cls) -> Supervisor:
+        """Return that of a controller whose predecessor had latched."""
+        return cls(SAFE, reason(StatusCode.SAFE_LATCHED, cause=reason(
+            StatusCode.LATCHED_BEFORE)), latched=True)
 
     @property
     def settled(self) -> str | None:
@@ -111,8 +119,24 @@ class Supervisor:
         """
         Fall back immediately; recover when it was possible for long enough.
 
-        A hold becomes the safe input after its timeout.
+        A hold becomes the safe input after its timeout, which may latch.
         """
+        found = self._next(order, requested, time_ns)
+        if not (order.safe_latch and (self.latched or found.level == SAFE)):
+            return found
+        possible, since, cause = requested.level in order.laws, None, found.reason
+        if possible:
+            since = time_ns if self.better_since_ns is None else self.better_since_ns
+        if self.latched and self.reason is not None:
+            cause = self.reason.cause if possible else requested.reason
+        assert cause is not None
+        ready = since is not None and (time_ns - since) / NANOSECONDS >= order.recovery_time
+        return Supervisor(SAFE, reason(
+            StatusCode.LATCH_CLEARABLE if ready else StatusCode.SAFE_LATCHED, cause=cause), None,
+            found.bad_since_ns, since, latched=True)
+
+    def _next(self, order: FallbackOrder, requested: LevelRequest, time_ns: int) -> Supervisor:
+        """Return the same without a latch."""
         depth, bad_since, why = order.depth, None, requested.reason
         if requested.level == HOLD:
             bad_since = time_ns if self.bad_since_ns is None else self.bad_since_ns

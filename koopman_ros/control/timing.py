@@ -11,6 +11,7 @@ import math
 from koopman_ros.control.state import State
 from koopman_ros.control.supervisor import HOLD
 from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
+from koopman_ros.estimation import History
 
 # s that the rate limit counts at most between two commands without a measurement, unless
 # measurements are usually further apart.
@@ -45,7 +46,7 @@ def afresh(state: State, by_ns: int) -> State:
     return replace(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
                    applied=state.applied.shifted(by_ns), supervisor=supervisor, recovery=None,
                    disturbances=state.disturbances and state.disturbances.shifted(by_ns),
-                   setpoint=replace(state.setpoint, scheduled=()))
+                   setpoint=replace(state.setpoint, scheduled=()), history=History())
 
 
 def time_of_measurement(state: State, time_ns: int, countable: float | None

@@ -36,6 +36,8 @@ KNOWN_TYPES = {
     'sensor_msgs/msg/Range': FieldDefaults('range', 'm'),
     'sensor_msgs/msg/JointState': FieldDefaults('position[{name}]'),
     'std_msgs/msg/Float64': FieldDefaults('data'),
+    'std_msgs/msg/UInt8': FieldDefaults('data'),
+    'diagnostic_msgs/msg/DiagnosticStatus': FieldDefaults('level'),
     'std_msgs/msg/Float64MultiArray': FieldDefaults('data[0]'),
 }
 _ANY = FieldDefaults('')

@@ -48,6 +48,8 @@ class StatusCode(Enum):
     FROZEN = 'sensor_frozen', (
         'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s while '
         'the model moved by more than {change:change}: the sensor may be stuck; check it')
+    BAD_QUALITY = 'bad_quality', (
+        'the quality of the measured {signal} is bad: check the sensor')
     DISTURBANCE_SILENT = 'disturbance_silent', (
         'no measurement of {signal} for more than {timeout:g} s: its last value {held:value} is '
         'assumed; check the sensor')
@@ -67,6 +69,17 @@ class StatusCode(Enum):
     LAW_FAILED = 'law_failed', 'the {level:level} failed: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
     RECOVERING = 'recovering', '{cause} (cleared; waiting for recovery_time)'
+    SAFE_LATCHED = 'safe_latched', (
+        '{cause}; the safe state is latched: remove the cause, then clear it on the panel or by '
+        'the service clear_safe_state')
+    LATCH_CLEARABLE = 'latch_clearable', (
+        '{cause} (gone); the safe state is latched: clear it on the panel or by the service '
+        'clear_safe_state')
+    LATCHED_BEFORE = 'latched_before', 'the safe state was reached before the restart'
+    NOT_LATCHED = 'not_latched', 'the safe state is not latched: there is nothing to clear'
+    LATCH_KEPT = 'latch_kept', (
+        'the safe state stays latched until a control law has been possible for '
+        '{recovery_time:g} s: {cause}')
     LOST_HERE = 'lost_here', (
         'in the acceptance test the {level:level} did not reach the set-point from a state like '
         'this one, but a linear law did')
@@ -125,6 +138,9 @@ class StatusCode(Enum):
     SCHEDULE_FULL = 'schedule_full', (
         '{most} set-points are already scheduled, the maximum: wait until some have taken effect, '
         'or send this one with stamp 0')
+    ANALYSIS_REFUSED = 'analysis_refused', (
+        'the value of {signal} is {age:.4g} s old and cannot correct the estimate, which reaches '
+        'back {reach:.4g} s: check its stamp, analysis_delay and estimator')
     NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
         'manual command refused in automatic mode: switch to manual mode first')
     MANUAL_NOT_FINITE = 'manual_not_finite', (

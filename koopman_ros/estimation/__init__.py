@@ -15,6 +15,7 @@ from koopman_ros.estimation.disturbance_observer import (
     equivalent_bias,
     MeasuredState,
 )
+from koopman_ros.estimation.history import Analysis, History, Instant
 from koopman_ros.estimation.kalman_filters import ExtendedKalmanFilter, UnscentedKalmanFilter
 from koopman_ros.estimation.measured_disturbances import (
     check_disturbances,
@@ -30,7 +31,8 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
     'unscented_kalman_filter': UnscentedKalmanFilter,
 }
 
-__all__ = ['ESTIMATORS', 'Accepted', 'AppliedInputs', 'DisturbanceObserver', 'Estimate',
-           'Estimator', 'ExtendedKalmanFilter', 'Innovation', 'MeasuredDisturbances',
-           'MeasuredState', 'PendingInputs', 'Standstill', 'UnscentedKalmanFilter', 'Verdict',
-           'check', 'check_disturbances', 'equivalent_bias', 'held_means', 'largest_bandwidth']
+__all__ = ['ESTIMATORS', 'Accepted', 'Analysis', 'AppliedInputs', 'DisturbanceObserver',
+           'Estimate', 'Estimator', 'ExtendedKalmanFilter', 'History', 'Innovation', 'Instant',
+           'MeasuredDisturbances', 'MeasuredState', 'PendingInputs', 'Standstill',
+           'UnscentedKalmanFilter', 'Verdict', 'check', 'check_disturbances', 'equivalent_bias',
+           'held_means', 'largest_bandwidth']

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -146,6 +147,35 @@ class Estimator(ABC):
         :param predicted: whose disturbance is kept, or None where nothing is known.
         :param u: (n_u,) input that is assumed to hold the plant there, or None.
         """
+
+    def predict_over(self, estimate: Estimate, pieces: Iterable[tuple[float, Array]],
+                     rate: Array | None) -> Estimate | None:
+        """
+        Predict an estimate over a number of inputs.
+
+        :param pieces: seconds, and the (n_u,) input that acts for so long, in scaled deviations.
+        :param rate: (n_x,) due to the measured disturbances, or None.
+        :return: the estimate then, without that rate, or None as from :meth:`predict`.
+        """
+        begin = estimate.under(rate)
+        now: Estimate | None = begin
+        for seconds, u in pieces:
+            now = now and self.predict(now, u, seconds)
+        return now if now is None or rate is None else replace(
+            now, w=estimate.w + (now.w - begin.w))
+
+    def with_noise(self, factor: Array) -> Estimator:
+        """Return the estimator for measurements with (n_y,) times the noise; itself by default."""
+        return self
+
+    def with_analysis(self, predicted: Estimate, index: int, x: float, deviation: float
+                      ) -> Estimate:
+        """
+        Correct by a value of one state alone, a scaled deviation with its standard deviation.
+
+        :raises NotImplementedError: by default; then such values are refused.
+        """
+        raise NotImplementedError
 
     def transferred(self, estimate: Estimate, rate: Array) -> Estimate:
         """

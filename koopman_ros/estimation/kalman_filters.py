@@ -3,6 +3,7 @@
 
 """Nonlinear Kalman filters on the model's drift: states that are not measured, disturbances."""
 
+import copy
 from dataclasses import replace
 from functools import cached_property
 import math
@@ -57,6 +58,8 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         max(slowest, 1.0 / _LONGEST))
     noise = np.where(tuning.measurement_noise > 0.0, tuning.measurement_noise, np.where(
         recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half))
+    # the error of a value that is not reported is uniformly distributed
+    noise = np.hypot(noise, tuning.sensor.unreported / math.sqrt(3.0))
     dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
     if dead_time > 0.0:
         # at one sample a second the bandwidth of a filter is the root of the ratio between the
@@ -214,6 +217,24 @@ class ExtendedKalmanFilter(Estimator):
         return Estimate(
             predicted.x + step[:n], self.bounded(predicted.w + step[n:]), 0.5 * (P + P.T),
             _averaged(predicted.innovation, innovation / np.sqrt(np.diag(S)), square))
+
+    def with_noise(self, factor: Array) -> Estimator:
+        """Return the filter for measurements with (n_y,) times the noise."""
+        return self._observing(self._H, factor * self._noise)
+
+    def with_analysis(self, predicted: Estimate, index: int, x: float, deviation: float
+                      ) -> Estimate:
+        """Correct by a value of one state; the innovation stays that of the measurements."""
+        H, measured = np.eye(self.model.n_x)[[index]], predicted.x.copy()
+        measured[index] = x
+        found = self._observing(H, np.array([deviation])).correct(predicted, measured, 0.0)
+        return replace(found, innovation=predicted.innovation)
+
+    def _observing(self, H: Array, noise: Array) -> Estimator:
+        """Return the filter for other outputs (n, n_x) of scaled deviations with noise (n,)."""
+        other = copy.copy(self)
+        other._H, other._R = H, np.diag(noise ** 2)
+        return other
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
         """Start from a state (n_x,) with the measured outputs; see the observer's."""

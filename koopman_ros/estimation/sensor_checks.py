@@ -68,7 +68,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
         return Verdict(Accepted(y, time_ns, changed))
     seconds = (time_ns - last.time_ns) / NANOSECONDS
     change = np.abs(y - last.value)
-    excess = change / (limits.jump + limits.rate * seconds)
+    excess = change / (limits.jump + limits.unreported + limits.rate * seconds)
     i = int(np.argmax(excess))
     if excess[i] > 1.0:
         return Verdict(replace(last, jumped=True), reason(
@@ -76,7 +76,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
             value=float(y[i]),
             seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
     # back after a jump, and further than noise brings it
-    moved = last.jumped and bool(np.any(change > limits.jump))
+    moved = last.jumped and bool(np.any(change > limits.jump + limits.unreported))
     still = change == 0.0
     if not still.any():
         return Verdict(Accepted(y, time_ns, changed), moved=moved)
@@ -86,7 +86,9 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
               for since, same in zip(before.since_ns, still, strict=True)),
         np.where(still, before.travel + travel(before), 0.0), before.w)
     accepted = Accepted(y, time_ns, stuck)
-    should_move = still & (np.abs(stuck.travel) > 0.5 * limits.jump)
+    # one that reports on change has a heartbeat
+    should_move = still & (np.abs(stuck.travel) > 0.5 * limits.jump) & (
+        limits.report_on_change == 0.0)
     stood = np.where(should_move, (time_ns - np.array(stuck.since_ns)) / NANOSECONDS, 0.0)
     i = int(np.argmax(stood))
     if stood[i] > limits.stuck_sensor_timeout > 0.0:

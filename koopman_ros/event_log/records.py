@@ -33,7 +33,8 @@ VERSION = 1
 EVENTS: dict[str, type[events.Event]] = {
     'measurement': events.Measurement, 'silence': events.Silence,
     'setpoint': events.SetpointRequest, 'manual_command': events.ManualCommand,
-    'mode': events.ModeChange, 'initialisation': events.Initialisation}
+    'mode': events.ModeChange, 'initialisation': events.Initialisation,
+    'analysis': events.AnalysisValue, 'clear_safe_state': events.ClearSafeState}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
 _FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
 _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
@@ -98,7 +99,9 @@ def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, d
             'command': _written(outcome.command),
             'setpoint': None if report.target is None else numbers(report.target.setpoint),
             'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
-    elif isinstance(event, (events.SetpointRequest, events.ManualCommand)):
+    elif isinstance(event, (
+            events.SetpointRequest, events.ManualCommand, events.AnalysisValue,
+            events.ClearSafeState)):
         written |= {'accepted': outcome.refused is None, 'reason': _codes(outcome.refused)}
     return name, written
 
@@ -108,7 +111,8 @@ def event_of(record: EventRecord) -> events.Event:
     if record.event not in EVENTS:
         raise ValueError(f'unknown event {record.event!r}')
     kind = EVENTS[record.event]
-    return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]})
+    return kind(**{name: _read(name, record.fields[name]) for name in _FIELDS[kind]
+                   if name in record.fields})
 
 
 def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
@@ -141,9 +145,9 @@ def _read(name: str, value: Any) -> Any:
         return Mode[value.upper()]
     if name == 'cause':
         return None if value is None else StatusCode(value)
-    if name == 'signals':
-        return None if value is None else tuple(map(str, value))
-    return value if value is None or isinstance(value, (int, float)) else float_array(value)
+    if name in ('signals', 'quality'):
+        return None if value is None else tuple(map(str if name == 'signals' else int, value))
+    return value if value is None or isinstance(value, (int, float, str)) else float_array(value)
 
 
 def _codes(reason: Reason | None) -> list[str]:

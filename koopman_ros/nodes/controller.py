@@ -46,6 +46,7 @@ from koopman_ros.ros.controller_messages import RecordPublisher, ReportPublisher
 from koopman_ros.ros.diagnostics import TaskReport
 from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
+from koopman_ros.ros.latch_file import LatchFile
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.measurements import Measurements, Sample
 from koopman_ros.ros.model_reload import ModelReload
@@ -89,6 +90,7 @@ class ControllerNode(ManagedNode):
         self._loaded: LoadedModel | None = loaded
         # before the node became inactive: its last command is still in force at the plant
         self._last = State()
+        self._latch = LatchFile(self)
 
     def configure(self) -> None:
         """Load the model and create the loop, which does not command yet."""
@@ -120,7 +122,8 @@ class ControllerNode(ManagedNode):
         self._counts = status.Counts()
         self._measured = np.full(len(signals.states), np.nan)
         self._connect(SignalTopics(signals, parameters.states, parameters.inputs,
-                                   disturbances=parameters.disturbances))
+                                   disturbances=parameters.disturbances,
+                                   analyses=parameters.every_state))
         self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
         self._diagnostics = self.diagnostics.add_group(self._statuses, status.TASKS)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
@@ -139,8 +142,7 @@ class ControllerNode(ManagedNode):
         self._commands = SignalPublisher(wiring.commands, self._signals.inputs, endpoints.publish)
         self._reports = ReportPublisher(endpoints, wiring)
         self._measurements = Measurements(
-            self, endpoints, wiring, exclusive, self._settings.synchronisation_tolerance,
-            self._answer)
+            self, endpoints, wiring, exclusive, self._settings, self._answer)
         self._requests = OperatorRequests(
             self, endpoints, wiring, self._loop, self._measurements.applied,
             lambda: self._diagnostics.publish_if_changed())
@@ -157,7 +159,8 @@ class ControllerNode(ManagedNode):
         """Begin to command, from the present inputs; earlier set-point requests are kept."""
         with self._loop.lock:
             self._timing, self._received = Timing(self), time.monotonic()
-            self._loop.begin(self._timing, self._last)
+            self._loop.begin(self._timing, self._last,
+                             self._settings.tuning.safe_latch and self._latch.marked)
             self._measurements.begin(
                 self._timing, lambda: self._settings.measurement_timeout or _SOURCES_WINDOW,
                 lambda: self._loop.state.command is not None)
@@ -168,6 +171,7 @@ class ControllerNode(ManagedNode):
         with self._loop.lock:
             self._loop.active = False
             self._measurements.end()
+            self._latch.update(self._loop.state.supervisor.latched)
             if self._loop.state.command is not None:
                 self._last = self._loop.state
 
@@ -209,7 +213,7 @@ class ControllerNode(ManagedNode):
         present = applied.latest if self._last.command is None else self._last.command
         event = events.Measurement(
             stamp_ns, sample.values, measured, countable,
-            *self._measurements.disturbances.with_ages(stamp_ns) or ())
+            *self._measurements.disturbances.with_ages(stamp_ns) or (), quality=sample.quality)
         outcome = self._loop.answer(event, present if measured is None else measured, arrived,
                                     advance is not Advance.OLD)
         if outcome is None or outcome.report is None:
@@ -236,6 +240,8 @@ class ControllerNode(ManagedNode):
         if self._loop.state.command is None or not self.active or all(
                 map(topics.has_subscribers, self._commands.publishers)):
             self._received = time.monotonic()
+        if self.active:
+            self._latch.update(self._loop.state.supervisor.latched)
         if self._status_pending:
             self._publish_status(self._report, time.monotonic())
         with self._loop.lock:
@@ -292,7 +298,8 @@ class ControllerNode(ManagedNode):
         loop = self._loop
         situation = status.StatusContext(
             loop.controller, self._settings, self._signals, loop.state, self._report,
-            self._counts, self._timing, self._measurements.assembler, self._measured,
+            self._counts, self._timing, self._measurements.assembler, self._measurements.awaited,
+            self._measured,
             complaint=self._endpoints.complaint or self._measurements.complaint,
             unheard=[publisher.topic_name for publisher in self._commands.publishers
                      if not topics.has_subscribers(publisher)],

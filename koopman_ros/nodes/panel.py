@@ -68,6 +68,7 @@ _LOGGED = 300  # characters of an action in the log
 _SERVICES = {
     'reset': (PLANT, 'reset', Trigger), 'reload': (CONTROLLER, 'reload_model', Trigger),
     'automatic': (CONTROLLER, 'set_automatic', SetBool),
+    'clear safe state': (CONTROLLER, 'clear_safe_state', Trigger),
     'train': (TRAINER, 'train', Trigger), 'cancel': (TRAINER, 'cancel_training', Trigger),
     'record': (TRAINER, 'record', SetBool), 'experiment': (TRAINER, 'experiment', SetBool)}
 _DONE = ('acknowledge', 'shelve', 'unshelve')  #: actions that the pages have carried out

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The player: the inputs of a controller from a bag, as they were recorded."""
+"""The player: the inputs of a controller from a bag, as recorded, or set-points from a CSV."""
 
 import copy
 import sys
@@ -17,11 +17,12 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from koopman_ros import records
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import player_table
+from koopman_ros.parameters.trainer import player_table, preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
+from koopman_ros.ros.setpoint_table import SetpointTable
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _POLL_PERIOD_NS = 10_000_000  # for what no message announces
@@ -47,11 +48,14 @@ class PlayerNode(LoopNode):
             raise ConfigurationError(reason)
         # by topic of the bag
         names = {'/' + name.lstrip('/'): name for name in settings.topics}
-        content = records.summary(settings.bag)
+        table = SetpointTable.read(
+            settings, preset_wiring(settings.system)) if settings.bag.endswith('.csv') else None
+        content = records.summary(settings.bag) if table is None else table.content
         begin_ns = (content.start_ns or 0) + round(settings.start_offset * NANOSECONDS)
-        self._messages = (message for message in records.in_log_order(
-            records.read_messages(settings.bag, names, recover=settings.recover))
-            if message.log_time_ns >= begin_ns)
+        messages = records.in_log_order(records.read_messages(
+            settings.bag, names, recover=settings.recover)) if table is None else (
+                table.messages(self.get_clock(), settings.setpoint_lead))
+        self._messages = (message for message in messages if message.log_time_ns >= begin_ns)
         played = {topic: name for topic, name in names.items() if content.counts.get(topic)}
         if not played:
             known = ', '.join(sorted(t for t, count in content.counts.items() if count))

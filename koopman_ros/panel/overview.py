@@ -267,7 +267,15 @@ def _controller_card(page: PageLayout) -> None:
                      'In manual mode the set-point is not controlled.']):
                 answer.show(await page.act('automatic', CONTROLLER, manual, not manual))
 
+        async def clear() -> None:
+            if await page.confirm(
+                    'Clear the latched safe state?', 'Clear the safe state',
+                    ['The control laws command the inputs again at once.']):
+                answer.show(await page.act('clear safe state', CONTROLLER))
+
         button = page.button('', switch)
+        with box('row1 hidden') as latched:
+            page.button('Clear the safe state …', clear)
         answer = AnswerLine()
 
     def show(now: Snapshot) -> None:
@@ -281,5 +289,6 @@ def _controller_card(page: PageLayout) -> None:
                                       in now.estimates))
         button.set_text('Switch to automatic mode' if now.mode == 'manual'
                         else 'Switch to manual mode …')
+        show_if(latched, now.status(CONTROL).values.get('safe state') == 'latched')
 
     page.follow(show)

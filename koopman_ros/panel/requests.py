@@ -23,8 +23,8 @@ class Action:
     """Action of an operator."""
 
     who: str
-    #: setpoint, manual, automatic, reset, reload, record, experiment, train, cancel, compare,
-    #: end comparison or parameters
+    #: setpoint, manual, automatic, clear safe state, reset, reload, record, experiment, train,
+    #: cancel, compare, end comparison or parameters
     what: str
     name: str = ''  #: of the signal or the node
     value: Any = None  #: in the unit in which people read it

@@ -159,6 +159,9 @@ class LoopViewModel:
     def take_record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
         """Take a record of the controller's event log; a malformed one is ignored."""
         self.conditions.take_message(CONTROLLER, now)
+        if event == 'measurement':
+            # one that is reported on change may stand for many
+            self.conditions.take_message(PLANT, now)
         try:
             self._take_event(event, fields)
         except (AttributeError, KeyError, TypeError, ValueError):

@@ -17,7 +17,6 @@ from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
 from koopman_ros.core.declaration import (
     nested,
-    NoParameters,
     of_other_states,
     parameter,
     per_signal,
@@ -27,6 +26,7 @@ from koopman_ros.core.signals import Outputs
 from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
+    AnalysisPlaces,
     box_defaults,
     DEFAULT_SYSTEM,
     InputPlaces,
@@ -65,6 +65,9 @@ class ControllerParameters:
         0.0, 'Largest difference between the stamps of messages that belong to one '
              'measurement.', 's',
         0.0, 10.0, read_only=True)
+    sample_time: float = parameter(
+        1.0, 'Time between two commands if all measured signals have a report_on_change.', 's',
+        0.01, 3600.0, read_only=True)
     tuning: Tuning = nested(Tuning)
     measurement_timeout: float = parameter(
         10.0, 'Plant time without a newer measurement after which the inputs are held and '
@@ -84,8 +87,8 @@ class ControllerParameters:
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces, 'measured')
     inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
     disturbances: Mapping[str, MeasuredPlace] = per_signal(MeasuredPlace)
-    #: names of all states that the tuning is for
-    every_state: Mapping[str, NoParameters] = per_signal(NoParameters, 'states')
+    #: of all states that the tuning is for
+    every_state: Mapping[str, AnalysisPlaces] = per_signal(AnalysisPlaces, 'states')
 
 
 def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
@@ -115,8 +118,8 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
         plugin_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
     except ValueError as error:
         return f'estimator = {tuning.estimator!r}: {error}'
-    return SignalTopics(signals, values.states, values.inputs,
-                        disturbances=values.disturbances).check()
+    return SignalTopics(signals, values.states, values.inputs, disturbances=values.disturbances,
+                        analyses=values.every_state).check()
 
 
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
@@ -147,6 +150,8 @@ def _dynamics(model: LiftedModel) -> dict[str, Any]:
     # a window, a fifth of it, is to show the slowest mode, and not to let an unstable one run off
     shown = max(slowest, 0.1 * fastest, float(np.max(modes.real)), 1e-3)
     return {**levels,
+            'sample_time': (
+                min(max(float(f'{0.1 / fastest:.2g}'), 0.01), 1.0) if fastest > 0.0 else 1.0),
             'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
             'bumpless_transfer_time': (
                 min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0),

@@ -34,11 +34,13 @@ CLOCK = '/clock'
 #: the default system
 DEFAULT_SYSTEM = 'reactor'
 
+QUALITY = '1'  #: unit of a quality
+
 LONGEST_FRAME_ID = 256  # characters that are passed on
 
 # The places of signals: of states, then of inputs and of disturbances.
-KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual',
-         'measured_disturbances')
+KINDS = ('measured', 'quality', 'late', 'setpoints', 'active_setpoints', 'predicted', 'applied',
+         'commands', 'manual', 'measured_disturbances')
 PLANT_KINDS = ('measured', 'applied', 'commands', 'measured_disturbances')
 # parameters that name them
 SIGNALS = ('states_measured', 'inputs_commanded', 'disturbances_measured', 'controlled')
@@ -66,9 +68,25 @@ class MeasuredPlace:
 class StatePlaces(MeasuredPlace):
     """Where a measured state is; its set-points and prediction have the same type and field."""
 
+    quality_topic: str = _topic('Topic of the quality of the measurements, as levels of '
+                                'DiagnosticStatus: 0 good, 1 uncertain, above bad; empty: none.')
+    quality_type: str = parameter(
+        'std_msgs/msg/UInt8', 'Message type of the quality.', read_only=True,
+        choices=('std_msgs/msg/UInt8', 'diagnostic_msgs/msg/DiagnosticStatus'))
     setpoint_topic: str = _topic('Topic of requested set-points.')
     active_setpoint_topic: str = _topic('Topic of the active set-point.')
     predicted_topic: str = _topic('Topic of the predicted measurement.')
+
+
+@dataclass(frozen=True)
+class AnalysisPlaces:
+    """Where values of a state come that are rare and late, as from a laboratory."""
+
+    analysis_topic: str = _topic('Topic of rare values that come late, as of an analyser; empty: '
+                                 'none.')
+    analysis_type: str = _topic('Message type of these values; empty: the usual type.')
+    analysis_field: str = _topic('Message field that holds the value; empty: the usual field.')
+    analysis_unit: str = _topic('Unit of that value; empty: the usual unit of the type.')
 
 
 @dataclass(frozen=True)
@@ -218,6 +236,8 @@ class SignalTopics:
     kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
     #: places of its measured disturbances, by name
     disturbances: Mapping[str, Any] = field(default_factory=dict)
+    #: places of late values, by name of the state
+    analyses: Mapping[str, AnalysisPlaces] = field(default_factory=dict)
 
     #: measurements of the states, and their predictions
     measured = _role('states', 'topic')
@@ -230,6 +250,19 @@ class SignalTopics:
     manual = _role('inputs', 'manual_topic', commanded=True)
     applied = _role('inputs', 'topic')
     measured_disturbances = _role('disturbances', 'topic')
+
+    @cached_property
+    def quality(self) -> dict[str, MessageField]:
+        """Qualities of the measurements that have one."""
+        return {name: _place(given.quality_topic, name, QUALITY, {'type': given.quality_type})
+                for name, given in self.states.items() if given.quality_topic}
+
+    @cached_property
+    def late(self) -> dict[str, MessageField]:
+        """Late values of states that have some."""
+        return {name: _place(given.analysis_topic, name, self.signals.every[name], {
+            kind: getattr(given, f'analysis_{kind}') for kind in ('type', 'field', 'unit')})
+            for name, given in self.analyses.items() if given.analysis_topic}
 
     def check(self) -> str:
         """Return their defect in words, or an empty string."""

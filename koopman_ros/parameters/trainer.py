@@ -291,11 +291,12 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
     wiring = _wiring(signals, {**own, **given})
-    # a preset may have more topics than these, but not those of disturbances
-    recorded = own.pop('topics', (*wiring.topics, CONTROLLER_INTERNALS, PREDICTED_TRAJECTORY,
-                                  ACTIVE_CONSTRAINTS, EVENT_LOG, AUDIT_LOG, DIAGNOSTICS))
-    defaults['topics'] = tuple(dict.fromkeys((*recorded, *(
-        place.topic for place in wiring.measured_disturbances.values()))))
+    usual = (*wiring.topics, CONTROLLER_INTERNALS, PREDICTED_TRAJECTORY, ACTIVE_CONSTRAINTS,
+             EVENT_LOG, AUDIT_LOG, DIAGNOSTICS)
+    # a preset may have more topics than these, but not those of disturbances and qualities
+    own['topics'] = tuple(dict.fromkeys((*own.get('topics', usual), *(
+        place.topic for places in (wiring.measured_disturbances, wiring.quality)
+        for place in places.values()))))
     if present is not None:
         states, inputs = present.states, present.inputs
         defaults |= {
@@ -396,7 +397,16 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
 class PlayerParameters:
     """Snapshot of the player's parameters."""
 
-    bag: str = parameter('run_1', 'Bag to play: a .mcap file or a bag folder.', read_only=True)
+    bag: str = parameter(
+        'run_1', 'Bag to play: a .mcap file or a bag folder; or a .csv of set-points with the '
+        'columns time [s] and <signal> [unit].', read_only=True)
+    setpoint_ramps: bool = parameter(
+        False, 'Ramps between the rows of a .csv, in place of steps.', read_only=True)
+    ramp_period: float = parameter(
+        1.0, 'Time between two set-points of a ramp.', 's', 0.01, 3600.0, read_only=True)
+    setpoint_lead: float = parameter(
+        0.0, 'Time by which set-points of a .csv are sent ahead, with the stamp from which they '
+        'hold, so that the law mpc knows them; 0: not ahead.', 's', 0.0, 3600.0, read_only=True)
     system: str = parameter(
         DEFAULT_SYSTEM, 'Bundled plant whose topics are the defaults; any other name: no '
         'defaults.', read_only=True)
@@ -434,6 +444,8 @@ class PlayerParameters:
 
 
 def _check_player(values: PlayerParameters) -> str:
+    if values.bag.endswith('.csv') and values.rate == 0.0:
+        return 'rate = 0 plays in lock-step, which a .csv of set-points cannot: set rate above 0'
     return refusal(values.topics) or refusal((*values.measurement, values.answer))
 
 
@@ -445,8 +457,8 @@ def player_table(given: Mapping[str, Any] = MappingProxyType({})
     if (wiring := preset_wiring(system)) is not None:
         defaults |= {
             'topics': tuple(dict.fromkeys(place.topic for places in (
-                wiring.applied, wiring.measured_disturbances, wiring.measured, wiring.setpoints,
-                wiring.manual)
+                wiring.applied, wiring.measured_disturbances, wiring.quality, wiring.measured,
+                wiring.setpoints, wiring.manual)
                 for place in places.values())),
             'measurement': tuple(dict.fromkeys(
                 place.topic for place in wiring.measured.values())),

@@ -110,7 +110,7 @@ def _columns(arrays: Mapping[str, Any]) -> Any:
     return pd.DataFrame({name: pd.Series(values) for name, values in columns.items()})
 
 
-def _header(table: Any, column: str) -> tuple[Any, str] | None:
+def header_of(table: Any, column: str) -> tuple[Any, str] | None:
     """Return the header of a column unchanged, with its unit, or None for no such column."""
     for header in table.columns:
         match = _SIGNAL.fullmatch(str(header))
@@ -125,7 +125,7 @@ def _headers(table: Any) -> str:
 
 def with_unit(table: Any, signal: SignalColumn, report: ImportReport) -> SignalColumn:
     """Return a signal with its unit, that of its column where the request has none."""
-    found = _header(table, signal.column)
+    found = header_of(table, signal.column)
     if found is None:
         raise ValueError(f'the record has no column {signal.column!r}, it has {_headers(table)}: '
                          'name one of them')
@@ -173,7 +173,7 @@ def _time_column(table: Any, name: str) -> tuple[Any, str]:
     wanted = SignalColumn.of(name or next(
         (one for one in map(str, table.columns)
          if re.split(r'[\s\[]', one.strip().lower())[0] in _TIME_NAMES), 'time'))
-    if (found := _header(table, wanted.column)) is not None:
+    if (found := header_of(table, wanted.column)) is not None:
         return table[found[0]], wanted.unit or found[1]
     if name and wanted.column == table.index.name:
         return index, wanted.unit
@@ -230,7 +230,7 @@ class TableImport:
     def _values(self, table: Any, signal: SignalColumn) -> Array:
         """Return the numbers (R,) of a column in the unit of the signal, NaN for none."""
         import pandas as pd
-        header, unit = _header(table, signal.column) or ('', '')
+        header, unit = header_of(table, signal.column) or ('', '')
         values = pd.to_numeric(table[header], errors='coerce').to_numpy(dtype=np.float64)
         values = np.where(np.isfinite(values), values, np.nan)
         missing = int(np.sum(np.isnan(values)))

@@ -19,6 +19,7 @@ from koopman_ros.control import (
     Setpoint,
     State,
     StepReport,
+    Supervisor,
 )
 from koopman_ros.control.events import Event, EventOutcome, Measurement, Silence
 from koopman_ros.core.arrays import Array
@@ -66,15 +67,17 @@ class ControlLoop:
         self._held_for: StatusCode | None = None
         self._settling = False
 
-    def begin(self, timing: Timing, last: State) -> None:
+    def begin(self, timing: Timing, last: State, latched: bool) -> None:
         """
         Forget all but the mode and the requested set-points; the caller holds the lock.
 
         :param last: that commanded, of whose inputs some may still act.
+        :param latched: whether the safe state is latched from before.
         """
         asked = self.state.setpoint
         self.state = State(self.state.mode, Setpoint(asked.requested, scheduled=asked.scheduled),
-                           applied=last.applied)
+                           applied=last.applied, supervisor=(
+                               Supervisor.latched_before() if latched else Supervisor()))
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True
 
     def answer(self, event: Measurement, present: Array | None, arrived: tuple[float, int, int],

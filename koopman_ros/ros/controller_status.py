@@ -34,6 +34,7 @@ TASKS = (CONTROL, *CONDITIONS)
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
 _WAY_BACK = 'recovering: the {} moves from its safe value towards the nominal one'
 _INACTIVE = 'inactive'
+_LATCHED = 'the safe state is latched'
 
 
 @dataclass
@@ -71,6 +72,7 @@ class StatusContext:
     counts: Counts
     timing: Timing
     assembler: SampleSynchronizer  #: of the measurements
+    missing: str  #: parts of a measurement that are missing, or empty
     measured: Array  #: (n_y,) last measured, in the units of the signals
     complaint: str  #: problem on the graph, e.g. a second controller; or empty
     unheard: Sequence[str]  #: topics of the commands without a subscriber
@@ -93,7 +95,7 @@ class StatusContext:
     @property
     def awaited(self) -> str:
         """Parts of a measurement that are missing, or empty."""
-        return f' of {self.assembler.awaited}' if self.assembler.awaited else ''
+        return f' of {self.missing}' if self.missing else ''
 
     def commanded(self, command: Array) -> str:
         """Write a command (n_u,) with names and units."""
@@ -158,6 +160,7 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
             now.timing.busy and now.timing.wall_silence > timeout)):
         command = now.state.command
         doing = '' if command is None else f', {now.commanded(command)}'
+        doing += f', {_LATCHED}' if now.state.supervisor.latched else ''
         action = 'manual mode' if mode is Mode.MANUAL else (
             _ACTIONS[HOLD] if report.depth == 0 else _action(now))
         if now.timing.busy:
@@ -177,6 +180,9 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
         level = Severity.ERROR if report.level in _ACTIONS else Severity.WARN
         action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
         return level, f'{action}: {now.reason}'
+    if now.state.supervisor.latched:
+        return Severity.WARN, (f'{mode.value}: {_LATCHED}, and is commanded in automatic mode: '
+                               'clear it on the panel or by the service clear_safe_state')
     return Severity.OK, ''
 
 
@@ -214,6 +220,10 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         yield MEASUREMENTS, (
             f'the last measurement is {now.timing.silence:.0f} s old: commands are based on the '
             'model only; check sensor and plant')
+    if report.measurement.uncertain:
+        yield MEASUREMENTS, (
+            f'the quality of {" and ".join(report.measurement.uncertain)} is uncertain: a Kalman '
+            f'filter assumes {tuning.uncertain_noise_factor:g} times the noise; check the sensor')
     if now.timing.without_clock:
         yield MEASUREMENTS, (
             'use_sim_time is set, but /clock is not published: time-outs use the wall clock; set '
@@ -297,6 +307,8 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'active law': level_words(report.level),
         'law': law.form or 'none',
         'reason': now.reason or 'none',
+        **({'safe state': 'latched' if state.supervisor.latched else 'not latched'}
+           if now.parameters.tuning.safe_latch else {}),
         **now.model(),
         **values_by_name(signals.states, now.measured.tolist()),
         **labelled(controlled, 'set-point', None if target is None else target.setpoint),

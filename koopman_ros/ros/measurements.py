@@ -6,11 +6,14 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, SignalTopics
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, QUALITY, SignalTopics
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.signals import InputWait, MeasuredInputs, SignalSample, SignalSubscriber
@@ -23,23 +26,39 @@ class Sample(NamedTuple):
     stamp_ns: int
     values: Array  #: (n_y,) in the units of the signals
     two_sources: bool  #: whether several publishers send such measurements in turn
+    quality: tuple[int, ...] | None  #: (n_y,) as of an event; None where all are good
 
 
 class Measurements:
     """
     Hand over measurements when they are complete.
 
+    A signal that is reported on change has its last value until its heartbeat is over. If all
+    signals are, there is a measurement every `sample_time`.
+
     :param exclusive: topics on which only one node may publish.
-    :param tolerance: s by which stamps of one measurement may differ.
     :param answer: called with each measurement.
     """
 
     def __init__(self, node: HostedNode, endpoints: topics.EndpointMonitor, wiring: SignalTopics,
-                 exclusive: Mapping[str, str], tolerance: float,
+                 exclusive: Mapping[str, str], settings: ControllerParameters,
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals
-        self._endpoints = endpoints
-        self.assembler = SampleSynchronizer(tuple(signals.states), round(tolerance * NANOSECONDS))
+        self._endpoints, self._names = endpoints, tuple(signals.states)
+        #: ns for which the last value holds, by signal that is reported on change
+        self._heartbeats = {
+            name: round(seconds * NANOSECONDS) for name, seconds in zip(
+                signals.states, settings.tuning.sensor.report_on_change.tolist(), strict=True)
+            if seconds > 0.0}
+        self._clock = node.get_clock()
+        self._reported: dict[str, tuple[int, float]] = {}  # when it came, in ns, and value
+        self.assembler = SampleSynchronizer(
+            tuple(name for name in signals.states if name not in self._heartbeats),
+            round(settings.synchronisation_tolerance * NANOSECONDS))
+        if not self.assembler.names:
+            self._ticked_ns = -1
+            self._shortest_ns = round(0.5 * settings.sample_time * NANOSECONDS)
+            node.create_timer(settings.sample_time, node.guarded(self._on_sample_time))
         self.applied = MeasuredInputs(signals.inputs)
         self.disturbances = MeasuredInputs(signals.disturbances)
         self.frame_id, self._frame_length = '', 0
@@ -53,6 +72,10 @@ class Measurements:
             not self._begun() and not self.applied.complete and self._inputs.published()), answer)
         SignalSubscriber(node, endpoints.subscribe, wiring.measured_disturbances,
                          signals.disturbances, self.disturbances.take)
+        self._quality: dict[str, float] = {}
+        SignalSubscriber(node, endpoints.subscribe, wiring.quality,
+                         dict.fromkeys(wiring.quality, QUALITY),
+                         lambda received: self._quality.update(received.values))
         measured = SignalSubscriber(
             node, endpoints.subscribe, wiring.measured, signals.states, self._on_measurement)
         if measured.unstamped:
@@ -79,6 +102,16 @@ class Measurements:
         self._wait.clear()
 
     @property
+    def awaited(self) -> str:
+        """The signals that are missing in the next measurement, or an empty string."""
+        return self.assembler.awaited or ', '.join(self._silent(self._clock.now().nanoseconds))
+
+    def _silent(self, now_ns: int) -> list[str]:
+        """Return the signals whose heartbeat is over."""
+        return [name for name, heartbeat_ns in self._heartbeats.items() if name not in
+                self._reported or now_ns - self._reported[name][0] > heartbeat_ns]
+
+    @property
     def complaint(self) -> str:
         """The defect of the messages, or an empty string."""
         return '' if self._frame_length <= LONGEST_FRAME_ID else (
@@ -89,7 +122,13 @@ class Measurements:
         self.frame_id = received.frame_id[:LONGEST_FRAME_ID]
         self._frame_length = len(received.frame_id)
         late = self.assembler.late.total()
-        complete = self.assembler.take(received.stamp_ns, received.values)
+        sampled = {name: value for name, value in received.values.items()
+                   if name not in self._heartbeats}
+        complete = self.assembler.take(received.stamp_ns, sampled) if sampled else None
+        if self._heartbeats:
+            now_ns = self._clock.now().nanoseconds
+            self._reported |= {name: (now_ns, value) for name, value in received.values.items()
+                               if name in self._heartbeats}
         if not self._active:
             return
         source, at = self._sources.get(received.topic), self._timing.now()
@@ -97,12 +136,27 @@ class Measurements:
             source.take(received.number, at[0], self._window())
         if self.assembler.late.total() > late:
             self._timing.ignore(at)
-        if complete is None:
+        if complete is not None:
+            self._sampled(complete[0], dict(zip(
+                self.assembler.names, complete[1].tolist(), strict=True)))
+
+    def _on_sample_time(self) -> None:
+        now_ns = self._clock.now().nanoseconds
+        # simulated time may stand between two calls that are late
+        if self._active and not 0 <= now_ns - self._ticked_ns < self._shortest_ns:
+            self._ticked_ns = now_ns
+            self._sampled(now_ns, {})
+
+    def _sampled(self, stamp_ns: int, sampled: Mapping[str, float]) -> None:
+        """Hand over a measurement, unless a signal is missing."""
+        if self._heartbeats and self._silent(self._clock.now().nanoseconds):
             return
-        sample = Sample(*complete, two_sources=any(
-            one.conflict or (one.newest is None and self._endpoints.shared(topic))
-            for topic, one in self._sources.items()))
-        self._wait.take(sample)
+        values = {**sampled, **{name: value for name, (_, value) in self._reported.items()}}
+        quality = tuple(int(self._quality.get(name, 0)) for name in self._names)
+        self._wait.take(Sample(
+            stamp_ns, np.array([values[name] for name in self._names]), any(
+                one.conflict or (one.newest is None and self._endpoints.shared(topic))
+                for topic, one in self._sources.items()), quality if any(quality) else None))
 
     def _on_applied(self, received: SignalSample) -> None:
         self.applied.take(received)

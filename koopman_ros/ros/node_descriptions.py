@@ -145,9 +145,10 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                        topics.CONTROLLER_INTERNALS, topics.PREDICTED_TRAJECTORY,
                        topics.ACTIVE_CONSTRAINTS, topics.EVENT_LOG, topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
-            subscribes=(*topics_of('measured', 'applied', 'measured_disturbances', 'setpoints',
-                                   'manual'), topics.CLOCK),
-            serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES),
+            subscribes=(*topics_of('measured', 'quality', 'applied', 'measured_disturbances',
+                                   'setpoints', 'manual'), topics.CLOCK),
+            serves=('~/set_automatic', '~/clear_safe_state', '~/reload_model', *lifecycle,
+                    *STANDARD_SERVICES),
             many=_HOSTS),
         'trainer': Program(
             'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
@@ -184,7 +185,8 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                         topics.EVENT_LOG, topics.DIAGNOSTICS, '/parameter_events',
                         topics.CLOCK),
             serves=STANDARD_SERVICES,
-            calls=(*(f'controller/{service}' for service in ('set_automatic', 'reload_model')),
+            calls=(*(f'controller/{service}' for service in (
+                'set_automatic', 'clear_safe_state', 'reload_model')),
                    'plant/reset',
                    *(f'trainer/{service}' for service in (
                        'record', 'experiment', 'train', 'cancel_training')),

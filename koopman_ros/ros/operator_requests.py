@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Requests of the operator to a controller: set-points, manual commands, the mode."""
+"""Requests to a controller: set-points, manual commands, the mode, and values of a laboratory."""
 
 from collections.abc import Callable
 import math
@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 from rclpy.node import Node
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.control import events, Mode
 from koopman_ros.core.arrays import Array
@@ -46,7 +46,10 @@ class OperatorRequests:
         for name, place in wiring.manual.items():
             SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.inputs,
                              self._on_manual)
+        SignalSubscriber(node, endpoints.subscribe, wiring.late, wiring.signals.every,
+                         self._on_analysis)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
+        node.create_service(Trigger, '~/clear_safe_state', self._on_clear_safe_state)
 
     @property
     def complaint(self) -> str:
@@ -68,6 +71,11 @@ class OperatorRequests:
                 throttle_duration_sec=1.0)
         self._changed()
 
+    def _on_analysis(self, received: SignalSample) -> None:
+        for name, value in received.values.items():
+            self._change(events.AnalysisValue(received.stamp_ns, name, value))
+        self._changed()
+
     def _on_manual(self, received: SignalSample) -> None:
         state = self._loop.state
         held = state.command if state.manual_input is None else state.manual_input
@@ -87,6 +95,15 @@ class OperatorRequests:
         self._change(events.ModeChange(mode))
         response.success, response.message = True, f'{mode.value} mode'
         self._log.info(response.message)
+        self._changed()
+        return response
+
+    def _on_clear_safe_state(self, _: Trigger.Request, response: Trigger.Response
+                             ) -> Trigger.Response:
+        response.success = self._change(events.ClearSafeState())
+        response.message = 'safe state cleared' if response.success else self._note
+        if response.success:
+            self._log.info(response.message)
         self._changed()
         return response
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, State, Tuning
+from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
@@ -342,6 +343,22 @@ def kelvin(value):
 
 def moved(setpoint, now_ns=NOW, *, measured=320.0, ramp=np.inf, seconds=1.0, lag=0.0):
     return advance(setpoint, kelvin(measured), MODEL.states, kelvin(ramp), now_ns, seconds, lag)
+
+
+@pytest.mark.parametrize(('ramp', 'lag'), [(np.inf, 0.0), (0.5, 0.0), (np.inf, 4.0)])
+def test_the_setpoints_ahead_are_those_that_will_be_active(ramp, lag):
+    setpoint = replace(Setpoint(), requested=kelvin(310.0), active=kelvin(310.0), scheduled=(
+        (NOW + 4 * SECOND, kelvin(314.0)), (NOW + 9 * SECOND, kelvin(312.0)),
+        (NOW + 60 * SECOND, kelvin(320.0))))
+    found = setpoints.ahead(setpoint, MODEL.states, kelvin(ramp), lag, NOW, 30.0)
+    if np.isinf(ramp) and not lag:
+        assert [(seconds, float(value[0])) for seconds, value in found] == [
+            (4.0, 314.0), (9.0, 312.0)]
+    for seconds, value in found:
+        setpoint = moved(setpoint, NOW + round(seconds * SECOND), ramp=ramp, lag=lag,
+                         seconds=30.0 / setpoints.MAX_AHEAD)
+        assert value == pytest.approx(setpoint.active)
+    assert not setpoints.ahead(setpoint, MODEL.states, kelvin(ramp), lag, NOW, 3.0)
 
 
 def schedule(setpoint):

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from koopman_ros.control import Controller, InputLimits, State, Supervisor, Tuning
+from koopman_ros.control import (
+    ClearSafeState,
+    Controller,
+    InputLimits,
+    Mode,
+    ModeChange,
+    State,
+    Supervisor,
+    Tuning,
+)
 from koopman_ros.control.recovery import rest_under, SafeStateRecovery
 from koopman_ros.control.supervisor import FallbackOrder, LevelRequest
 from koopman_ros.core.status import reason, StatusCode
@@ -44,11 +53,11 @@ HOLD = LevelRequest('hold', NO_LAW)
 BLIND = LevelRequest('hold', reason(StatusCode.NO_MEASUREMENT), passing=True)
 
 
-def walk(requests):
+def walk(requests, order=ORDER):
     """Return where requests, one a second, lead."""
     supervisors = [Supervisor()]
     for second, request in enumerate(requests):
-        supervisors.append(supervisors[-1].at(ORDER, request, second * SECOND))
+        supervisors.append(supervisors[-1].at(order, request, second * SECOND))
     return supervisors[1:]
 
 
@@ -79,6 +88,45 @@ def test_a_longer_hold_timeout_does_not_revoke_the_safe_input():
     for second in range(70, 90):
         supervisor = supervisor.at(longer, HOLD, second * SECOND)
         assert supervisor.level == 'safe'
+
+
+LATCHING = replace(ORDER, safe_latch=True)
+L, C = StatusCode.SAFE_LATCHED, StatusCode.LATCH_CLEARABLE
+
+
+@pytest.mark.parametrize(('requests', 'codes'), [
+    ([LevelRequest('safe', FAR), *[BEST] * 12], [*[L] * 11, C, C]),
+    ([LevelRequest('safe', FAR), *[BEST] * 12, HOLD, *[LINEAR] * 11], [
+        *[L] * 11, C, C, *[L] * 11, C]),
+    ([*[BLIND] * 62, *[BEST] * 11], [*[StatusCode.NO_MEASUREMENT] * 61, *[L] * 11, C])],
+    ids=['after the data were left', 'with another cause meanwhile', 'after a silence'])
+def test_a_latched_safe_input_stays_and_may_be_cleared_once_a_law_is_possible(requests, codes):
+    supervisors = walk(requests, LATCHING)
+    assert [supervisor.reason.code for supervisor in supervisors] == codes
+    assert [supervisor.level == 'safe' for supervisor in supervisors] == [
+        code in (L, C) for code in codes]
+
+
+def test_only_the_operator_clears_a_latched_safe_input():
+    loop = Reactor(controller(safe_latch=True, hold_timeout=5.0, recovery_time=3.0))
+    loop.run(5)
+
+    def cleared():
+        state, refused = loop.loop.controller.clear_safe_state(loop.loop.state)
+        return state.supervisor, refused and refused.code
+
+    assert cleared()[1] is StatusCode.NOT_LATCHED
+    loop.loop = replace(loop.loop, state=replace(
+        loop.loop.state, supervisor=Supervisor.latched_before()))
+    assert levels(loop.run(5)) == ['safe']
+    # manual mode and back does not, and the law has to be possible again for long enough
+    loop.do(ModeChange(Mode.MANUAL), ModeChange(Mode.AUTOMATIC))
+    assert levels(loop.run(3)) == ['safe']
+    assert cleared()[1] is StatusCode.LATCH_KEPT
+    loop.run(1)
+    assert cleared() == (Supervisor(), None)
+    loop.do(ClearSafeState())
+    assert levels(loop.run(2)) == ['sdre']
 
 
 def test_reasons_tell_what_is_waited_for():

@@ -273,6 +273,25 @@ def test_a_plant_at_rest_is_not_frozen_and_nothing_is_when_that_is_switched_off(
     assert levels(loop.run(60, lambda _: START)) == ['sdre']
 
 
+@pytest.mark.parametrize(('heartbeat', 'expected'), [
+    (60.0, {'sdre'}), (0.0, {'sdre', 'hold', 'safe'})])
+def test_a_sensor_that_reports_on_change_neither_jumps_nor_is_stuck(heartbeat, expected):
+    reported = START
+
+    def deadband(kelvin):
+        nonlocal reported
+        if abs(kelvin - reported) > 2.0:
+            reported = kelvin
+        return reported
+
+    loop = asked(controller(sensor={
+        'report_on_change': np.array([heartbeat]), 'deadband': np.array([2.0])}))
+    samples = loop.run(300, deadband)
+    assert set(levels(samples)) == expected
+    if heartbeat:
+        assert all(abs(s.temperature - SETPOINT) < 2.5 for s in samples[200:])
+
+
 def test_a_plant_that_rests_where_the_model_was_not_trained_is_not_frozen():
     """As an empty tank, which the extrapolated model expects to go on falling."""
     own = controller()

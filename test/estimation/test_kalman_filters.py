@@ -4,6 +4,7 @@
 """States that are not measured: filters against Kalman's equations, and the reactor's saddle."""
 
 from dataclasses import replace
+import itertools
 from typing import Any
 
 import numpy as np
@@ -15,17 +16,22 @@ from koopman_ros.control import (
     Controller,
     Initialisation,
     InputLimits,
+    Mode,
+    SensorLimits,
     SetpointRequest,
     State,
+    Supervisor,
     Tuning,
 )
 from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import (
     Estimate,
     Estimator,
     ExtendedKalmanFilter,
+    History,
     UnscentedKalmanFilter,
 )
 from koopman_ros.estimation.kalman_filters import uncertainty
@@ -35,6 +41,7 @@ from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel
+from support.closed_loops import content, SECOND
 from support.random_lifts import coordinates, random_lift
 
 FILTERS = [ExtendedKalmanFilter, UnscentedKalmanFilter]
@@ -285,10 +292,88 @@ def test_noise_that_is_not_given_is_that_of_the_record():
     known = replace(model, provenance=replace(
         model.provenance, metrics={f'noise_{name}': 0.125}))
     half = 0.5 * (model.states.upper[0] - model.states.lower[0])
-    for noise, one, expected in ((0.0, model, 1e-3 * half), (0.0, known, 0.125),
-                                 (0.5, known, 0.5)):
-        given = Tuning.for_model(one, measurement_noise=noise)
+    for noise, one, deadband, expected in (
+            (0.0, model, 0.0, 1e-3 * half), (0.0, known, 0.0, 0.125), (0.5, known, 0.0, 0.5),
+            (0.3, known, 0.4 * np.sqrt(3.0), 0.5)):
+        given = Tuning.for_model(one, measurement_noise=noise, sensor=SensorLimits(
+            np.full(1, -1e9), np.full(1, 1e9), report_on_change=np.ones(1),
+            deadband=np.array([deadband])))
         assert uncertainty(one, outputs, given)[0] == pytest.approx([expected], rel=1e-12)
+
+
+def test_an_uncertain_measurement_has_more_noise_and_a_bad_one_is_missing():
+    model, outputs = oscillator(), first(oscillator(), 1)
+
+    def filtered(noise: float) -> Controller:
+        return Controller(model, Tuning.for_model(
+            model, controlled=(outputs.names[0],), measurement_noise=np.array([noise]),
+            uncertain_noise_factor=4.0, estimator='extended_kalman_filter'), outputs)
+
+    own, noisy = filtered(0.1), filtered(0.4)
+    state, *_ = own.step(State(), model.states.center[:1], SECOND)
+    y = model.states.center[:1] + 0.2
+    after, _, report = own.step(state, y, 2 * SECOND, quality=(1,))
+    assert content(after.estimate) == content(noisy.step(state, y, 2 * SECOND)[0].estimate)
+    assert report.measurement.uncertain == outputs.names
+    assert content(after.estimate) != content(own.step(state, y, 2 * SECOND)[0].estimate)
+    *_, report = own.step(state, y, 2 * SECOND, quality=(2,))
+    assert (report.level, report.reason.code) == ('hold', StatusCode.BAD_QUALITY)
+
+
+@pytest.mark.parametrize('dead_time', [0.0, 2.5])
+def test_late_values_correct_the_filter_at_their_own_times_in_any_order(dead_time):
+    model, rng = oscillator(), np.random.default_rng(1)
+    outputs = first(model, 1)
+    loop = Controller(model, Tuning.for_model(
+        model, controlled=(outputs.names[0],), measurement_noise=np.array([0.1]),
+        dead_time=np.array([dead_time]), analysis_delay=np.array([0.0, 20.0]),
+        analysis_noise=np.array([0.0, 0.2]), estimator='extended_kalman_filter'), outputs)
+    own, state, steps = loop.estimation.level(Supervisor()).estimator, State(), []
+    for second in range(30):
+        y = model.states.center[:1] + rng.normal(0.0, 0.3, 1)
+        # a silence in between
+        before = state
+        state, *_ = loop.hold(state, second * SECOND, None) if second == 20 else loop.step(
+            state, y, second * SECOND, quality=(1,) if second == 15 else None)
+        steps.append((second, before, state, None if second == 20 else (
+            y - model.states.center[:1]) / model.states.scale[:1]))
+    late = {11.4: 0.7, 19.8: -0.4, 24.0: 0.1}
+
+    def textbook(estimate: Estimate, value: float) -> Estimate:
+        P, r = estimate.covariance, (0.2 / model.states.scale[1]) ** 2
+        gain = P[:, 1] / (P[1, 1] + r)
+        step = gain * (value - estimate.x[1])
+        return replace(estimate, x=estimate.x + step[:2], w=estimate.w + step[2:],
+                       covariance=P - np.outer(gain, P[1]))
+
+    # all in the order of their times
+    estimate = steps[10][2].estimate
+    for second, before, _, y in steps[11:]:
+        edges = [second - 1.0, *(time for time in late if second - 1.0 < time < second), second]
+        for begin, end in itertools.pairwise(edges):
+            for seconds, u in before.applied.pieces(
+                    round(begin * SECOND), round(end * SECOND), loop.estimation.dead_ns):
+                estimate = own.predict(estimate, model.inputs.to_deviation(u), seconds)
+            if end == second and y is not None:
+                one = own if second != 15 else own.with_noise(np.array([3.0]))
+                estimate = one.correct(estimate, np.append(y, estimate.x[1]), 1.0)
+            if end in late:
+                estimate = textbook(estimate, late[end])
+    for order in itertools.permutations(late):
+        now = state
+        for time in order:
+            value = model.states.center[1] + model.states.scale[1] * late[time]
+            now, refused = loop.take_analysis(now, model.states.names[1], value, round(
+                time * SECOND))
+            assert refused is None
+        assert now.estimate.x == pytest.approx(estimate.x, abs=1e-9)
+        assert now.estimate.w == pytest.approx(estimate.w, abs=1e-9)
+        assert now.estimate.covariance == pytest.approx(estimate.covariance, rel=1e-7, abs=1e-12)
+    for signal, time in ((1, 5.0), (0, 25.0)):
+        unchanged, refused = loop.take_analysis(
+            state, model.states.names[signal], model.states.center[signal], round(time * SECOND))
+        assert (unchanged, refused.code) == (state, StatusCode.ANALYSIS_REFUSED)
+    assert loop.set_mode(state, Mode.MANUAL).history == History()
 
 
 def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_all():

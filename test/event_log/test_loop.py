@@ -54,12 +54,14 @@ HAPPENS = st.one_of(
               st.sampled_from([0.0, 0.0, 3.5, 1e6])),
     st.tuples(st.just('manual'), st.floats(COOLANT - 30.0, COOLANT + 30.0) | st.just(np.inf)),
     st.tuples(st.just('mode'), st.sampled_from(Mode)),
+    st.tuples(st.just('clear')), st.tuples(st.just('analysis'), st.floats(0.0, 30.0), NEAR),
     st.tuples(st.just('applied'), st.floats(COOLANT - 30.0, COOLANT + 30.0)),
     st.tuples(st.just('exchange'), st.sampled_from([
         {'model': 'reactor_nz3'}, {'model': 'reactor_nz4'}, {'coolant_temperature.weight': 0.3},
         {'model': 'reactor_linear', 'observer_bandwidth': 0.0}, {'observer_bandwidth': 0.1},
         {'setpoint_filter_time': 20.0, 'temperature.setpoint_ramp': 0.1},
-        {'coolant_temperature.rate_limit': 0.2}])),
+        {'coolant_temperature.rate_limit': 0.2}, {'safe_latch': True},
+        {'estimator': 'extended_kalman_filter', 'temperature.analysis_delay': 60.0}])),
     st.tuples(st.just('snapshot')))
 
 
@@ -76,6 +78,11 @@ def happen(controller: Recorded, event: tuple) -> None:
             controller.do(events.ManualCommand(np.array([kelvin])))
         case ('mode', mode):
             controller.do(events.ModeChange(mode))
+        case ('clear',):
+            controller.do(events.ClearSafeState())
+        case ('analysis', seconds, kelvin):
+            controller.do(events.AnalysisValue(
+                controller.now - round(seconds * SECOND), 'temperature', kelvin))
         case ('applied', kelvin):
             controller.do(events.Initialisation(np.array([kelvin])))
         case ('exchange', parameters):

@@ -285,6 +285,7 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     desk.wait(lambda: node.snapshot.inputs[0].command == pytest.approx(68.0))
     assert node.snapshot.mode == 'manual'
     assert desk.ask('automatic', CONTROLLER, True).accepted
+    assert 'not latched' in desk.ask('clear safe state', CONTROLLER).text
     # parameters
     assert desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 30.0}).accepted
     desk.wait(lambda: node.snapshot.inputs[0].limits == pytest.approx((41.0, 86.0)))

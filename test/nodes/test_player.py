@@ -232,7 +232,32 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
     ros.wait_until(lambda: len(commands) >= 5)
 
 
+@pytest.mark.parametrize(('shape', 'values', 'stamps'), [
+    ({}, [45.0, 40.0, 41.0], [None, None, None]),
+    ({'setpoint_ramps': True, 'ramp_period': 10.0}, [45.0, 42.5, 40.0, 40.5, 41.0], 5 * [None]),
+    ({'setpoint_lead': 60.0}, [45.0, 40.0, 41.0], [0.0, 20.0, 40.0])])
+def test_setpoints_of_a_csv_are_steps_or_ramps_at_once_or_ahead(
+        ros: Harness, tmp_path: Path, shape: dict[str, Any], values: list[float],
+        stamps: list[float | None]) -> None:
+    # the unit is that of the column; a cell may be empty
+    (tmp_path / 'day.csv').write_text(
+        'time [min],temperature [K],note\n0,318.15,\n0.3333333333333333,313.15,\n0.5,,x\n'
+        '0.6666666666666666,314.15,\n')
+    heard = ros.listen(Temperature, reactor.SETPOINT)
+    began = time.time()
+    play(tmp_path / 'day.csv', rate=200.0, **shape)
+    ros.wait_until(lambda: len(heard) >= len(values))
+    assert [message.temperature for message in heard] == pytest.approx(values)
+    for message, after in zip(heard, stamps, strict=True):
+        at = stamp_nanoseconds(message.header.stamp) / NANOSECONDS
+        assert at == (0.0 if after is None else pytest.approx(began + after, abs=10.0))
+
+
 @pytest.mark.parametrize(('parameters', 'words'), [
+    ({'bag': 'day.csv', 'rate': 0.0}, 'lock-step, which a .csv of set-points cannot'),
+    ({'bag': 'day.csv'}, 'day.csv has no column temperature: name the columns time [s] and'),
+    ({'bag': 'day.csv', 'system': 'none', 'topics': ['setpoint'], 'measurement': ['temperature'],
+      'answer': 'coolant_setpoint'}, "system = 'none' has no set-points"),
     ({'bag': 'none.mcap'}, "cannot start: bag 'none.mcap' does not exist"),
     ({'topics': ['pressure']}, 'no message on /pressure: choose from /temperature'),
     ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
@@ -250,6 +275,7 @@ def test_what_cannot_be_played_is_refused_in_one_line(
     content = bytearray(bag.read_bytes())
     content[len(content) // 3] ^= 1
     Path('damaged.mcap').write_bytes(content)
+    Path('day.csv').write_text('time [s],pressure [Pa]\n0,1.0\n')
     assert run_here(player, **{'bag': 'bag.mcap', **parameters}) == 1
     assert words in complaint(capfd)
 

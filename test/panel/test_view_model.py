@@ -330,6 +330,9 @@ def test_a_slow_plant_is_not_silent_between_its_measurements() -> None:
         measure(own, 50.0, 60.0 * minute)
     assert PLANT not in [one.role for one in own.snapshot(NOW + 240.0 + 59.0).silences]
     assert PLANT in [one.role for one in own.snapshot(NOW + 240.0 + 400.0).silences]
+    # nor one of which the controller knows that it has not changed
+    answered(own, wall=NOW + 600.0)
+    assert PLANT not in [one.role for one in own.snapshot(NOW + 240.0 + 400.0).silences]
 
 
 def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
@@ -445,7 +448,7 @@ def test_a_condition_has_one_alarm(
         if plant is not None and seconds < plant:
             measure(own, 50.0, seconds)
         if task:
-            answered(own, wall=NOW + seconds)
+            own.take_record('silence', {'mode': 'automatic', 'level': 'sdre'}, NOW + seconds)
             status(own, task, level, message, values, NOW + seconds)
         own.advance(NOW + seconds)
         for moment in (moment for moment in expected if math.isclose(moment, seconds)):

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 import itertools
 import math
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -13,14 +14,17 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
+from koopman_ros.event_log.records import parse
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, STATUS, STEADY, TABLE
+from support.controller_bench import Bench, reproduced, STATUS, STEADY, TABLE
 from support.nodes import seconds, temperature, value
 
 CONTROLLER = '/controller'
@@ -329,6 +333,117 @@ def test_what_the_operator_requests_is_done_without_measurements(ros: Harness) -
     for before, after in itertools.pairwise(own):
         passed = seconds(after) - seconds(before)
         assert abs(after.temperature - before.temperature) <= 4.0 * min(passed, 1.0) + 1e-6
+
+
+def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
+        ros: Harness, tmp_path: Path) -> None:
+    ros.environment['ROS_HOME'] = str(tmp_path)
+    patience = {'safe_latch': True, 'recovery_time': 2.0}
+    bench = Bench(ros, {**patience, 'measurement_timeout': 0.3, 'hold_timeout': 0.2})
+    found = bench.status(lambda s: 'the safe state is latched' in s.message)
+    assert (value(found, 'safe state'), found.level) == ('latched', DiagnosticStatus.ERROR)
+    assert bench.process.stop() == 0
+    bench = Bench(ros, patience)
+    answer = ros.call(Trigger, 'controller/clear_safe_state', Trigger.Request())
+    assert not answer.success
+    assert 'the safe state was reached before the restart' in answer.message
+    for k in range(2, 5):
+        assert bench.measure(STEADY, float(k)).temperature < STEADY
+    bench.status(lambda s: 'clear it on the panel or by the service' in s.message)
+    assert ros.call(Trigger, 'controller/clear_safe_state', Trigger.Request()).success
+    bench.measure(STEADY, 5.0)
+    assert value(bench.status(), 'active law') == 'learned law'
+    ros.wait_until(lambda: not [*tmp_path.rglob('*.latched')])
+
+
+def test_the_quality_of_a_measurement_is_taken_into_account_and_recorded(ros: Harness) -> None:
+    records = ros.listen(String, topics.EVENT_LOG)
+    bench = Bench(ros, {'temperature.quality_topic': 'temperature_quality', 'temperature'
+                        '.quality_type': 'diagnostic_msgs/msg/DiagnosticStatus'})
+    quality = ros.speak(DiagnosticStatus, 'temperature_quality', to='controller')
+    for time, level, severity, words in (
+            (2.0, DiagnosticStatus.ERROR, DiagnosticStatus.ERROR, 'temperature is bad'),
+            (3.0, DiagnosticStatus.WARN, DiagnosticStatus.WARN, 'temperature is uncertain'),
+            (4.0, DiagnosticStatus.OK, DiagnosticStatus.OK, 'automatic')):
+        quality.publish(DiagnosticStatus(level=level))
+        ros.meet('controller')
+        bench.measure(STEADY, time)
+        assert bench.status(lambda s, words=words: words in s.message).level == severity
+    ros.wait_until(lambda: '"stamp_ns":4000000000' in ''.join(m.data for m in records))
+    assert [record.fields['quality'] for record in reproduced(records)[0]
+            if record.event == 'measurement'][-3:] == [[2], [1], None]
+
+
+def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: Harness) -> None:
+    ros.start('controller', {
+        'temperature.report_on_change': 60.0, 'temperature.deadband': 0.2, 'sample_time': 0.5,
+        'measurement_timeout': 5.0, 'coolant_temperature.rate_limit': 0.0, 'use_sim_time': True})
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    clock, ask, manual, thermometer = (
+        ros.speak(kind, topic, to='controller') for kind, topic in (
+            (Clock, topics.CLOCK), (Temperature, reactor.SETPOINT),
+            (Temperature, reactor.MANUAL_COOLANT_SETPOINT), (Temperature, reactor.TEMPERATURE)))
+    now = 10.0
+
+    def pass_until(condition: Callable[[], bool], step: float = 0.25) -> None:
+        def found() -> bool:
+            nonlocal now
+            now += step
+            clock.publish(Clock(clock=temperature(0.0, now).header.stamp))
+            return condition()
+
+        ros.wait_until(found)
+
+    def told(level: bytes, words: str) -> bool:
+        status = ros.last_status(STATUS)
+        return status is not None and status.level == level and words in status.message
+
+    # stamped by another clock, and the only one
+    thermometer.publish(temperature(STEADY, 5.0))
+    pass_until(lambda: len(commands) > 5)
+    assert np.diff([seconds(m) for m in commands]).min() >= 0.25
+    held = commands[-1].temperature
+    ask.publish(temperature(STEADY - 5.0))
+    pass_until(lambda: commands[-1].temperature < held - 1.0)
+    ros.set_bool('controller/set_automatic', False)
+    manual.publish(temperature(20.0))
+    pass_until(lambda: commands[-1].temperature == pytest.approx(20.0))
+    pass_until(lambda: told(DiagnosticStatus.OK, 'manual'))
+    # behind its heartbeat the signal is missing
+    pass_until(lambda: told(
+        DiagnosticStatus.ERROR, 'no measurement of temperature for more than 5 s'), 2.0)
+    assert now > 60.0 + 5.0
+
+
+def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(
+        ros: Harness) -> None:
+    ros.start('controller', {
+        'system': 'two_tanks', 'level_1.report_on_change': 100.0,
+        'estimator': 'extended_kalman_filter', 'level_2.analysis_topic': 'laboratory',
+        'level_2.analysis_delay': 60.0})
+    records = ros.listen(String, topics.EVENT_LOG)
+    commands = ros.listen(JointState, 'pump_1_setpoint')
+    sensors = {name: ros.speak(JointState, name, to='controller')
+               for name in ('level_1', 'level_2', 'laboratory')}
+
+    def send(name: str, metres: float, time: float) -> None:
+        message = JointState(name=['level_2' if name == 'laboratory' else name],
+                             position=[metres])
+        message.header.stamp = temperature(0.0, time).header.stamp
+        sensors[name].publish(message)
+
+    send('level_2', 0.15, 1.0)
+    ros.wait_for_status(STATUS, lambda s: 'first measurement of level_1' in s.message)
+    send('level_1', 0.12, 0.5)
+    ros.meet('controller')
+    for time in (2.0, 3.0, 4.0):
+        send('level_2', 0.15, time)
+    ros.wait_until(lambda: [seconds(message) for message in commands] == [2.0, 3.0, 4.0])
+    for time in (2.5, 1.0):
+        send('laboratory', 0.16, time)
+    ros.wait_until(lambda: [record.fields['accepted'] for record in map(
+        parse, (message.data for message in records)) if record.event == 'analysis'] == [
+            True, False])
 
 
 def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(

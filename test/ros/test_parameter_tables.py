@@ -133,6 +133,14 @@ def test_what_cannot_be_built_is_refused_with_the_error_and_what_was_changed(
     assert BUILT.check(now, before) == (reason and f'{reason}; choose another value')
 
 
+@pytest.mark.parametrize('system', ['reactor', 'two_tanks'])
+def test_the_quality_of_a_measurement_is_recorded(system: str) -> None:
+    usual = trainer_table(None, {'system': system}).rows['topics'].default
+    name = usual[0]
+    given = {'system': system, f'{name}.quality_topic': 'quality'}
+    assert {*trainer_table(None, given).rows['topics'].default} == {*usual, 'quality'}
+
+
 @pytest.mark.parametrize('node', TABLES)
 def test_every_number_has_a_range_that_a_slider_can_show(node: str) -> None:
     for item in TABLES[node].rows.values():

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 from typing import Any, ClassVar, Self
@@ -32,6 +32,14 @@ class Target:
     u: Array  #: (n_u,) input that balances drift and disturbance
     forcing: Array  #: (n_x,) B(x_ref) u_ref + w, added to the drift
     residual: float  #: size of the rate that no input balances; 0 where x can be held
+    #: later targets with the seconds until then, as far as the law looks ahead
+    later: tuple[tuple[float, Target], ...] = ()
+
+    def after(self, seconds: float) -> Target:
+        """Return the target of a later time."""
+        passed = [target for until, target in self.later if until <= seconds]
+        return replace(passed[-1] if passed else self, later=tuple(
+            (until - seconds, target) for until, target in self.later if until > seconds))
 
 
 def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
@@ -211,6 +219,10 @@ class Law(ABC):
     def unusable(self) -> Reason | None:
         """Return why it can never act, as for a missing package; None where it can."""
         return None
+
+    def horizon(self, interval: float) -> float:
+        """Return how far it looks ahead in s, at samples every `interval` s; 0 by default."""
+        return 0.0
 
     @abstractmethod
     def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,

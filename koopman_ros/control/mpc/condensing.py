@@ -260,7 +260,7 @@ def _add_cost(cost: Array, X: Array, x_ref: Array, Q: Array, share: Array) -> No
         for i in range(n):
             for column in range(columns):
                 E[i, column] = X[c, i, column]
-            E[i, 0] -= x_ref[i]
+            E[i, 0] -= x_ref[c, i]
         for i in range(n):
             for column in range(columns):
                 total = 0.0
@@ -273,7 +273,7 @@ def _add_cost(cost: Array, X: Array, x_ref: Array, Q: Array, share: Array) -> No
                     cost[c, row, column] += E[i, row] * QE[i, column]
 
 
-@_compiled(_MODEL, _MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.int64, _MATRIX,
+@_compiled(_MODEL, _MATRIX, _MATRIX, _VECTOR, _MATRIX, _MATRIX, _VECTOR, types.int64, _MATRIX,
            _MATRIX)
 def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, u_ref: Array,
              lengths: Array, steps: int, Q: Array, R: Array) -> tuple[Array, Array]:
@@ -292,7 +292,7 @@ def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, u_r
     w
         (n_x,) disturbance of the state's rate.
     x_ref, u_ref
-        (n_x,) and (n_u,) references.
+        (N, n_x) and (N, n_u) references of the intervals.
     lengths
         (N,) of the intervals.
     steps
@@ -316,8 +316,8 @@ def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, u_r
             X[c, i, 0], X[c, i, 1 + i] = x[c, i], 1.0
         for i in range(m):
             for j in range(m):
-                weight, v = lengths[c] * R[i, j], u[c, j] - u_ref[j]
-                cost[c, 0, 0] += weight * (u[c, i] - u_ref[i]) * v
+                weight, v = lengths[c] * R[i, j], u[c, j] - u_ref[c, j]
+                cost[c, 0, 0] += weight * (u[c, i] - u_ref[c, i]) * v
                 cost[c, 1 + n + i, 0] += weight * v
                 cost[c, 0, 1 + n + i] += weight * v
                 cost[c, 1 + n + i, 1 + n + j] = weight

@@ -89,6 +89,11 @@ class RecedingHorizon(Law):
         """Return that its packages are not installed, or do not work."""
         return self._unusable
 
+    def horizon(self, interval: float) -> float:
+        """Return the length of a plan, which tracks scheduled set-points."""
+        return 0.0 if self.planner is None else (
+            float(self.planner.grid(interval).times[-1]) * self.model.seconds_per_time_unit)
+
     def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
                 previous: Array | None) -> LawResult:
         """

@@ -62,6 +62,9 @@ class PlanningProblem:
     #: (n_u,) interval in which the command of each input acts first
     begins: NDArray[np.intp]
     under_way: Array  #: (N, n_u) inputs that act until then; anything from there on
+    x_ref: Array  #: (N, n_x) mean reference in each interval
+    u_ref: Array  #: (N, n_u) input that holds it
+    end: Target  #: that in force at the end
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -120,9 +123,10 @@ class Planner:
         change = grid.since_change * self._rate
         change[begins, np.arange(model.n_u)] = grid.sample * self._rate
         # B(x) changes the slope with the input
+        end = target.after(float(grid.times[-1]) * model.seconds_per_time_unit)
         fastest, terminal = self._cost_to_go(
-            tuple(target.x.tolist()),
-            () if model.input_terms is None else tuple(target.u.tolist()),
+            tuple(end.x.tolist()),
+            () if model.input_terms is None else tuple(end.u.tolist()),
             grid.sample)
         rate = max(_fastest(self._slope), fastest, _fastest(self._jacobian(estimate.x)))
         steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
@@ -130,7 +134,7 @@ class Planner:
             estimate.x, estimate.w, target,
             None if previous is None else model.inputs.to_deviation(previous), grid, steps,
             terminal, change, begins, np.zeros_like(change) if later is None else (
-                self._under_way(grid, later.pieces)))
+                self._under_way(grid, later.pieces)), *self._references(grid, target), end)
 
     def grid(self, interval: float, after: float = 0.0) -> HorizonGrid:
         """
@@ -147,6 +151,17 @@ class Planner:
         return held_means(
             np.concatenate(([0.0], np.cumsum(durations))),
             np.array([model.inputs.to_deviation(u) for _, u in pieces]), grid.times)
+
+    def _references(self, grid: HorizonGrid, target: Target) -> tuple[Array, Array]:
+        """Return the mean references (N, n_x) and (N, n_u) of the intervals."""
+        if not target.later:
+            return np.tile(target.x, (len(grid.lengths), 1)), np.tile(
+                target.u, (len(grid.lengths), 1))
+        times, every = zip((0.0, target), *target.later, strict=True)
+        edges = np.array(times) / self._model.seconds_per_time_unit
+        edges = np.append(edges, max(edges[-1], grid.times[-1]) + grid.sample)
+        return (held_means(edges, np.array([one.x for one in every]), grid.times),
+                held_means(edges, np.array([one.u for one in every]), grid.times))
 
     def _new_grid(self, sample: float, after: float) -> HorizonGrid:
         A, B = self._slope, self._model.B
@@ -239,15 +254,15 @@ class Planner:
 
         :return: the largest change of an input, and the changed plan; or why there is none.
         """
-        start, w, x_ref, u_ref = (np.ascontiguousarray(value, dtype=np.float64) for value in (
-            problem.start, problem.w, problem.target.x, problem.target.u))
+        start, w, x_ref, u_ref, end = (np.ascontiguousarray(value, dtype=np.float64) for value in (
+            problem.start, problem.w, problem.x_ref, problem.u_ref, problem.end.x))
         given = (u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps, self._weights.Q,
                  self._weights.R)
         ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
                       roll_out(self._arrays, *given))
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
             return reason(StatusCode.PLAN_NOT_SOLVED, flag='the trajectory is not finite')
-        nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
+        nodes, by_inputs, H, f = condense(x, start, end, ends, cost, problem.terminal)
         free = problem.free.ravel()
         if not free.all():
             by_inputs, H, f = by_inputs[..., free], H[np.ix_(free, free)], f[free]

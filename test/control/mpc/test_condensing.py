@@ -77,7 +77,7 @@ def simulated(model: LiftedModel, x: np.ndarray, u: np.ndarray, w: np.ndarray, l
 def test_roll_out_with_its_sensitivities_and_cost(model: LiftedModel) -> None:
     n, m = model.B.shape
     u, x = RNG.normal(size=(2, m)), 0.3 * RNG.normal(size=(3, n))
-    w, x_ref, u_ref = 0.1 * RNG.normal(size=n), RNG.normal(size=n), RNG.normal(size=m)
+    w, x_ref, u_ref = 0.1 * RNG.normal(size=n), RNG.normal(size=(2, n)), RNG.normal(size=(2, m))
     lengths, Q, R = np.array([0.1, 0.2]), np.diag(1.0 + np.arange(n)), np.diag(2.0 + np.arange(m))
     ends, cost = roll_out(model_arrays(model), u, x, w, x_ref, u_ref, lengths, 10, Q, R)
 
@@ -86,7 +86,8 @@ def test_roll_out_with_its_sensitivities_and_cost(model: LiftedModel) -> None:
             """Return end and cost of node and input with a deviation."""
             v = u[k] + deviation[n:]
             return simulated(model, x[k] + deviation[:n], v, w, length, lambda state: (
-                (state - x_ref) @ Q @ (state - x_ref) + (v - u_ref) @ R @ (v - u_ref)))
+                (state - x_ref[k]) @ Q @ (state - x_ref[k])
+                + (v - u_ref[k]) @ R @ (v - u_ref[k])))
 
         exact, slope = interval(np.zeros(n + m)), differences(interval, np.zeros(n + m))
         np.testing.assert_allclose(ends[k, :, 0], exact[:n], rtol=1e-6, atol=1e-7)
@@ -101,7 +102,7 @@ def test_roll_out_with_its_sensitivities_and_cost(model: LiftedModel) -> None:
 def test_roll_out_by_the_methods_of_a_model_is_the_same(model: LiftedModel) -> None:
     n, m = model.B.shape
     given = (RNG.normal(size=(3, m)), 0.3 * RNG.normal(size=(4, n)), RNG.normal(size=n),
-             RNG.normal(size=n), RNG.normal(size=m), np.array([0.01, 0.02, 0.03]), 2,
+             RNG.normal(size=(3, n)), RNG.normal(size=(3, m)), np.array([0.01, 0.02, 0.03]), 2,
              np.diag(1.0 + np.arange(n)), np.diag(2.0 + np.arange(m)))
     for here, there in zip(roll_out(model_arrays(model), *given),
                            own_drift.roll_out(model, *given), strict=True):
@@ -115,7 +116,8 @@ def test_condensed_cost_is_that_of_the_simulated_plan() -> None:
     u, x = RNG.normal(size=(N, m)), RNG.normal(size=(N + 1, n))
     start, w, x_ref, u_ref = (RNG.normal(size=size) for size in (n, n, n, m))
     lengths, terminal = np.array([0.1, 0.15, 0.2, 0.3]), np.array([[2.0, 0.3], [0.3, 1.0]])
-    ends, cost = roll_out(model_arrays(model), u, x, w, x_ref, u_ref, lengths, 20, Q, R)
+    ends, cost = roll_out(model_arrays(model), u, x, w, np.tile(x_ref, (N, 1)),
+                          np.tile(u_ref, (N, 1)), lengths, 20, Q, R)
     nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, terminal)
 
     def simulate(v: np.ndarray) -> tuple[float, np.ndarray]:

@@ -3,7 +3,7 @@
 
 """The predictive law against independent optima, its limits, and its failures."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 import math
 import sys
 import time
@@ -23,11 +23,12 @@ from koopman_ros.control.state import State
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.status import StatusCode
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.evaluation.simulate import at, simulate, Simulation
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance
-from koopman_ros.plants import ControlAffineSystem, plant_class, Process, steady_state
+from koopman_ros.plants import Actuator, ControlAffineSystem, plant_class, Process, steady_state
 
 PERIOD = 0.1  # s
 Q = np.array([1.0, 0.1])
@@ -169,7 +170,8 @@ def test_range_is_planned_for_optimally():
         1.0, abs=2e-3)
 
 
-def test_plan_with_active_limits_is_that_of_a_general_optimiser():
+@pytest.mark.parametrize('change_after', [None, 75.0])
+def test_plan_with_active_limits_is_that_of_a_general_optimiser(change_after):
     """Against SLSQP on simulations of the model, with range, rate and limits of the states."""
     model, interval, x, x_ref = shipped('two_state'), 30.0, [-0.3, -0.2], [0.05, 0.2]
     u_max, change, e_max = 0.15, 0.12, [9.0, 0.08]
@@ -182,22 +184,32 @@ def test_plan_with_active_limits_is_that_of_a_general_optimiser():
         ).for_signals(model, states.names),
         MPCParameters(upper=states.center + np.array(e_max) * states.scale))
     estimate, target = Estimate(np.array(x), w), steady_state_target(model, np.array(x_ref))
+    end = target
+    if change_after is not None:
+        end = steady_state_target(model, np.array([-0.02, 0.12]))
+        target = replace(target, later=((change_after, end),))
     found = one.compute(estimate, target, None, interval, inputs.center)
     assert found.failure is None
     problem = one.planner.problem(estimate, target, interval, inputs.center)
     lengths, N = problem.grid.lengths, len(problem.grid.lengths)
+    # the share of each interval in which the later target holds
+    edges = problem.grid.times * model.seconds_per_time_unit
+    share = np.clip((edges[1:] - (change_after or np.inf)) / np.diff(edges), 0.0, 1.0)[:, None]
+    x_refs, u_refs = ((1.0 - share) * now + share * then for now, then in (
+        (target.x, end.x), (target.u, end.u)))
 
     def simulated(u: np.ndarray) -> tuple[float, np.ndarray]:
         y, nodes = np.append(x, 0.0), []
-        for v, length in zip(u, lengths, strict=True):
-            def rate(y: np.ndarray, v: float = v) -> np.ndarray:
-                e, e_u = y[:2] - target.x, v - target.u[0]
+        for v, length, x_ref, u_ref in zip(u, lengths, x_refs, u_refs, strict=True):
+            def rate(y: np.ndarray, v: float = v, x_ref: np.ndarray = x_ref,
+                     u_ref: np.ndarray = u_ref) -> np.ndarray:
+                e, e_u = y[:2] - x_ref, v - u_ref[0]
                 return np.append(model.drift(y[:2]) + model.B @ [v] + w, e @ e + 0.1 * e_u ** 2)
 
             for _ in range(4):
                 y = runge_kutta_step(rate, y, length / 4)
             nodes.append(y[:2])
-        e = nodes[-1] - target.x
+        e = nodes[-1] - end.x
         return y[2] + e @ problem.terminal @ e, np.array(nodes)
 
     best = minimize(
@@ -209,11 +221,35 @@ def test_plan_with_active_limits_is_that_of_a_general_optimiser():
         options={'ftol': 1e-10, 'maxiter': 200})
     assert best.success
     planned = found.memory[0][:, 0]
-    assert np.sum(np.abs(planned) > u_max - 1e-6) == 1
-    assert np.sum(np.abs(np.diff(planned, prepend=0.0)) > change - 1e-6) == 1
-    assert found.plan.at_state.tolist() == [0.0, 1.0]
+    if change_after is None:
+        assert np.sum(np.abs(planned) > u_max - 1e-6) == 1
+        assert np.sum(np.abs(np.diff(planned, prepend=0.0)) > change - 1e-6) == 1
+        assert found.plan.at_state.tolist() == [0.0, 1.0]
     np.testing.assert_allclose(planned, best.x, atol=2e-3)
     assert simulated(planned)[0] == pytest.approx(best.fun, rel=1e-3)
+
+
+@pytest.mark.parametrize('dead_time', [0.0, 0.5])
+def test_a_scheduled_setpoint_is_prepared_for(monkeypatch, dead_time):
+    system, model = OSCILLATOR
+    model = replace(model, dead_time=np.array([dead_time]))
+
+    def tracked() -> tuple[float, np.ndarray]:
+        """Return the integral of the squared error, and the commands before the set-point."""
+        loop = simulate(
+            Controller(model, tuning(model)),
+            Process(system, 0, np.zeros(2), np.zeros(1), Actuator(dead_time=dead_time)),
+            [at(0.0, SetpointRequest(4 * NANOSECONDS, np.array([1.0, 0.0])))],
+            period=PERIOD, duration=8.0)
+        error = loop.states - np.where(loop.times[:, None] < 3.0, 0.0, [1.0, 0.0])
+        return PERIOD * float(np.sum(Q * error ** 2)), loop.commands[loop.times < 2.9]
+
+    cost, before = tracked()
+    assert np.abs(before).max() > 0.1
+    monkeypatch.setattr(RecedingHorizon, 'horizon', lambda *_: 0.0)
+    late, before = tracked()
+    assert not before.any()
+    assert cost < 0.4 * late
 
 
 @pytest.mark.parametrize(('name', 'period', 'samples'), [
