@@ -211,9 +211,9 @@ class ControllerNode(ManagedNode):
         # the first command after an activation begins from the measured inputs, or else from the
         # last command before the node became inactive
         present = applied.latest if self._last.command is None else self._last.command
-        event = events.Measurement(
-            stamp_ns, sample.values, measured, countable,
-            *self._measurements.disturbances.with_ages(stamp_ns) or (), quality=sample.quality)
+        disturbances, ages = self._measurements.disturbances.with_ages(stamp_ns)
+        event = events.Measurement(stamp_ns, sample.values, measured, countable, disturbances,
+                                   ages, sample.quality)
         outcome = self._loop.answer(event, present if measured is None else measured, arrived,
                                     advance is not Advance.OLD)
         if outcome is None or outcome.report is None:

@@ -169,10 +169,10 @@ class MeasuredInputs:
         return self.latest if near else None
 
 
-    def with_ages(self, stamp_ns: int) -> tuple[Array, Array] | None:
-        """Return the last values (n,) and their ages in s at a time; None without any signal."""
+    def with_ages(self, stamp_ns: int) -> tuple[Array | None, Array | None]:
+        """Return the last values (n,) and their ages in s at a time; None without signals."""
         if not self._names:
-            return None
+            return None, None
         stamps, values = zip(*map(self.get, self._names), strict=True)
         return np.array(values), (stamp_ns - np.array(stamps)) / NANOSECONDS
 

@@ -176,7 +176,7 @@ def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
     signals = signals_of(model)
     own = built(table_of(model, {'system': 'reactor'}).snapshot({}), model)
     heard = MeasuredInputs(signals.disturbances)
-    assert MeasuredInputs(()).with_ages(0) is None
+    assert MeasuredInputs(()).with_ages(0) == (None, None)
     state = State()
     for k, (kelvin, words) in enumerate((
             (None, 'no measurement of feed_temperature yet: its nominal value 76.85 degC'),
