@@ -47,6 +47,8 @@ def _brief(value: object) -> str:
 def real(value: ArrayLike, name: str) -> Array:
     """Return numbers as a float64 array; ValueError for complex or non-numeric ones."""
     array = np.asarray(value)
+    if array.dtype == np.float64:
+        return array
     if np.iscomplexobj(array):
         raise ValueError(f'{name} must be real, got complex numbers: pass their real part')
     try:
