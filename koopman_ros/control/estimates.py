@@ -87,13 +87,11 @@ class StateEstimation:
 
         :return: the state, and whether the applied input follows the command.
         """
-        u, tolerance = state.command, self.tuning.tracking_tolerance
-        if u is None:
+        command, tolerance = state.command, self.tuning.tracking_tolerance
+        if command is None or measured is None or not np.isfinite(measured).all():
             return state, True
-        if measured is not None and np.isfinite(measured).all():
-            u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
-        return (replace(state, applied=state.applied.corrected(u)),
-                bool((u == state.command).all()))
+        u = np.minimum(np.maximum(command, measured - tolerance), measured + tolerance)
+        return (replace(state, applied=state.applied.corrected(u)), bool((u == command).all()))
 
     def observe(self, state: State, y: Array, time_ns: int, elapsed: float
                 ) -> tuple[State, Observation]:
@@ -125,7 +123,8 @@ class StateEstimation:
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
-            far = outside > max(level.law.margin for level in self.levels.values())
+            far = outside > 0.0 and outside > max(
+                level.law.margin for level in self.levels.values())
             predicted = self._corrected(
                 state, predicted, verdict, x, time_ns, elapsed,
                 far or self._lost(state, time_ns))

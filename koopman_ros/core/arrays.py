@@ -81,6 +81,11 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     return array
 
 
+def change_within(rate: Array, seconds: float) -> Array:
+    """Return the largest changes (n,) at some rates (n,); infinite where a rate is, even in 0 s."""
+    return rate * seconds if seconds > 0.0 else np.where(np.isinf(rate), np.inf, 0.0)
+
+
 def read_only(value: ArrayLike) -> Array:
     """Return a read-only copy of numbers."""
     copy = np.array(value, dtype=np.float64)

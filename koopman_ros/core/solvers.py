@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dgeev, dgees, dgesv, dtrsen
 from koopman_ros.core.arrays import Array
 
 __all__ = ['RiccatiSolution', 'RiccatiStatus', 'over_interval', 'runge_kutta_step',
-           'solve_riccati', 'transition']
+           'solve_riccati', 'spectral_radius', 'transition']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
@@ -122,11 +122,10 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n = len(A)
     D, W = over_interval(A, B, Q, R, interval)
-    step, push = D[:n, :n], D[:n, n:]
-    Q_d, N, R_d = W[:n, :n], W[:n, n:], W[n:, n:]
     # what the cross term makes of input and weight
-    by_R = _solved(R_d, np.concatenate((push.T, N.T), axis=1))
-    rest, G, Q_rest = step - push @ by_R[:, n:], push @ by_R[:, :n], Q_d - N @ by_R[:, n:]
+    both = np.concatenate((D[:n, n:], W[:n, n:])).T
+    by_R = both.T.dot(_solved(W[n:, n:], both))
+    rest, G, Q_rest = D[:n, :n] - by_R[:n, n:], by_R[:n, :n], W[:n, :n] - by_R[n:, n:]
     scale = _scale(Q_rest, G)
     less = _hamiltonian(rest, scale * G, Q_rest / scale)
     more = less.copy()
@@ -134,13 +133,15 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     more.flat[::2 * n + 1] += 2.0
     size = (_size(A) + _size(B)) * interval
     P = scale * _stable_graph(_solved(more, less), _ROUNDING * min(size, 1.0))
-    P_step, P_push = P @ step, P @ push
-    right = N.T + push.T @ P_step + P_push.T
-    K = _solved(R_d + push.T.dot(P_push), right)
+    PD = P.dot(D[:n])
+    square = D[:n].T.dot(PD)
+    cost, P_step = W + square, PD[:, :n]
+    right = cost[n:, :n] + PD[:, n:].T
+    K = _solved(cost[n:, n:], right)
     # the equation less P on both sides, whose terms shrink with the interval
-    square, feedback = step.T @ P_step, right.T @ K
-    terms = _size(Q_d) + 2.0 * _size(P_step) + _size(square) + _size(feedback)
-    return P, K, _size(P_step + P_step.T + square + Q_d - feedback) / terms
+    feedback = right.T.dot(K)
+    terms = _size(W[:n, :n]) + 2.0 * _size(P_step) + _size(square[:n, :n]) + _size(feedback)
+    return P, K, _size(P_step + P_step.T + cost[:n, :n] - feedback) / terms
 
 
 def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float

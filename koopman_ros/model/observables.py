@@ -142,13 +142,14 @@ class NetworkObservables(Observables):
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
         """Evaluate the lift and the secants, by divided differences of tanh and of its slope."""
-        a, a_ref = self.W @ x + self.b, self.W @ x_ref + self.b
-        h, h_ref = np.tanh(a), np.tanh(a_ref)
+        a, a_ref = arguments = np.array((x, x_ref)) @ self.W.T + self.b
+        h, h_ref = np.tanh(arguments)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
         apart = a - a_ref + np.copysign(1e-300, a - a_ref)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
-        return (self._lifted(x, h), self._jacobian(1.0 - h * h), self._jacobian(secant),
-                self._bent(-(h + h_ref) * secant * (self.W @ w)))
+        J, M, H = self._bent(np.array((
+            1.0 - h * h, secant, -(h + h_ref) * secant * (self.W @ w))))
+        return self._lifted(x, h), J + self._of_states, M + self._of_states, H
 
     def _lifted(self, x: Array, h: Array) -> Array:
         free: Array = (h - self.value_at_zero) @ self.V.T
