@@ -71,6 +71,10 @@ class StateEstimation:
         """Return the inputs of which some act after the time of the estimate."""
         return PendingInputs(state.applied, time_ns, self.dead_ns)
 
+    def assumed(self, state: State) -> float:
+        """Return for how many s more inputs act that were only assumed, as after a start."""
+        return state.applied.assumed(state.commanded_ns or 0, self.dead_ns)
+
     def acting(self, state: State, time_ns: int) -> Array:
         """Return the input (n_u,) that acts from a time on, in scaled deviations; 0 at first."""
         if state.command is None:

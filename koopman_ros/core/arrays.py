@@ -82,7 +82,7 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
 
 
 def change_within(rate: Array, seconds: float) -> Array:
-    """Return the largest changes (n,) at some rates (n,); infinite where a rate is, even in 0 s."""
+    """Return the largest changes (n,) at rates (n,); infinite for an infinite one, even in 0 s."""
     return rate * seconds if seconds > 0.0 else np.where(np.isinf(rate), np.inf, 0.0)
 
 

@@ -9,7 +9,7 @@ from enum import Enum
 import math
 
 import numpy as np
-from scipy.linalg.lapack import dgeev, dgees, dgesv, dtrsen
+from scipy.linalg.lapack import dgees, dgeev, dgesv
 
 from koopman_ros.core.arrays import Array
 

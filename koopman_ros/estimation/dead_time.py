@@ -51,6 +51,11 @@ class AppliedInputs:
         return np.array([self.values[max(0, bisect_right(self.times_ns, time_ns - dead) - 1)][i]
                          for i, dead in enumerate(dead_ns)])
 
+    def assumed(self, time_ns: int, dead_ns: tuple[int, ...]) -> float:
+        """Return for how many s after a time inputs act that were applied before the first one."""
+        first = next((time for time in self.times_ns if time > _ALWAYS // 2), time_ns)
+        return max(0, first + max(dead_ns, default=0) - time_ns) / NANOSECONDS
+
     def pieces(self, start_ns: int, end_ns: int, dead_ns: tuple[int, ...]
                ) -> list[tuple[float, Array]]:
         """Return the durations in s and the inputs (n_u,) that act from one time to another."""
