@@ -57,10 +57,11 @@ def step(loop, plant, state, duration, *events):
     return run
 
 
-@pytest.mark.parametrize(('seconds', 'known'), [
-    (10.0, 9.0), (10.0, 11.0), (30.5, 27.0), (60.0, 54.0), (120.0, 108.0)])
-def test_a_late_coolant_brings_no_overshoot(seconds, known):
-    run = step(*late_reactor(seconds, known), 150.0 + 2.0 * seconds)
+@pytest.mark.parametrize(('seconds', 'known', 'estimator'), [
+    (10.0, 9.0, ''), (10.0, 11.0, ''), (30.5, 27.0, ''), (60.0, 54.0, ''), (120.0, 108.0, ''),
+    (60.0, 54.0, 'extended_kalman_filter')])
+def test_a_late_coolant_brings_no_overshoot(seconds, known, estimator):
+    run = step(*late_reactor(seconds, known, estimator=estimator), 150.0 + 2.0 * seconds)
     assert SETPOINT - run.states.min() < 0.3
     assert abs(run.states[-1, 0] - SETPOINT) < 0.5
 
@@ -134,7 +135,7 @@ def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
         limited = uncertainty(model, outputs, loop.tuning)[1]
         assert limited < usual
         assert limited == pytest.approx(
-            largest_bandwidth(seconds, slowest) ** 2 * noise / gain)
+            0.5 * largest_bandwidth(seconds, slowest) ** 2 * noise / gain)
         own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
         np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
                                       uncertainty(loop.model, outputs, own)[1])
