@@ -125,7 +125,7 @@ def late(known: float, share: float, system: ControlAffineSystem) -> Metrics:
         float(equilibrium_input(system, [START])[0]), SECONDS, [at(LEAD, at_setpoint(SETPOINT))],
         actuator=Actuator(dead_time=share * known))
     away = loop.errors(course, SETPOINT, LEAD)
-    return {'largest_kelvin': float(np.max(-away)),
+    return {'largest_kelvin': max(0.0, float(np.max(-away))),
             'seconds_to_0.2_kelvin': loop.settling(course, SETPOINT, 0.2, LEAD),
             'final_kelvin': float(np.max(np.abs(away[-60:])))}
 
