@@ -24,7 +24,7 @@ _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 # The power series of exp(M) - I, for |M| < 1, by M to M^4 in rows that are multiplied by powers of
 # M^4 (M. S. Paterson, L. J. Stockmeyer, SIAM J. Comput. 2 (1973)).
-_SERIES = np.array([[1.0 / math.factorial(4 * i + j) for j in range(1, 5)] for i in range(4)])
+_SERIES = np.array([[1.0 / math.factorial(4 * i + j) for j in range(1, 5)] for i in range(5)])
 
 
 class RiccatiStatus(Enum):
@@ -190,13 +190,15 @@ def transition(A: Array, interval: float) -> Array:
 
 def _part(M: Array, interval: float, size: float) -> tuple[Array, int]:
     """Return exp(M h) - I for a part h of an interval, and how often h doubles to all of it."""
-    doublings = max(0, math.frexp(size)[1] + 1)
+    doublings = max(0, math.frexp(size)[1])
     M = M * math.ldexp(interval, -doublings)
     M2 = M.dot(M)
     M4 = M2.dot(M2)
     powers = np.concatenate((M, M2, M2.dot(M), M4)).reshape(4, -1)
-    total, *rest = _SERIES.dot(powers).reshape(4, *M.shape)
-    return total + M4.dot(rest[0] + M4.dot(rest[1] + M4.dot(rest[2]))), doublings
+    *parts, total = _SERIES.dot(powers).reshape(-1, *M.shape)
+    for part in reversed(parts):
+        total = part + M4.dot(total)
+    return total, doublings
 
 
 def spectral_radius(M: Array) -> float:
