@@ -48,8 +48,9 @@ class AppliedInputs:
 
     def acting(self, time_ns: int, dead_ns: tuple[int, ...]) -> Array:
         """Return the input (n_u,) that acts on the plant from a time on."""
-        return np.array([self.values[max(0, bisect_right(self.times_ns, time_ns - dead) - 1)][i]
-                         for i, dead in enumerate(dead_ns)])
+        rows = [max(0, bisect_right(self.times_ns, time_ns - dead) - 1) for dead in dead_ns]
+        return self.values[rows[0]] if len(set(rows)) == 1 else np.array(
+            [self.values[row][i] for i, row in enumerate(rows)])
 
     def assumed(self, time_ns: int, dead_ns: tuple[int, ...]) -> float:
         """Return for how many s after a time inputs act that were applied before the first one."""
