@@ -149,6 +149,19 @@ def test_robustness_has_the_figures_of_its_summary() -> None:
             for one, name in zip(shown * (len(names) // len(shown)), names, strict=True):
                 _agrees(one, summary['disturbances'][name][figure])
 
+    late = [row for row in rows if row[0].startswith('late: ')]
+    assert len(late) == 4
+    for label, *cells in late:
+        for cell, plant, name in zip(cells, ('unchanged', 'unchanged', 'UA −20 %'), (
+                'largest_kelvin', 'seconds_to_0.2_kelvin', 'largest_kelvin'), strict=True):
+            for one, share in zip(cell.split('; '), ('0.7', '1', '1.3'), strict=True):
+                found = summary['wrong_dead_time'][
+                    f'known {label[6:]}, {share} times as long, {plant}']
+                if one == 'runs away':
+                    assert found['final_kelvin'] > 10.0
+                else:
+                    _agrees(one, found[name])
+
     noise = [row for row in rows if len(row) == 5 and row[0][:1].isdecimal()]
     assert len(noise) == 7
     for label, *cells in noise:

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, change_within
 from koopman_ros.tuning import InputLimits
 
 # In input units; what is left then is below the resolution of any actuator.
@@ -30,12 +30,10 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     """
     command = within = limits.within(wanted)
     if previous is not None:
-        # 0 s times infinity is no number
-        reach = np.where(np.isinf(limits.rate), np.inf, 0.0)
-        np.multiply(limits.rate, max(0.0, seconds), out=reach, where=np.isfinite(limits.rate))
+        reach = change_within(limits.rate, seconds)
         command = np.minimum(np.maximum(within, previous - reach), previous + reach)
     command.setflags(write=False)
-    return command, bool(np.any(within != wanted)), bool(np.any(command != within))
+    return command, bool((within != wanted).any()), bool((command != within).any())
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +54,7 @@ class BumplessTransfer:
         share = seconds / time_constant if time_constant > 0.0 else 0.0
         fading = math.exp(-share)
         left = BumplessTransfer(fading * (self.offset + share * self.feed), fading * self.feed)
-        size = np.max(np.abs(left.offset)) + np.max(np.abs(left.feed))
+        size = np.abs(left.offset).max() + np.abs(left.feed).max()
         return left if size > _NEGLIGIBLE else None
 
 

@@ -85,6 +85,10 @@ class StateEstimation:
         """Return the inputs of which some act after the time of the estimate."""
         return PendingInputs(state.applied, time_ns, self.dead_ns)
 
+    def assumed(self, state: State) -> float:
+        """Return for how many s more inputs act that were only assumed, as after a start."""
+        return state.applied.assumed(state.commanded_ns or 0, self.dead_ns)
+
     def acting(self, state: State, time_ns: int) -> Array:
         """Return the input (n_u,) that acts from a time on, in scaled deviations; 0 at first."""
         if state.command is None:
@@ -101,13 +105,11 @@ class StateEstimation:
 
         :return: the state, and whether the applied input follows the command.
         """
-        u, tolerance = state.command, self.tuning.tracking_tolerance
-        if u is None:
+        command, tolerance = state.command, self.tuning.tracking_tolerance
+        if command is None or measured is None or not np.isfinite(measured).all():
             return state, True
-        if measured is not None and np.isfinite(measured).all():
-            u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
-        return (replace(state, applied=state.applied.corrected(u)),
-                bool((u == state.command).all()))
+        u = np.minimum(np.maximum(command, measured - tolerance), measured + tolerance)
+        return (replace(state, applied=state.applied.corrected(u)), bool((u == command).all()))
 
     def feed_forward(self, state: State) -> Array | None:
         """Return the rate (n_x,) due to the measured disturbances; None without any."""
@@ -176,7 +178,8 @@ class StateEstimation:
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
-            far = outside > max(level.law.margin for level in self.levels.values())
+            far = outside > 0.0 and outside > max(
+                level.law.margin for level in self.levels.values())
             lost = far or self._lost(state, time_ns)
             fresh = predicted is None or verdict.moved or not elapsed > 0.0 or lost
             predicted = self._corrected(

@@ -233,7 +233,7 @@ class FallbackLevel:
         if not np.isfinite(u).all():
             return LawResult(None, reason(StatusCode.COMMAND_NOT_FINITE), result.info)
         within = self.limits.within(u)
-        return replace(result, u=within, clipped=bool(result.clipped or np.any(within != u)))
+        return replace(result, u=within, clipped=bool(result.clipped or (within != u).any()))
 
     def _within_reach(self, target: Target, w: Array) -> Target:
         """Return the target, or the nearest one where the inputs do not suffice."""

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, change_within
 from koopman_ros.core.status import Reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation.sensor_checks import out_of_range
@@ -130,6 +130,9 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
     :param seconds: time since the last measurement; 0 at the first.
     :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
     """
+    if (setpoint.active is setpoint.requested is not None and setpoint.ramped is None
+            and not setpoint.scheduled):
+        return setpoint
     due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
         kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
@@ -142,9 +145,7 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
         active = np.clip(measured, box.lower, box.upper)
     requested = active if setpoint.requested is None else overlaid(active, setpoint.requested)
     ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
-    # infinity for a step, also where no time has passed
-    reach = np.full(len(ramp), np.inf)
-    np.multiply(ramp, seconds, out=reach, where=np.isfinite(ramp))
+    reach = change_within(ramp, seconds)
     ramped = np.minimum(np.maximum(requested, ramped - reach), ramped + reach)
     if lag <= 0.0:
         arrived = ramped.tolist() == requested.tolist()

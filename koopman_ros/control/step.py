@@ -171,10 +171,11 @@ class ControlStep(Configuration):
 
     def _advanced(self, state: State, x: Array, time: StepTime) -> State:
         """Return the state with the set-point of now; it begins from `x` (n_x,)."""
-        return replace(state, setpoint=setpoints.advance(
+        setpoint = setpoints.advance(
             state.setpoint, self.best.controlled_of(x), self.controlled,
             self.tuning.setpoint_ramp, time.now_ns, time.counted,
-            self.tuning.setpoint_filter_time))
+            self.tuning.setpoint_filter_time)
+        return state if setpoint is state.setpoint else replace(state, setpoint=setpoint)
 
     def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
                  time: StepTime) -> tuple[State, Array, StepReport]:

@@ -47,6 +47,8 @@ def _brief(value: object) -> str:
 def real(value: ArrayLike, name: str) -> Array:
     """Return numbers as a float64 array; ValueError for complex or non-numeric ones."""
     array = np.asarray(value)
+    if array.dtype == np.float64:
+        return array
     if np.iscomplexobj(array):
         raise ValueError(f'{name} must be real, got complex numbers: pass their real part')
     try:
@@ -77,6 +79,11 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
                          f'{array[position]}: check its source')
     array.setflags(write=False)
     return array
+
+
+def change_within(rate: Array, seconds: float) -> Array:
+    """Return the largest changes (n,) at rates (n,); infinite for an infinite one, even in 0 s."""
+    return rate * seconds if seconds > 0.0 else np.where(np.isinf(rate), np.inf, 0.0)
 
 
 def read_only(value: ArrayLike) -> Array:

@@ -203,7 +203,7 @@ class Estimator(ABC):
 
     def _share(self, w: Array) -> float:
         """Return the largest share of its bound that a disturbance has as an input."""
-        return float(np.max(np.abs(self.as_input(w)) / self._max_disturbance, initial=0.0))
+        return float((np.abs(self.as_input(w)) / self._max_disturbance).max(initial=0.0))
 
     @cached_property
     def _max_disturbance(self) -> Array:

@@ -48,12 +48,20 @@ class AppliedInputs:
 
     def acting(self, time_ns: int, dead_ns: tuple[int, ...]) -> Array:
         """Return the input (n_u,) that acts on the plant from a time on."""
-        return np.array([self.values[max(0, bisect_right(self.times_ns, time_ns - dead) - 1)][i]
-                         for i, dead in enumerate(dead_ns)])
+        rows = [max(0, bisect_right(self.times_ns, time_ns - dead) - 1) for dead in dead_ns]
+        return self.values[rows[0]] if len(set(rows)) == 1 else np.array(
+            [self.values[row][i] for i, row in enumerate(rows)])
+
+    def assumed(self, time_ns: int, dead_ns: tuple[int, ...]) -> float:
+        """Return for how many s after a time inputs act that were applied before the first one."""
+        first = next((time for time in self.times_ns if time > _ALWAYS // 2), time_ns)
+        return max(0, first + max(dead_ns, default=0) - time_ns) / NANOSECONDS
 
     def pieces(self, start_ns: int, end_ns: int, dead_ns: tuple[int, ...]
                ) -> list[tuple[float, Array]]:
         """Return the durations in s and the inputs (n_u,) that act from one time to another."""
+        if len(self.values) == 1 and start_ns < end_ns:
+            return [((end_ns - start_ns) / NANOSECONDS, self.values[0])]
         edges = {start_ns, end_ns} | {
             time + dead for time in self.times_ns for dead in set(dead_ns)
             if start_ns < time + dead < end_ns}

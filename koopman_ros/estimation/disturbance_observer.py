@@ -31,7 +31,7 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
     # far out the model's drift grows without bound, and corrections could not bring x back
-    if not np.all(np.abs(x) <= LOST * model.states.half_widths):
+    if not (np.abs(x) <= LOST * model.states.half_widths).all():
         return None
     return Estimate(x, estimate.w)
 

@@ -63,12 +63,13 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
     dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
     if dead_time > 0.0:
         # at one sample a second the bandwidth of a filter is the root of the ratio between the
-        # rate of an output that a disturbance causes and the output's noise
+        # rate of an output that a disturbance causes and the output's noise; its poles are damped
+        # by 0.7, so that a disturbance settles as with an observer of the root of twice of that
         rates = np.abs(outputs.C * model.states.scale @ model.B) / (
             model.inputs.scale * model.seconds_per_time_unit)
         with np.errstate(divide='ignore'):
             disturbance_noise = np.minimum(
-                disturbance_noise, largest_bandwidth(dead_time, slowest) ** 2 * np.min(
+                disturbance_noise, 0.5 * largest_bandwidth(dead_time, slowest) ** 2 * np.min(
                     noise[:, None] / rates, axis=0))
     disturbance_noise, error = (
         np.where(own > 0.0, own, default) for own, default in (

@@ -69,7 +69,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     seconds = (time_ns - last.time_ns) / NANOSECONDS
     change = np.abs(y - last.value)
     excess = change / (limits.jump + limits.unreported + limits.rate * seconds)
-    i = int(np.argmax(excess))
+    i = int(excess.argmax())
     if excess[i] > 1.0:
         return Verdict(replace(last, jumped=True), reason(
             StatusCode.JUMPED, signal=outputs.names[i], before=float(last.value[i]),
@@ -90,7 +90,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     should_move = still & (np.abs(stuck.travel) > 0.5 * limits.jump) & (
         limits.report_on_change == 0.0)
     stood = np.where(should_move, (time_ns - np.array(stuck.since_ns)) / NANOSECONDS, 0.0)
-    i = int(np.argmax(stood))
+    i = int(stood.argmax())
     if stood[i] > limits.stuck_sensor_timeout > 0.0:
         return Verdict(accepted, reason(
             StatusCode.FROZEN, signal=outputs.names[i], value=float(y[i]),

@@ -113,7 +113,7 @@ class Coordinates:
         if not np.isfinite(value).all():
             return math.inf
         excess = np.maximum(self.lower - value, value - self.upper)
-        return max(0.0, float(np.max(2.0 * excess / (self.upper - self.lower), initial=0.0)))
+        return float((2.0 * excess / (self.upper - self.lower)).max(initial=0.0))
 
     @cached_property
     def half_widths(self) -> Array:

@@ -431,7 +431,7 @@ class LiftedModel:
             finite.
         """
         half, (lower, upper) = self.states.half_widths, self.states.corners
-        outside = np.max(np.maximum(np.maximum(lower - x, x - upper) / half, 0.0), axis=1)
+        outside = np.maximum(np.maximum(lower - x, x - upper) / half, 0.0).max(axis=1)
         if self.training_states is not None:
             outside = np.maximum(outside, self.training_states.distance(x, half))
         return np.where(np.isfinite(x).all(axis=1), outside, np.inf)
@@ -457,7 +457,7 @@ class LiftedModel:
         """Return the pseudo-inverse of J_N(x): (..., n_z, n_x) -> (..., n_x, n_z)."""
         if self.identity and J.shape[-1] == 1:
             # one state: a tenth of the time of a singular value decomposition
-            inverse: Array = (J / np.sum(J * J, axis=-2, keepdims=True)).swapaxes(-1, -2)
+            inverse: Array = (J / (J * J).sum(axis=-2, keepdims=True)).swapaxes(-1, -2)
             return inverse
         return np.asarray(np.linalg.pinv(J), dtype=np.float64)
 
@@ -477,7 +477,7 @@ class LiftedModel:
             return self.observables.features.lift(x) @ self.readout.T
         z, J = self.observables.lift_and_jacobian(x)
         f = (self._onto_states(J) @ (z @ self.A.T)[..., None])[..., 0]
-        return f - self.pre_feedback_rate(x)
+        return f if self.pre_feedback is None else f - self.pre_feedback_rate(x)
 
     @cached_property
     def pre_feedback_slope(self) -> Array:

@@ -142,26 +142,34 @@ class NetworkObservables(Observables):
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
         """Evaluate the lift and the secants, by divided differences of tanh and of its slope."""
-        a, a_ref = self.W @ x + self.b, self.W @ x_ref + self.b
-        h, h_ref = np.tanh(a), np.tanh(a_ref)
+        a, a_ref = arguments = np.array((x, x_ref)) @ self.W.T + self.b
+        h, h_ref = np.tanh(arguments)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
         apart = a - a_ref + np.copysign(1e-300, a - a_ref)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
-        H = self._jacobian(-(h + h_ref) * secant * (self.W @ w))
-        H[:self.n_z - len(self.V)] = 0.0
-        return (self._lifted(x, h), self._jacobian(1.0 - h * h), self._jacobian(secant), H)
+        J, M, H = self._bent(np.array((
+            1.0 - h * h, secant, -(h + h_ref) * secant * (self.W @ w))))
+        return self._lifted(x, h), J + self._of_states, M + self._of_states, H
 
     def _lifted(self, x: Array, h: Array) -> Array:
         free: Array = (h - self.value_at_zero) @ self.V.T
         return np.concatenate((x, free), axis=-1) if self.identity else free
 
     def _jacobian(self, slope: Array) -> Array:
-        """Return V diag(slope) W below the rows of the states: (..., h) -> (..., n_z, n_x)."""
-        rows = self.n_z - len(self.V)
-        J = np.empty((*slope.shape[:-1], self.n_z, self.n_x))
-        J[..., :rows, :] = np.eye(rows, self.n_x)
-        np.matmul(self.V * slope[..., None, :], self.W, out=J[..., rows:, :])
-        return J
+        return self._bent(slope) + self._of_states
+
+    def _bent(self, slope: Array) -> Array:
+        """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""
+        found: Array = (self._below * slope[..., None, :]) @ self.W
+        return found
+
+    @cached_property
+    def _of_states(self) -> Array:
+        return np.eye(self.n_z, self.n_x) if self.identity else np.zeros((self.n_z, self.n_x))
+
+    @cached_property
+    def _below(self) -> Array:
+        return np.concatenate((np.zeros((self.n_z - len(self.V), len(self.W))), self.V))
 
 
 @final

@@ -124,5 +124,5 @@ class VerifiedLoops:
 
 def _distances(states: Array, x: Array, half_widths: Array) -> Array:
     """Return the distances (...) between states (..., n_x): the largest coordinate's."""
-    distances: Array = np.max(np.abs((states - x) / half_widths), axis=-1)
+    distances: Array = np.abs((states - x) / half_widths).max(axis=-1)
     return distances

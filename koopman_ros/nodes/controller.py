@@ -115,7 +115,7 @@ class ControllerNode(ManagedNode):
         self._report_lock = threading.Lock()
         self._report = self._logged = StepReport(
             Mode.AUTOMATIC, next(iter(self._loop.controller.levels)))
-        self._safe_input_warning = ''
+        self._safe_input_warning = self._dead_time_change = ''
         # no status is collected until then, unless the level or the presence of a reason changes
         self._last_status, self._status_pending = (0.0, '', False), False
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
@@ -308,6 +308,7 @@ class ControllerNode(ManagedNode):
             request=self._requests.complaint,
             model_refused=self._models.refused,
             model=lambda: {**self._models.figures(),
+                           'dead time change': self._dead_time_change or 'none',
                            'safe input': self._safe_input_warning or 'within reach'})
         return status.statuses(situation) if self.active else status.inactive(situation)
 
@@ -327,11 +328,14 @@ class ControllerNode(ManagedNode):
 
     def _exchange(self, event: str, fields: Mapping[str, object]) -> None:
         """Switch to the present parameters and model."""
-        before = self._loop.controller.model.states.names
+        before = self._loop.controller
         self._loop.exchange(built(self._settings, self._models.in_force.model),
                             lambda: self._records.publish(event, fields))
+        if change := status.dead_time_change(before, self._loop.controller):
+            self._dead_time_change = change
+            self.get_logger().info(change)
         model = self._loop.controller.model
-        if model.states.names != before:
+        if model.states.names != before.model.states.names:
             # what is estimated is something else; what was last said is of another model
             self._signals = signals_of(model, self._signals.controlled, self._signals.states)
             self._report = replace(self._report, estimate=None, target=None)

@@ -117,6 +117,14 @@ def statuses(now: StatusContext) -> dict[str, TaskReport]:
     return found
 
 
+def dead_time_change(before: Controller, after: Controller) -> str:
+    """Return which dead times a change of model or parameters has changed, or ''."""
+    return ', '.join(
+        f'dead time of {name}: {old:g} s -> {new:g} s' for name, old, new in zip(
+            after.model.inputs.names, before.tuning.dead_times(before.model).tolist(),
+            after.tuning.dead_times(after.model).tolist(), strict=True) if old != new)
+
+
 def inactive(now: StatusContext) -> dict[str, TaskReport]:
     """Return the statuses of a node that answers no measurement."""
     return {**dict.fromkeys(CONDITIONS, TaskReport(Severity.OK, _INACTIVE)),
@@ -142,7 +150,10 @@ def _in_order(now: StatusContext) -> str:
         return f'{mode.value}, no set-point yet: the first measurement is the set-point'
     if command.at_range:
         return f'{mode.value}, {now.input} at a limit'
-    return f'{mode.value}, {now.input} at a rate limit' if command.at_rate else mode.value
+    if command.at_rate:
+        return f'{mode.value}, {now.input} at a rate limit'
+    return mode.value if not now.controller.estimation.assumed(now.state) else (
+        f'{mode.value}, {now.input} before the start is assumed until its dead time is over')
 
 
 def _control(now: StatusContext) -> tuple[Severity, str]:
@@ -301,6 +312,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
     bias = None if estimate is None or signals.estimated else (
         now.controller.equivalent_bias(state))
     controlled = {name: signals.states[name] for name in signals.controlled}
+    dead_times = now.controller.tuning.dead_times(now.controller.model)
     return {
         'condition': condition,
         'mode': state.mode.value,
@@ -328,6 +340,8 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'gain norm': float(law.gain),
         'predicted growth per sample': float(law.growth),
         **labelled(inputs, 'transfer', transfer, difference=True),
+        **labelled(dict.fromkeys(inputs, 's'), 'dead time', dead_times),
+        'inputs before the start act for [s]': now.controller.estimation.assumed(state),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,

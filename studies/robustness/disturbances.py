@@ -4,7 +4,7 @@
 """What changed plants, lags, biases, saturation and noise do to the loop."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 import math
 from typing import Any
@@ -22,6 +22,8 @@ LEAD = 10.0  # s of rest before a change
 SECONDS = 1500.0
 NOISE = 0.1  # K
 BIAS = 2.0  # K
+# Dead times that are known, in s, and how much longer or shorter that of the plant is.
+DEAD_TIMES, SHARES = (10.0, 30.0, 60.0, 120.0), (0.7, 1.0, 1.3)
 BANDWIDTHS = (0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 20.0)  # 1/min
 CHANGED = {
     'UA −20 %': changed_reactor(heat_transfer=0.8), 'UA +20 %': changed_reactor(heat_transfer=1.2),
@@ -113,6 +115,19 @@ def judge(case: Disturbed) -> Metrics:
         'disturbance_kelvin': math.nan if last is None else float(last.disturbance[0]),
         'equivalent_bias_kelvin': bias if math.isfinite(bias) else None,
         'learned': loop.worst(course) == 'sdre'}
+
+
+def late(known: float, share: float, system: ControlAffineSystem) -> Metrics:
+    """Step by -10 K with a coolant that is `share` times as late as is known, in s."""
+    model = replace(loop.shipped_model(), dead_time=np.array([known]))
+    course = loop.run_loop(
+        loop.reactor_controller(model=model, bandwidth=None), system, np.array([START]),
+        float(equilibrium_input(system, [START])[0]), SECONDS, [at(LEAD, at_setpoint(SETPOINT))],
+        actuator=Actuator(dead_time=share * known))
+    away = loop.errors(course, SETPOINT, LEAD)
+    return {'largest_kelvin': max(0.0, float(np.max(-away))),
+            'seconds_to_0.2_kelvin': loop.settling(course, SETPOINT, 0.2, LEAD),
+            'final_kelvin': float(np.max(np.abs(away[-60:])))}
 
 
 def noise_against_speed(bandwidth: float) -> Metrics:

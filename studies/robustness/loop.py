@@ -35,22 +35,23 @@ def shipped_model() -> LiftedModel:
     return load(model_path('reactor_nz4'))
 
 
-def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 1.0,
+def reactor_controller(*, bandwidth: float | None = BANDWIDTH, coolant_weight: float = 1.0,
                        fallback: bool = True, linear_model_margin: float = 0.5,
                        model: LiftedModel | None = None) -> Controller:
     """
     Return the controller with the default parameters of its node and the shipped model.
 
-    :param bandwidth: of the observer, in 1/min.
+    :param bandwidth: of the observer, in 1/min; None for the default, which falls with the
+        model's dead time.
     :param coolant_weight: in 1/K^2.
     :param fallback: whether the distance from the training data decides which law acts.
     :param linear_model_margin: up to which the linear law does, in half-ranges.
     """
     model = model or shipped_model()
+    observer = {} if bandwidth is None else {'observer_bandwidth': bandwidth / SECONDS_PER_MINUTE}
     tuning = built(table_of(model).snapshot({
-        'observer_bandwidth': bandwidth / SECONDS_PER_MINUTE,
-        'coolant_temperature.weight': coolant_weight, 'linear_model_margin': linear_model_margin}),
-        model).tuning
+        **observer, 'coolant_temperature.weight': coolant_weight,
+        'linear_model_margin': linear_model_margin}), model).tuning
     return Controller(model, tuning if fallback else replace(tuning, **NO_FALLBACK))
 
 

@@ -46,6 +46,8 @@ def write_report(found: Found, folder: Path) -> None:
         _table(figures['verified']),
         '## Disturbances: deviation of the temperature; of steps, overshoot',
         _table(figures['disturbances']),
+        '## A step by −10 K with a coolant whose dead time is wrong',
+        _table(figures['wrong_dead_time']),
         '## Noise of 0.1 K at 1 Hz, and the time after UA −20 % and a step by −10 K',
         _table(figures['noise']),
         '## Region of attraction',

@@ -79,7 +79,8 @@ def linearised_controller(controller: Controller, temperature: float) -> control
     assert rest is not None
 
     def stepped(x: Array, w: Array, u: Array, y: Array) -> tuple[State, Array]:
-        state = replace(before, estimate=Estimate(x, w), transfer=None, command=u)
+        state = replace(before, estimate=Estimate(x, w), transfer=None, command=u,
+                        applied=before.applied.corrected(u))
         return controller.step(state, y, 3 * NANOSECONDS)[:2]
 
     holding = stepped(rest.x, np.zeros(1), u, point)[1]

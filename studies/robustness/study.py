@@ -64,6 +64,10 @@ def study(backend: Backend | None = None) -> Found:
             name: grown[0.0, share * at.delay] for name, share in near.items()}}
     cases = {case.name: case for case in disturbances.cases()}
     disturbed = spread('disturbances', lambda name: disturbances.judge(cases[name]), cases)
+    plants = {'unchanged': REACTOR, **disturbances.CHANGED}
+    late = spread('wrong dead times', lambda key: disturbances.late(
+        *key[:2], plants[key[2]]), product(
+            disturbances.DEAD_TIMES, disturbances.SHARES, ('unchanged', 'UA −20 %')))
     noise = spread('noise', disturbances.noise_against_speed, disturbances.BANDWIDTHS)
     ends = spread('region of attraction', lambda key: stability.end_of(
         key[2], key[1], fallback=key[0]),
@@ -79,11 +83,10 @@ def study(backend: Backend | None = None) -> Found:
         'fallback_kelvin': stability.hottest_start(coolant, fallback=True),
         'no_fallback_kelvin': stability.hottest_start(coolant, fallback=False)},
         stability.COOLANTS)
-    reactors = {'unchanged': REACTOR, **disturbances.CHANGED}
     back = spread('back from the safe coolant', lambda key: stability.back_from_safe(
-        reactors[key[0]], key[1]), product(reactors, narrow.LINEAR_MARGINS))
-    plants = {'reactor': narrow.reactor_courses, 'two_state': narrow.two_state_courses}
-    courses = spread('lifts of narrow data', lambda name: plants[name](), plants)
+        plants[key[0]], key[1]), product(plants, narrow.LINEAR_MARGINS))
+    runs = {'reactor': narrow.reactor_courses, 'two_state': narrow.two_state_courses}
+    courses = spread('lifts of narrow data', lambda name: runs[name](), runs)
     far = spread('far from the model', lambda key: narrow.far_from_the_model(*key),
                  product(narrow.LINEAR_MARGINS, narrow.MARGIN_BANDWIDTHS))
     figures = {
@@ -93,6 +96,9 @@ def study(backend: Backend | None = None) -> Found:
                 'delay_seconds': m.delay, 'distance': m.distance}
             for (weight, bandwidth, kelvin), m in margins.items()},
         'verified': verified, 'disturbances': disturbed,
+        'wrong_dead_time': {
+            f'known {known:g} s, {share:g} times as long, {name}': found
+            for (known, share, name), found in late.items()},
         'noise': {f'bandwidth={bandwidth:g}': m for bandwidth, m in noise.items()},
         'attraction': {
             'hottest_cooled_kelvin': stability.hottest_cooled(),

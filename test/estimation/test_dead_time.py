@@ -52,6 +52,12 @@ def test_the_first_input_was_applied_before_and_the_last_is_what_was_measured():
         -5.0, 10.0, 13.9, 14.0)] == [7.0, 7.0, 7.0, 1.0]
     found = found.corrected(np.array([3.0]))
     assert found.acting(14 * SECOND, (4 * SECOND,))[0] == 3.0
+    # what was applied before the first command acts on for a dead time
+    for count, left in ((1, 4.0), (3, 2.0), (5, 0.0), (6, 0.0)):
+        now_ns = (9 + count) * SECOND
+        assert found.assumed(now_ns, (4 * SECOND,)) == left
+        assert commanded((4 * SECOND,), count).assumed(now_ns, (4 * SECOND,)) == left
+        assert found.assumed(now_ns, (0,)) == 0.0
     # a clock that was set back by 8 s, and a command at a time at which there was one
     found = found.shifted(-8 * SECOND).followed_by(2 * SECOND, np.array([5.0]), (4 * SECOND,))
     assert [found.acting(time * SECOND, (4 * SECOND,))[0] for time in (5, 6)] == [7.0, 5.0]

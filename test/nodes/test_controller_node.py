@@ -233,6 +233,14 @@ def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
     assert status.level == DiagnosticStatus.WARN
     assert 'max_measurement_age allows 1 s' in status.message
 
+    # of the inputs that act until the dead time is over only the last one is known
+    bench.ros.set_parameters('controller', max_measurement_age=0.0, **{
+        'coolant_temperature.dead_time': 25.0})
+    status = bench.status(lambda s: 'before the start is assumed' in s.message)
+    assert [value(status, f'{figure} [s]') for figure in (
+        'dead time', 'inputs before the start act for')] == ['25', '25']
+    assert value(status, 'dead time change') == 'dead time of coolant_temperature: 0 s -> 25 s'
+
 
 def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are_reported(
         bench: Bench) -> None:

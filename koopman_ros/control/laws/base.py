@@ -56,7 +56,7 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
     w = np.zeros(model.n_x) if w is None else w
     u = -model.input_inverse(x_ref).dot(drift + w)
     forcing = model.forcing(x_ref, u) + w
-    return Target(x_ref, z, drift, u, forcing, float(np.linalg.norm(drift + forcing)))
+    return Target(x_ref, z, drift, u, forcing, math.hypot(*(drift + forcing).tolist()))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,13 @@ from koopman_ros.control.laws.base import (
     Weights,
 )
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import RiccatiSolution, RiccatiStatus, solve_riccati, transition
+from koopman_ros.core.solvers import (
+    RiccatiSolution,
+    RiccatiStatus,
+    solve_riccati,
+    spectral_radius,
+    transition,
+)
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
@@ -63,19 +69,15 @@ class Feedback:
         :param interval: between samples in the model's time unit; 0 when it is not known.
         :return: 1 and more, or NaN, when the loop is predicted not to be stable.
         """
-        loop = self.drift + self.action
-        if not np.isfinite(loop).all():
-            return math.nan
+        n = len(self.drift)
         if not interval > 0.0:
+            loop = self.drift + self.action
             return float(np.exp(np.max(np.linalg.eigvals(loop).real)))
-        n = len(loop)
         held = np.zeros((2 * n, 2 * n))
         held[:n, :n], held[:n, n:] = self.drift, self.action
         step = transition(held, interval)[:n]
         closed = step[:, :n] + step[:, n:]
-        if not np.isfinite(closed).all():
-            return math.inf
-        return float(np.max(np.abs(np.linalg.eigvals(closed))))
+        return spectral_radius(closed) if np.isfinite(closed).all() else math.inf
 
 
 def closed(model: LiftedModel) -> bool:
