@@ -66,7 +66,7 @@ def study(backend: Backend | None = None) -> Found:
     disturbed = spread('disturbances', lambda name: disturbances.judge(cases[name]), cases)
     plants = {'unchanged': REACTOR, **disturbances.CHANGED}
     late = spread('wrong dead times', lambda key: disturbances.late(
-        *key[:2], plants[key[2]]), product(
+        key[0], key[1], plants[key[2]]), product(
             disturbances.DEAD_TIMES, disturbances.SHARES, ('unchanged', 'UA −20 %')))
     noise = spread('noise', disturbances.noise_against_speed, disturbances.BANDWIDTHS)
     ends = spread('region of attraction', lambda key: stability.end_of(
