@@ -6,7 +6,6 @@
 import contextlib
 from dataclasses import dataclass
 from datetime import datetime, UTC
-from pathlib import Path
 
 import numpy as np
 
