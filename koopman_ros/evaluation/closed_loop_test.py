@@ -182,7 +182,8 @@ class ClosedLoopTest:
 def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
                           law: type[Law] = StateDependentRiccati,
                           limits: InputLimits | None = None, interval: float = 0.0,
-                          loops: int = LOOPS, watch: Callable[[float], bool] = lambda _: False,
+                          noise: Array | None = None, loops: int = LOOPS,
+                          watch: Callable[[float], bool] = lambda _: False,
                           backend: Backend | None = None) -> ClosedLoopTest | None:
     """
     Let a model's law control a drift that the model was not learned from, where the data are.
@@ -197,7 +198,9 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     from each other (a scrambled Sobol sequence of fixed seed); if these are not known, they fill
     the box. Set-points are steady states of that drift, held by an input within its limits; if
     none is among the data, the nearest ones are taken. All laws get that input, as from a
-    disturbance observer at rest. Inputs are held from sample to sample. Where no law reaches the
+    disturbance observer at rest. Inputs are held from sample to sample, and act after the dead
+    time of the model, which the law bridges as in operation, by the inputs under way; the other
+    laws know the state at which each input will act. Where no law reaches the
     set-point within the limits, they run again without: the limits must not hide a model that is
     wrong far from the data.
 
@@ -207,6 +210,7 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     :param limits: of the inputs; by default those of the tuning.
     :param interval: seconds between samples; by default, and at least, half of the fastest
         time constant of the linear loop.
+    :param noise: (n_x,) standard deviation of the measured states, in state units; by default 0.
     :param loops: closed loops to run; fewer where these take many samples.
     :param watch: called with the share that is done; True ends the check.
     :param backend: where the loops run, 32 of them side by side; this process by default.
@@ -222,11 +226,13 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     slowest, fastest = _closed_loop_rates(linear, Weights.physical(
         linear, tuning.state_weight, tuning.input_weight))
     interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
-    samples = math.ceil(_DURATION / (slowest * interval))
+    dead_time = float(np.max(model.dead_time)) / model.seconds_per_time_unit
+    samples = math.ceil((_DURATION / slowest + dead_time) / interval)
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
     given = LoopBatch(plant, replace(tuning, limits=limits), law, interval, samples,
-                      math.ceil(_STEPS * interval * fastest))
+                      math.ceil(_STEPS * interval * fastest),
+                      np.zeros(model.n_x) if noise is None else noise / model.states.scale)
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
         for first in range(0, max(1, len(starts)), _PART)}

@@ -4,7 +4,7 @@
 """The gate: acceptance of a model by the part of the record that it was not learned from."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -82,8 +82,11 @@ class HeldOut:
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
-        found = evaluate_closed_loops(model, self._found.drift.rate, loops=loops, watch=watch,
-                                      interval=period * self._seconds, backend=backend)
+        model = replace(model, dead_time=self._seconds * self._found.dead_time)
+        found = evaluate_closed_loops(
+            model, self._found.drift.rate, loops=loops, watch=watch,
+            interval=period * self._seconds, noise=np.nan_to_num(self._found.noise),
+            backend=backend)
         if found is None:
             raise Stopped
         return found

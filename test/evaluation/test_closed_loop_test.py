@@ -75,6 +75,33 @@ def test_on_a_linear_plant_the_law_is_the_linear_one():
     assert np.all(np.max(np.abs(found.starts - found.setpoints) / TWO.scale, axis=1) >= 0.25)
 
 
+@pytest.mark.parametrize(('model', 'rate', 'dead', 'limits'), [
+    # of a part of a sample, and of several; of plants that are unstable and in minutes
+    (scalar(), linear_rate(1.0), [0.2], 2e-3), (scalar(), linear_rate(1.0), [1.0], 2e-3),
+    (two_states(), two_state_rate, [70.0, 70.0], 2e-3),
+    (two_states(), two_state_rate, [0.0, 70.0], 0.03)])
+def test_a_law_bridges_the_dead_time_by_the_inputs_under_way(model, rate, dead, limits):
+    model, wide = replace(model, dead_time=np.array(dead)), np.full(model.n_u, 99.0)
+    free = InputLimits(-wide, wide, np.full(model.n_u, np.inf))
+    found = evaluate_closed_loops(model, rate, loops=8, limits=free)
+    # beside the same law that acts on the state of that time
+    assert found.excess == pytest.approx(np.ones(8), abs=limits)
+    assert found.accepted
+    unaware = Tuning.for_model(model, max_gain=1e6, dead_time=np.zeros(model.n_u), limits=free)
+    lost = evaluate_closed_loops(model, rate, loops=8, tuning=unaware)
+    assert max(dead) < 0.5 or lost.share_failed > 0.5
+
+
+def test_noise_is_in_the_loops_of_all_laws():
+    found = evaluate_closed_loops(scalar(), linear_rate(1.0), loops=8, noise=np.full(1, 0.02))
+    assert found.excess == pytest.approx(np.ones(8), rel=1e-6)
+    # it reaches the law
+    off = evaluate_closed_loops(scalar(1.3), linear_rate(1.0), loops=8, noise=np.full(1, 0.02))
+    quiet = evaluate_closed_loops(scalar(1.3), linear_rate(1.0), loops=8)
+    assert np.all(off.excess != quiet.excess)
+    assert off.excess == pytest.approx(quiet.excess, rel=0.05)
+
+
 def test_an_input_of_the_wrong_sign_is_refused():
     found = evaluate_closed_loops(two_states(-B), two_state_rate, loops=16)
     assert not found.accepted

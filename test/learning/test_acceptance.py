@@ -54,11 +54,22 @@ def trained(found, shipped):
 
 @pytest.fixture
 def no_loops(monkeypatch, shipped):
-    """Leave the closed loops out where another figure decides."""
+    """Leave the closed loops out where another figure decides; return their arguments."""
+    given = []
     passed = ClosedLoopTest(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool),
                             np.ones(9), 0)
-    monkeypatch.setattr(sys.modules[evaluate_model.__module__], 'evaluate_closed_loops', lambda *_,
-                        **__: passed)
+    monkeypatch.setattr(sys.modules[evaluate_model.__module__], 'evaluate_closed_loops',
+                        lambda *_, **others: given.append((*_, others)) or passed)
+    return given
+
+
+def test_loops_have_dead_time_noise_and_period_of_the_record(found, trained, no_loops):
+    """A minute is the time unit of the drift; the period is 1 s."""
+    evaluate_model(replace(found, dead_time=np.array([0.2])), trained, None, Thresholds())
+    (model, _, others), *_ = no_loops
+    assert model.dead_time == pytest.approx([12.0])
+    assert others['noise'] == pytest.approx([NOISE], rel=0.15)
+    assert others['interval'] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(('unit', 'seconds'), [('s', 1.0), ('min', 60.0)])
