@@ -10,12 +10,18 @@ import numpy as np
 
 from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array, short_repr
-from koopman_ros.core.units import Display, display_unit, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import (
+    Display,
+    display_unit,
+    quantity_text,
+    SECONDS_PER_TIME_UNIT,
+)
 from koopman_ros.evaluation.closed_loop_test import (
     ClosedLoopTest,
     evaluate_closed_loops,
     LOOPS,
     Rate,
+    statement,
 )
 from koopman_ros.execution import Backend
 from koopman_ros.learning.identification import (
@@ -37,6 +43,10 @@ _SIGMAS = 5.0
 _NOTICEABLE = 1e-3
 # White errors have none; those of a fitted start stay far below.
 _LEAST_AUTOCORRELATION = 0.3
+# Of the drifts that explain a record as well as the chosen one.
+_MOST_ALTERNATIVES = 5
+# They differ where the mean square of their rates does by more than this share of the motion.
+_DIFFERENT = 0.1
 # A share of the set-points' range that may be missing: noise moves the ends of a record.
 _MISSING = 0.05
 
@@ -77,14 +87,19 @@ class HeldOut:
         return self.rmse(lifted_rate(model, self._seconds))
 
     def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
-                  backend: Backend | None = None) -> ClosedLoopTest:
-        """Close a model's loop on the estimated drift; Stopped where `watch` ended it."""
+                  backend: Backend | None = None, *, alternative: int = 0) -> ClosedLoopTest:
+        """
+        Close a model's loop on the estimated drift; Stopped where `watch` ended it.
+
+        :param alternative: number of the alternative drift to take instead, from 1.
+        """
+        drift = [self._found.drift, *self._found.alternatives][alternative]
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
         model = replace(model, dead_time=self._seconds * self._found.dead_time)
         found = evaluate_closed_loops(
-            model, self._found.drift.rate, loops=loops, watch=watch,
+            model, drift.rate, loops=loops, seed=alternative, watch=watch,
             interval=period * self._seconds, noise=np.nan_to_num(self._found.noise),
             backend=backend)
         if found is None:
@@ -130,8 +145,15 @@ class AcceptanceResult:
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
+    #: the same on each of the alternative drifts that were taken
+    alternative_checks: tuple[ClosedLoopTest, ...] = ()
 
     __repr__ = short_repr
+
+    @property
+    def statement(self) -> str:
+        """The share of failed loops on all drifts, with its confidence."""
+        return statement([self.law_check, *self.alternative_checks])
 
     @property
     def accepted(self) -> bool:
@@ -161,10 +183,16 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     if current_rmse is not None:
         beside = held_out.exceeded(model, 'the current model', rmse, current_rmse)
         reasons = (*filter(None, [beside]), *reasons)
+    checks = tuple(held_out.law_check(model, loops, lambda _: False, alternative=k)
+                   for k in range(1, 1 + min(len(found.alternatives), _MOST_ALTERNATIVES)))
+    reasons = (*reasons, *(
+        f'its law does not control a {drift.form} that explains the record equally well: {check}; '
+        'record more in that range' for drift, check in zip(
+            found.alternatives, checks, strict=False) if check.loops and not check.accepted))
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
-                            held_out.linear_rmse, found.noise, law_check)
+                            held_out.linear_rmse, found.noise, law_check, checks)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:
@@ -179,10 +207,33 @@ def _autocorrelation(drift: Drift, segments: Segments) -> Array:
     return products / np.where(squares > 0.0, squares, 1.0)
 
 
+def disagreement(found: Identified) -> str:
+    """Say by how much, and where most, drifts that explain the record equally well differ."""
+    if not found.alternatives:
+        return ''
+    box = found.drift.box
+    episodes = [*found.fitted, *found.held_out]
+    x, u = (np.concatenate(parts) for parts in (
+        [one.interpolated() for one in episodes], [one.inputs_at(one.time) for one in episodes]))
+    own = found.drift.rate(x, u)
+    differences = np.array([(one.rate(x, u) - own) / box.states.scale
+                            for one in found.alternatives])
+    squares = np.mean(differences ** 2, axis=(1, 2))
+    share = float(np.sqrt(np.max(squares) / np.mean((own / box.states.scale) ** 2)))
+    if share <= _DIFFERENT:
+        return ''
+    worst = x[int(np.argmax(np.max(np.sum(differences ** 2, axis=2), axis=0)))]
+    place = ', '.join(f'{name} {quantity_text(value, unit)}' for name, unit, value in zip(
+        box.states.names, box.states.units, worst.tolist(), strict=True))
+    return (f'{1 + len(found.alternatives)} drifts that explain the record equally well differ by '
+            f'{100.0 * share:.0f} % of the motion, most at {place}: record longer, with steps of '
+            'the input around that state')
+
+
 def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
               ) -> tuple[str, ...]:
     """Say where the best drift errs by more than white noise explains."""
-    warnings = list(found.warnings)
+    warnings = [*found.warnings, *filter(None, [disagreement(found)])]
     count = sum(len(episode) for episode in found.held_out)
     measured = len(model.states) - found.hidden
     for i, (name, unit) in enumerate(zip(model.states.names[:measured], model.states.units,

@@ -168,6 +168,8 @@ class Retrained:
                 'heldout_rx': fit.rx,
                 'condition': fit.cond,
                 'closed_loops': check.loops,
+                'closed_loop_statement': self.decision.statement,
+                'alternatives': len(self.decision.alternative_checks),
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
                 'closed_loop_cost_beside_linear': check.median_ratio,
@@ -428,7 +430,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
     return replace(model, verified_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
         method=f'{found.method}, {found.drift.form}', model_class=model_class,
-        accepted=decision.accepted, reasons=decision.reasons))
+        accepted=decision.accepted, reasons=decision.reasons, closed_loops=decision.statement))
 
 
 def _place(output: Path, accepted: bool) -> Path:

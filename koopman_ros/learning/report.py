@@ -138,6 +138,8 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield (f'Lift: n_z = {learned.model.n_z}, rw = {learned.figures.fit.rw:.2g}, condition number '
            f'{learned.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
            f'1/{learned.model.time_unit}. On the estimated drift {decision.law_check}.')
+    if decision.statement:
+        yield f'Simulated closed loops from where the data are: {decision.statement}.'
 
 
 def _label(signals: Coordinates, k: int) -> str:

@@ -101,11 +101,12 @@ def test_a_law_bridges_the_dead_time_by_the_inputs_under_way(model, rate, dead, 
 @pytest.mark.parametrize(('failed', 'loops', 'models', 'words'), [
     ((0,), 128, 1, '0 of 128 loops failed: with 99 % confidence at most 3.5 % of'),
     # 1 - 0.01^(1/500)
-    ((0, 0), 250, 2, '0 of 500 loops failed on 2 models that explain the record equally well: with '
-                     '99 % confidence at most 0.92 % of such starts fail'),
+    ((0, 0), 250, 2, '0 of 500 loops failed on 2 models that explain the record equally well: '
+                     'with 99 % confidence at most 0.92 % of such starts fail'),
     ((1, 2), 64, 2, '3 of 128 loops'), ((5,), 5, 1, 'at most 100 % of such'), ((), 0, 0, '')])
 def test_the_statement_has_an_exact_bound(failed, loops, models, words):
-    checks = [ClosedLoopTest(STATE, *np.zeros((2, loops, 1)), np.ones(loops), np.zeros(loops, bool),
+    ones = np.ones(loops)
+    checks = [ClosedLoopTest(STATE, *np.zeros((2, loops, 1)), ones, ones > 1.0,
                              2.0 * (np.arange(loops) < k), 0) for k in failed]
     said = statement(checks)
     assert words in said

@@ -16,7 +16,7 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 from koopman_ros.learning import evaluate_model, learn_lift, Thresholds
-from koopman_ros.learning.acceptance import uncovered_setpoints
+from koopman_ros.learning.acceptance import disagreement, uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.identification import (
     DriftModel,
@@ -163,10 +163,40 @@ def test_margin_and_condition_number_decide_and_warnings_are_passed_on(found, tr
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
     decision = evaluate_model(found, wrong, shipped, Thresholds(), loops=16)
-    assert decision.law_check.share_failed == 1.0
+    assert decision.law_check.share_failed > 0.9
     (reason,) = (reason for reason in decision.reasons if 'control' in reason)
-    assert 'the law fails in 16 of 16 closed loops' in reason
+    assert 'of 16 closed loops' in reason
     assert f'{decision.law_check.region}' in reason
+
+
+def test_the_law_is_tried_on_all_drifts_that_explain_the_record(found, trained, tmp_path):
+    def judged(*alternatives):
+        return evaluate_model(replace(found, alternatives=alternatives), trained, None,
+                              Thresholds(), loops=16)
+
+    drift = found.drift
+    decision = judged(drift, drift)
+    assert (decision.reasons, decision.warnings) == ((), ())
+    assert decision.statement.startswith('0 of 48 loops failed on 3 models that explain the rec')
+    # with starts of their own
+    first, second = decision.alternative_checks
+    assert not set(first.starts[:, 0]) & set(second.starts[:, 0])
+    decision = judged(drift, replace(drift, B=-drift.B))
+    (reason,) = decision.reasons
+    assert f'does not control a {drift.form} that explains the record equally well' in reason
+    assert 'the law fails in 1' in reason
+    (warning,) = decision.warnings
+    assert '3 drifts that explain the record equally well differ by ' in warning
+
+
+@pytest.mark.parametrize(('factor', 'said'), [(1.05, False), (1.2, True)])
+def test_drifts_that_differ_are_named(found, factor, said):
+    """All rates are a fifth larger, so the difference is most where the rates are."""
+    drift = found.drift
+    other = replace(drift, coefficients=factor * drift.coefficients, B=factor * drift.B)
+    text = disagreement(replace(found, alternatives=(other,)))
+    assert ('differ by 20 % of the motion, most at temperature' in text) == said
+    assert bool(text) == said
 
 
 @pytest.mark.usefixtures('no_loops')

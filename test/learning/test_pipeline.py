@@ -138,12 +138,15 @@ def test_report(accepted):
     figures = json.loads(files[0].read_text())
     assert figures == retrained.summary()
     assert figures['accepted'] is True
+    said = figures['closed_loop_statement']
+    assert said.startswith('0 of ')
+    assert 'simulated closed loops: ' + said in str(load(retrained.model_file))
     assert figures['measurements_used'] == figures['measurements_read'] == 1201
     # UA is 0.8 of 2.092 1/min
     gain = figures['input_gain']['temperature']['coolant_temperature']
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
-    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)',
+    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)', said,
                   f'| the current model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')

@@ -144,6 +144,8 @@ class Identified:
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()
     warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
+    #: other drifts that explain the samples left out of their fit about as well
+    alternatives: tuple[Drift, ...] = ()
     #: (n_u,) by which the inputs of the segments are later than those of the record, in time
     #: units; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
@@ -231,7 +233,8 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
                                    monitor=monitor) if OUTPUT_ERROR in score.method else model
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
-                      (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures))
+                      (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
+                      alternatives=tuple(best[d][0] for d in good if d != degree))
 
 
 @dataclass(frozen=True)
