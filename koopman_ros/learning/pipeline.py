@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+import glob
 import hashlib
 import os
 from pathlib import Path
@@ -28,7 +29,7 @@ from koopman_ros.learning.acceptance import (
     uncovered_setpoints,
 )
 from koopman_ros.learning.downsampling import coverage
-from koopman_ros.learning.drift_sampling import compare_classes
+from koopman_ros.learning.drift_sampling import alternative_models, compare_classes
 from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
@@ -86,6 +87,8 @@ class Retrained:
     plant: PlantDescription  #: names, units and nominal point; its time unit is that of the drift
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
+    #: models of other drifts that explain the record equally well
+    alternative_files: tuple[str, ...] = ()
     reduction: Reduction | None = None  #: the part of a long record that is used
     #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
     free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
@@ -132,6 +135,7 @@ class Retrained:
             'reasons': list(self.reasons),
             'warnings': list(self.decision.warnings) if self.decision else [],
             'model_file': self.model_file,
+            'alternative_files': list(self.alternative_files),
             'units': dict(zip((*states.names, *inputs.names), (*states.units, *inputs.units),
                               strict=True)),
             'measurements_read': self.account.measurements,
@@ -270,7 +274,21 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
-                   reasons=decision.reasons, model_file=str(path), free_runs=runs)
+                   reasons=decision.reasons, model_file=str(path), free_runs=runs,
+                   alternative_files=_save_alternatives(Path(task.output), [
+                       replace(one, dead_time=dead_time)
+                       for one in alternative_models(found, plant)]))
+
+
+def _save_alternatives(output: Path, models: Sequence[LiftedModel]) -> tuple[str, ...]:
+    """Write the alternatives in place of those of the training before; return their files."""
+    for old in output.parent.glob(f'{glob.escape(output.stem)}.alternative_*.safetensors'):
+        old.unlink()
+    files = [output.with_suffix(f'.alternative_{k}.safetensors')
+             for k in range(1, 1 + len(models))]
+    for path, model in zip(files, models, strict=True):
+        save(model, path)
+    return tuple(map(str, files))
 
 
 def _hidden(task: TrainingTask) -> bool:

@@ -66,6 +66,9 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
     if retrained.model_file:
         yield f'Model file: `{retrained.model_file}`'
+    if retrained.alternative_files:
+        yield 'Models of other drifts that explain the record equally well: ' + ', '.join(
+            f'`{file}`' for file in retrained.alternative_files)
     yield '## Data'
     yield bullets(map(str, retrained.task.bags))
     yield bullets([

@@ -16,6 +16,7 @@ from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
+from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.model import load, ModelFileError, save
 from koopman_ros.records import BagReadError
 from support.known_plants import box
@@ -154,6 +155,27 @@ def test_report(accepted):
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
     assert diverging.summary()['heldout_error_of_present_lift'] == {'temperature': None}
+
+
+@pytest.mark.usefixtures('learned')
+def test_models_of_alternative_drifts_are_kept_beside_the_model(
+        bag, accepted, tmp_path, monkeypatch):
+    """That of a training before goes."""
+    drift = accepted[0].found.drift
+    monkeypatch.setattr(task_module, 'identify', lambda *_, **__: replace(
+        accepted[0].found, alternatives=(drift, replace(
+            drift, coefficients=1.02 * drift.coefficients))))
+    (tmp_path / 'new.alternative_7.safetensors').touch()
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
+    names = ['new.alternative_1.safetensors', 'new.alternative_2.safetensors']
+    assert [Path(file).name for file in retrained.alternative_files] == names
+    assert names[0] in page_of(retrained)
+    assert sorted(path.name for path in tmp_path.glob('*alternative*')) == names
+    x, u = np.linspace(308.0, 320.0, 9)[:, None], np.full((9, 1), 290.0)
+    for file, factor in zip(retrained.alternative_files, (1.0, 1.02), strict=True):
+        rate = lifted_rate(load(file), 60.0)(x, u)
+        own = replace(drift, coefficients=factor * drift.coefficients).rate(x, u)
+        assert rate == pytest.approx(own, abs=1e-6)
 
 
 @pytest.mark.usefixtures('learned')
