@@ -168,6 +168,11 @@ class DriftPlant:
                            - self.rate(behind[:, :n], behind[:, n:]))
         return np.stack(columns, axis=-1) / (2.0 * _DIFFERENCE)
 
+    def holding(self, x: Array, v: Array) -> Array:
+        """Return the inputs (M, n_u) nearest to `v` that hold the states (M, n_x) best."""
+        B = np.nan_to_num(self.slope(x, v)[..., x.shape[1]:])
+        return v - (np.linalg.pinv(B) @ self.rate(x, v)[..., None])[..., 0]
+
     @property
     def linearised(self) -> LiftedModel:
         """The linear model of the plant at the model's nominal point."""

@@ -345,9 +345,7 @@ def _steady(plant: DriftPlant, x: Array, v: Array) -> tuple[Array, Array]:
     """Move states and inputs as little as it takes to rest; those that do not are left out."""
     n = x.shape[1]
     with np.errstate(all='ignore'):
-        # the input as far as it can hold the state: the rate is affine in it
-        v = v - (np.linalg.pinv(np.nan_to_num(plant.slope(x, v)[..., n:]))
-                 @ plant.rate(x, v)[..., None])[..., 0]
+        v = plant.holding(x, v)
         for _ in range(_NEWTON_STEPS):
             rate, slope = plant.rate(x, v), plant.slope(x, v)
             good = np.isfinite(rate).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))

@@ -34,6 +34,11 @@ from koopman_ros.learning.identification import (
 from koopman_ros.learning.identification.drift import prediction_error, Segments
 from koopman_ros.learning.lift.metrics import lifted_rate, LiftMetrics
 from koopman_ros.learning.lift.training import Trained
+from koopman_ros.learning.linearisation import (
+    operating_points,
+    OperatingPoint,
+    unfounded_instability,
+)
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import LINEAR
@@ -106,6 +111,12 @@ class HeldOut:
             raise Stopped
         return found
 
+    def better(self, rmse: Array) -> dict[str, Rate]:
+        """Return the drifts by form that do not err more than a model that errs so (n_x,)."""
+        drifts = [self._found.drift, self._found.linear, *self._found.alternatives]
+        return {drift.form: drift.rate for drift in drifts
+                if _size(self.rmse(drift.rate), self.scale) <= _size(rmse, self.scale)}
+
     def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array) -> str:
         """Say that an error is not clearly below another one, or nothing."""
         own, margin = _size(rmse, self.scale), self._thresholds.margin
@@ -147,6 +158,7 @@ class AcceptanceResult:
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
     #: the same on each of the alternative drifts that were taken
     alternative_checks: tuple[ClosedLoopTest, ...] = ()
+    operating_points: tuple[OperatingPoint, ...] = ()  #: with the eigenvalues of the model
 
     __repr__ = short_repr
 
@@ -189,10 +201,13 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
         f'its law does not control a {drift.form} that explains the record equally well: {check}; '
         'record more in that range' for drift, check in zip(
             found.alternatives, checks, strict=False) if check.loops and not check.accepted))
+    points = operating_points(model, law_check.setpoints)
+    reasons = (*reasons, *filter(None, [unfounded_instability(
+        model, found, points, held_out.better(rmse))]))
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
-                            held_out.linear_rmse, found.noise, law_check, checks)
+                            held_out.linear_rmse, found.noise, law_check, checks, points)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:

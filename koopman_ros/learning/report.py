@@ -141,6 +141,10 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield (f'Lift: n_z = {learned.model.n_z}, rw = {learned.figures.fit.rw:.2g}, condition number '
            f'{learned.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
            f'1/{learned.model.time_unit}. On the estimated drift {decision.law_check}.')
+    yield f'Eigenvalues of the model at operating points [1/{learned.model.time_unit}]:'
+    yield table(('operating point', 'eigenvalues'), (
+        (point.text(own), ', '.join(f'{value:.3g}' for value in point.eigenvalues))
+        for point in decision.operating_points))
     if decision.statement:
         yield f'Simulated closed loops from where the data are: {decision.statement}.'
 
