@@ -117,13 +117,14 @@ class HeldOut:
         return {drift.form: drift.rate for drift in drifts
                 if _size(self.rmse(drift.rate), self.scale) <= _size(rmse, self.scale)}
 
-    def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array) -> str:
+    def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array, remedy: str
+                 ) -> str:
         """Say that an error is not clearly below another one, or nothing."""
         own, margin = _size(rmse, self.scale), self._thresholds.margin
         if np.isfinite(own) and own <= (1.0 - margin) * _size(other, self.scale):
             return ''
         return (f'its error on held-out data, {_text(rmse, model)}, is not {100.0 * margin:.0f} % '
-                f'below that of {name}, {_text(other, model)}')
+                f'below that of {name}, {_text(other, model)}: {remedy}')
 
     def reasons(self, model: LiftedModel, rmse: Array, figures: LiftMetrics,
                 law_check: ClosedLoopTest, linear: bool) -> tuple[str, ...]:
@@ -134,13 +135,14 @@ class HeldOut:
         :param linear: whether it is a linear one itself, which need not be better than that.
         """
         reasons = [unusable(model)] + ([] if linear else [self.exceeded(
-            model, 'the best linear model', rmse, self.linear_rmse)])
+            model, 'the best linear model', rmse, self.linear_rmse, 'set model_class to linear')])
         cond, most = figures.fit.cond, self._thresholds.condition
         if not cond <= most:
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
-                           f'{most:.3g}: use fewer coordinates')
+                           f'{most:.3g}: reduce lifted_dimension, or set model_class to best')
         if not law_check.accepted:
-            reasons.append(f'its law does not control the estimated drift: {law_check}')
+            reasons.append(f'its law does not control the estimated drift: {law_check}; set '
+                           'model_class to best, or record more in that range')
         return tuple(filter(None, reasons))
 
 
@@ -193,7 +195,8 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
-        beside = held_out.exceeded(model, 'the current model', rmse, current_rmse)
+        beside = held_out.exceeded(model, 'the current model', rmse, current_rmse,
+                                   'keep that one, or reduce acceptance_margin')
         reasons = (*filter(None, [beside]), *reasons)
     checks = tuple(held_out.law_check(model, loops, lambda _: False, alternative=k)
                    for k in range(1, 1 + min(len(found.alternatives), _MOST_ALTERNATIVES)))

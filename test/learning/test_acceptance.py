@@ -120,7 +120,7 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
     own = f'{decision.rmse[0]:.4g} K'
     assert decision.reasons == (
         f'its error on held-out data, {own}, is not 10 % below that of the current model, '
-        f'{own}',)
+        f'{own}: keep that one, or reduce acceptance_margin',)
     assert evaluate_model(found, trained, trained.model, Thresholds(margin=0.0)).accepted
 
 
