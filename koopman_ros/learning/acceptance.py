@@ -24,6 +24,7 @@ from koopman_ros.evaluation.closed_loop_test import (
     statement,
 )
 from koopman_ros.execution import Backend
+from koopman_ros.learning.causes import likely_causes
 from koopman_ros.learning.identification import (
     Drift,
     fitted_starts,
@@ -272,9 +273,17 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
             warnings.append(
                 f'the best drift predicts {name} with an error of {error[i]:.3g} {unit}, of which '
                 f'{excess:.3g} {unit} is not noise ({noise:.3g} {unit} from sample to sample): '
-                'there is an unmeasured state or disturbance; measure it, or set '
-                'unmeasured_states')
+                + _remedy(likely_causes(found, i)))
     return tuple(warnings)
+
+
+def _remedy(causes: Sequence[tuple[float, str]]) -> str:
+    """Name the parameters to try, likeliest first."""
+    if not causes:
+        return ('the record does not explain it: record the disturbance as another input, or set '
+                'unmeasured_states')
+    return 'change ' + ', or '.join(
+        f'{name} (explains {100.0 * share:.0f} % of its square)' for share, name in causes)
 
 
 def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float]]
