@@ -280,8 +280,8 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
 def _remedy(causes: Sequence[tuple[float, str]]) -> str:
     """Name the parameters to try, likeliest first."""
     if not causes:
-        return ('the record does not explain it: record the disturbance as another input, or set '
-                'unmeasured_states')
+        return ('the inputs do not explain it: set unmeasured_states, or record a disturbance as '
+                'another input')
     return 'change ' + ', or '.join(
         f'{name} (explains {100.0 * share:.0f} % of its square)' for share, name in causes)
 
