@@ -16,16 +16,16 @@ from koopman_ros.learning.identification import fitted_starts, Identified, longe
 # Of the mean squared error that a cause must explain, in segments that it was not fitted to.
 _EXPLAINED = 0.2
 _DELAYS = (1, 2, 4, 8)  # samples by which an input might act later
-_MEMORIES = (3, 12, 48)  # samples of filters whose states may be what is not measured
+_MEMORIES = (3, 12, 48)  # samples of filters whose states may be like the unmeasured ones
 
 
 def likely_causes(found: Identified, i: int) -> list[tuple[float, str]]:
     """
-    Return what may explain the errors of a measured state, likeliest first.
+    Return the likely causes of the errors of a measured state, likeliest first.
 
     The errors of the drift in each segment are regressed on the response of a linear state with
-    the drift's slope to what each cause would add to its rate: inputs that act later, products of
-    inputs and states, filtered inputs.
+    the drift's slope to the rate due to each cause: inputs that act later, products of inputs and
+    states, filtered inputs.
 
     :param i: number of the state.
     :return: the explained share of the mean square, cross-validated over the segments, and the
@@ -50,7 +50,7 @@ def likely_causes(found: Identified, i: int) -> list[tuple[float, str]]:
 
 
 def _causes(found: Identified, episodes: Sequence[Episode]) -> dict[str, list[Array]]:
-    """Return what each cause may add to the rate at the samples of each episode, (N, p)."""
+    """Return terms of the rate due to each cause, (N, p) at the samples of each episode."""
     box = found.drift.box
     causes: dict[str, list[Array]] = {}
     for episode in episodes:
