@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -40,21 +41,27 @@ class TransformedDrift(Drift):
         """Whether B depends on the state."""
         return self.drift.varying_input_matrix
 
+    @cached_property
+    def _back(self) -> Array:
+        return np.asarray(np.linalg.inv(self.map), dtype=np.float64)
+
     def _own(self, xi: Array) -> Array:
         return xi @ self.map.T + self.shift
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations; see :class:`Drift`."""
-        rate = self.drift.scaled_rate(self._own(xi), v)
-        return np.linalg.solve(self.map, rate[..., None])[..., 0]
+        rate: Array = self.drift.scaled_rate(self._own(xi), v) @ self._back.T
+        return rate
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
         """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
-        return np.linalg.solve(self.map, self.drift.scaled_slope(self._own(xi), v)) @ self.map
+        slope: Array = self._back @ self.drift.scaled_slope(self._own(xi), v) @ self.map
+        return slope
 
     def scaled_input_matrix(self, xi: Array) -> Array:
         """Evaluate B in deviations; see :class:`Drift`."""
-        return np.linalg.solve(self.map, self.drift.scaled_input_matrix(self._own(xi)))
+        B: Array = self._back @ self.drift.scaled_input_matrix(self._own(xi))
+        return B
 
 
 def in_coordinates_of(predictor: Predictor[Drift], others: Iterable[Predictor[Drift]],
