@@ -177,14 +177,17 @@ class AcceptanceResult:
 
 
 def evaluate_model(found: Identified, learned: Trained | ClassComparison,
-                   current: LiftedModel | None, thresholds: Thresholds, *, loops: int = LOOPS
-                   ) -> AcceptanceResult:
+                   current: LiftedModel | None, thresholds: Thresholds, *, loops: int = LOOPS,
+                   watch: Callable[[float], bool] = lambda _: False,
+                   backend: Backend | None = None) -> AcceptanceResult:
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
     :param learned: the trained model, or the comparison by :func:`compare_classes`, of which the
         chosen model is judged, and whose closed loops are not run again.
-    :param loops: see :func:`evaluate_closed_loops`.
+    :param loops: like `backend` as for :func:`evaluate_closed_loops`; on each drift.
+    :param watch: called with the share that is done of the loops on alternative drifts; True ends.
+    :raises Stopped: when `watch` requested it.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)
     rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
@@ -192,15 +195,17 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     chosen = learned.chosen if isinstance(learned, ClassComparison) else None
     law_check = chosen.law_check if chosen and chosen.excess is not None else None
     if law_check is None:
-        law_check = held_out.law_check(model, loops, lambda _: False)
+        law_check = held_out.law_check(model, loops, lambda _: False, backend)
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
         beside = held_out.exceeded(model, 'the current model', rmse, current_rmse,
                                    'keep that one, or reduce acceptance_margin')
         reasons = (*filter(None, [beside]), *reasons)
-    checks = tuple(held_out.law_check(model, loops, lambda _: False, alternative=k)
-                   for k in range(1, 1 + min(len(found.alternatives), _MOST_ALTERNATIVES)))
+    count = min(len(found.alternatives), _MOST_ALTERNATIVES)
+    checks = tuple(held_out.law_check(
+        model, loops, lambda share, k=k: watch((k - 1 + share) / count), backend, alternative=k)
+        for k in range(1, 1 + count))
     reasons = (*reasons, *(
         f'its law does not control a {drift.form} that explains the record equally well: {check}; '
         'record more in that range' for drift, check in zip(

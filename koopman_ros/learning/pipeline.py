@@ -65,7 +65,8 @@ _LEAST_JUMP = 0.1
 # Shares of the whole at which reading, estimating, learning and judging begin and end.
 _STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
            'decide': (0.9, 1.0)}
-_JUDGED = 0.8  # share of deciding in which the closed loops are run
+# Shares of deciding in which the closed loops are run, and those on alternative drifts, too.
+_JUDGED, _WRITING = 0.8, 0.9
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
 OnProgress = Callable[[float, str], bool]
@@ -268,7 +269,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
-    progress('decide', 0.9, 'writing')
+    progress('decide', _WRITING, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes, learned.chosen.name)
     path = _place(Path(task.output), decision.accepted)
@@ -380,6 +381,10 @@ class _Progress:
         self('learn', self.learned, f'learning: {now.name}, {now.text}')
         return False
 
+    def judging_alternatives(self, share: float) -> bool:
+        self('decide', _JUDGED + share * (_WRITING - _JUDGED), 'judging: alternative drifts')
+        return False
+
     def judging(self, name: str, share: float) -> bool:
         # the closed loops of the last class come after all starts
         done = ('decide', _JUDGED * share) if self.learned == 1.0 else ('learn', self.learned)
@@ -421,7 +426,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
             reasons: tuple[str, ...] = (str(error),)
         progress('decide', _JUDGED, 'judging')
         if learned is not None:
-            decision = evaluate_model(found, learned, bare.present, thresholds)
+            decision = evaluate_model(found, learned, bare.present, thresholds,
+                                      watch=progress.judging_alternatives, backend=backend)
             decision = replace(decision, warnings=(*decision.warnings, *warnings))
             reasons = decision.reasons
         if not reasons:

@@ -166,7 +166,11 @@ def test_models_of_alternative_drifts_are_kept_beside_the_model(
         accepted[0].found, alternatives=(drift, replace(
             drift, coefficients=1.02 * drift.coefficients))))
     (tmp_path / 'new.alternative_7.safetensors').touch()
-    retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
+    told = []
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors'),
+                        lambda share, text: told.append((share, text)) or False)
+    assert told == sorted(told, key=lambda pair: pair[0])
+    assert 'judging: alternative drifts' in [text for _, text in told]
     names = ['new.alternative_1.safetensors', 'new.alternative_2.safetensors']
     assert [Path(file).name for file in retrained.alternative_files] == names
     assert names[0] in page_of(retrained)
