@@ -203,9 +203,12 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
                                    'keep that one, or reduce acceptance_margin')
         reasons = (*filter(None, [beside]), *reasons)
     count = min(len(found.alternatives), _MOST_ALTERNATIVES)
-    checks = tuple(held_out.law_check(
-        model, loops, lambda share, k=k: watch((k - 1 + share) / count), backend, alternative=k)
-        for k in range(1, 1 + count))
+
+    def of_alternative(k: int) -> ClosedLoopTest:
+        return held_out.law_check(model, loops, lambda share: watch((k - 1 + share) / count),
+                                  backend, alternative=k)
+
+    checks = tuple(map(of_alternative, range(1, 1 + count)))
     reasons = (*reasons, *(
         f'its law does not control a {drift.form} that explains the record equally well: {check}; '
         'record more in that range' for drift, check in zip(
