@@ -181,11 +181,13 @@ class ClosedLoopTest:
         return f'<ClosedLoopTest: {self}>'
 
 
-def statement(checks: Sequence[ClosedLoopTest]) -> str:
+def statement(checks: Sequence[ClosedLoopTest], models: int = 1) -> str:
     """
     Say which share of all starts may fail, from loops drawn at random; nothing without loops.
 
-    The bound is that of Clopper and Pearson (1934), for the mean over the plants of the checks.
+    The bound is that of Clopper and Pearson (1934), for the mean over the checks.
+
+    :param models: number of the plants on which the loops ran.
     """
     # in here: no node needs it
     from scipy.special import betaincinv
@@ -195,9 +197,8 @@ def statement(checks: Sequence[ClosedLoopTest]) -> str:
     if not loops:
         return ''
     most = betaincinv(failed + 1, loops - failed, CONFIDENCE) if failed < loops else 1.0
-    models = f' on {len(checks)} models that explain the record equally well' if (
-        len(checks) > 1) else ''
-    return (f'{failed} of {loops} loops failed{models}: with {100.0 * CONFIDENCE:g} % confidence '
+    where = f' on {models} models that explain the record equally well' if models > 1 else ''
+    return (f'{failed} of {loops} loops failed{where}: with {100.0 * CONFIDENCE:g} % confidence '
             f'at most {float(f"{100.0 * most:.2g}"):g} % of such starts fail')
 
 

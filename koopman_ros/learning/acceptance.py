@@ -51,6 +51,8 @@ _NOTICEABLE = 1e-3
 _LEAST_AUTOCORRELATION = 0.3
 # Of the drifts that explain a record as well as the chosen one.
 _MOST_ALTERNATIVES = 5
+# Rounds of closed loops, at least, from which the share of failures is stated.
+_ROUNDS = 4
 # They differ where the mean square of their rates does by more than this share of the motion.
 _DIFFERENT = 0.1
 # A share of the set-points' range that may be missing: noise moves the ends of a record.
@@ -93,24 +95,36 @@ class HeldOut:
         return self.rmse(lifted_rate(model, self._seconds))
 
     def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
-                  backend: Backend | None = None, *, alternative: int = 0) -> ClosedLoopTest:
+                  backend: Backend | None = None, *, drift: Drift | None = None, seed: int = 0
+                  ) -> ClosedLoopTest:
         """
         Close a model's loop on the estimated drift; Stopped where `watch` ended it.
 
-        :param alternative: number of the alternative drift to take instead, from 1.
+        :param drift: the drift to take instead.
         """
-        drift = [self._found.drift, *self._found.alternatives][alternative]
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
         model = replace(model, dead_time=self._seconds * self._found.dead_time)
         found = evaluate_closed_loops(
-            model, drift.rate, loops=loops, seed=alternative, watch=watch,
+            model, (drift or self._found.drift).rate, loops=loops, seed=seed, watch=watch,
             interval=period * self._seconds, noise=np.nan_to_num(self._found.noise),
             backend=backend)
         if found is None:
             raise Stopped
         return found
+
+    def further_checks(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
+                       backend: Backend | None) -> tuple[tuple[Drift, ClosedLoopTest], ...]:
+        """Close the loop from other starts, on this drift and on each alternative."""
+        drifts = [self._found.drift, *self._found.alternatives[:_MOST_ALTERNATIVES]]
+        drifts += [self._found.drift] * (_ROUNDS - len(drifts))
+
+        def checked(k: int) -> ClosedLoopTest:
+            return self.law_check(model, loops, lambda share: watch((k + share) / len(drifts)),
+                                  backend, drift=drifts[k], seed=1 + k)
+
+        return tuple((drift, checked(k)) for k, drift in enumerate(drifts))
 
     def better(self, rmse: Array) -> dict[str, Rate]:
         """Return the drifts by form that do not err more than a model that errs so (n_x,)."""
@@ -142,9 +156,14 @@ class HeldOut:
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
                            f'{most:.3g}: reduce lifted_dimension, or set model_class to best')
         if not law_check.accepted:
-            reasons.append(f'its law does not control the estimated drift: {law_check}; set '
-                           'model_class to best, or record more in that range')
+            reasons.append(uncontrolled('the estimated drift', law_check))
         return tuple(filter(None, reasons))
+
+
+def uncontrolled(drift: str, check: ClosedLoopTest) -> str:
+    """Say that a law does not control a drift, and what to try."""
+    return (f'its law does not control {drift}: {check}; set model_class to best, or record more '
+            'in that range')
 
 
 @dataclass(frozen=True)
@@ -159,8 +178,9 @@ class AcceptanceResult:
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
-    #: the same on each of the alternative drifts that were taken
-    alternative_checks: tuple[ClosedLoopTest, ...] = ()
+    #: more of them, of which none took part in a choice, on this and alternative drifts; none of a
+    #: model that is refused without them
+    further_checks: tuple[tuple[Drift, ClosedLoopTest], ...] = ()
     operating_points: tuple[OperatingPoint, ...] = ()  #: with the eigenvalues of the model
 
     __repr__ = short_repr
@@ -168,7 +188,8 @@ class AcceptanceResult:
     @property
     def statement(self) -> str:
         """The share of failed loops on all drifts, with its confidence."""
-        return statement([self.law_check, *self.alternative_checks])
+        checks = [check for _, check in self.further_checks] or [self.law_check]
+        return statement(checks, len({id(drift) for drift, _ in self.further_checks}))
 
     @property
     def accepted(self) -> bool:
@@ -186,7 +207,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     :param learned: the trained model, or the comparison by :func:`compare_classes`, of which the
         chosen model is judged, and whose closed loops are not run again.
     :param loops: like `backend` as for :func:`evaluate_closed_loops`; on each drift.
-    :param watch: called with the share that is done of the loops on alternative drifts; True ends.
+    :param watch: called with the share that is done of further loops; True ends.
     :raises Stopped: when `watch` requested it.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)
@@ -202,24 +223,17 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
         beside = held_out.exceeded(model, 'the current model', rmse, current_rmse,
                                    'keep that one, or reduce acceptance_margin')
         reasons = (*filter(None, [beside]), *reasons)
-    count = min(len(found.alternatives), _MOST_ALTERNATIVES)
-
-    def of_alternative(k: int) -> ClosedLoopTest:
-        return held_out.law_check(model, loops, lambda share: watch((k - 1 + share) / count),
-                                  backend, alternative=k)
-
-    checks = tuple(map(of_alternative, range(1, 1 + count)))
-    reasons = (*reasons, *(
-        f'its law does not control a {drift.form} that explains the record equally well: {check}; '
-        'record more in that range' for drift, check in zip(
-            found.alternatives, checks, strict=False) if check.loops and not check.accepted))
+    further = () if reasons else held_out.further_checks(model, loops, watch, backend)
+    reasons = (*reasons, *dict.fromkeys(
+        uncontrolled(f'a {drift.form} that explains the record equally well', check)
+        for drift, check in further if check.loops and not check.accepted))
     points = operating_points(model, law_check.setpoints)
     reasons = (*reasons, *filter(None, [unfounded_instability(
         model, found, points, held_out.better(rmse))]))
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
-                            held_out.linear_rmse, found.noise, law_check, checks, points)
+                            held_out.linear_rmse, found.noise, law_check, further, points)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:

@@ -65,7 +65,7 @@ _LEAST_JUMP = 0.1
 # Shares of the whole at which reading, estimating, learning and judging begin and end.
 _STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
            'decide': (0.9, 1.0)}
-# Shares of deciding in which the closed loops are run, and those on alternative drifts, too.
+# Shares of deciding in which the closed loops are run, and further ones, too.
 _JUDGED, _WRITING = 0.8, 0.9
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
@@ -174,7 +174,6 @@ class Retrained:
                 'condition': fit.cond,
                 'closed_loops': check.loops,
                 'closed_loop_statement': self.decision.statement,
-                'alternatives': len(self.decision.alternative_checks),
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
                 'closed_loop_cost_beside_linear': check.median_ratio,
@@ -381,8 +380,8 @@ class _Progress:
         self('learn', self.learned, f'learning: {now.name}, {now.text}')
         return False
 
-    def judging_alternatives(self, share: float) -> bool:
-        self('decide', _JUDGED + share * (_WRITING - _JUDGED), 'judging: alternative drifts')
+    def judging_further(self, share: float) -> bool:
+        self('decide', _JUDGED + share * (_WRITING - _JUDGED), 'judging: further closed loops')
         return False
 
     def judging(self, name: str, share: float) -> bool:
@@ -427,7 +426,7 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
         progress('decide', _JUDGED, 'judging')
         if learned is not None:
             decision = evaluate_model(found, learned, bare.present, thresholds,
-                                      watch=progress.judging_alternatives, backend=backend)
+                                      watch=progress.judging_further, backend=backend)
             decision = replace(decision, warnings=(*decision.warnings, *warnings))
             reasons = decision.reasons
         if not reasons:

@@ -108,7 +108,7 @@ def test_the_statement_has_an_exact_bound(failed, loops, models, words):
     ones = np.ones(loops)
     checks = [ClosedLoopTest(STATE, *np.zeros((2, loops, 1)), ones, ones > 1.0,
                              2.0 * (np.arange(loops) < k), 0) for k in failed]
-    said = statement(checks)
+    said = statement(checks, models)
     assert words in said
     if 0 < sum(failed) < loops:
         # so few failures have a probability of 1 % at the bound

@@ -111,7 +111,7 @@ def test_progress_rises_to_the_end(accepted):
     assert words[0] == 'reading bags'
     assert {'estimating: drift of degree 3', 'learning: identity lift, n_z 2, start 1 of 1',
             'judging: identity lift'} < set(words)
-    assert words[-2:] == ('judging', 'writing')
+    assert words[-2:] == ('judging: further closed loops', 'writing')
 
 
 def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
@@ -127,7 +127,8 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     assert refused.provenance.reasons == retrained.reasons
     again = tmp_path / 'again.safetensors'
     save(replace(refused, provenance=replace(
-        refused.provenance, accepted=True, reasons=())), again)
+        refused.provenance, accepted=True, reasons=(),
+        closed_loops=load(present).provenance.closed_loops)), again)
     assert again.read_bytes() == present.read_bytes()
 
 
@@ -170,7 +171,7 @@ def test_models_of_alternative_drifts_are_kept_beside_the_model(
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'),
                         lambda share, text: told.append((share, text)) or False)
     assert told == sorted(told, key=lambda pair: pair[0])
-    assert 'judging: alternative drifts' in [text for _, text in told]
+    assert 'judging: further closed loops' in [text for _, text in told]
     names = ['new.alternative_1.safetensors', 'new.alternative_2.safetensors']
     assert [Path(file).name for file in retrained.alternative_files] == names
     assert names[0] in page_of(retrained)
