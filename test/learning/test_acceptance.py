@@ -208,7 +208,10 @@ def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, 
     assert decision.current_rmse == [np.inf]
     assert decision.accepted
     decision = evaluate_model(found, replace(trained, model=diverging), diverging, Thresholds())
-    assert 'inf K, is not 10 % below that of the current model' in ' '.join(decision.reasons)
+    said = ' '.join(decision.reasons)
+    assert 'inf K, is not 10 % below that of the current model' in said
+    # the drift is stable
+    assert re.search('it is unstable at temperature .* although a drift of degree 3, which', said)
 
 
 @pytest.mark.parametrize('values', [
