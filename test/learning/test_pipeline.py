@@ -148,7 +148,8 @@ def test_report(accepted):
     gain = figures['input_gain']['temperature']['coolant_temperature']
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
-    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)', said, '| operating point | eigenvalues |',
+    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)', said,
+                  '| operating point | eigenvalues |',
                   f'| the current model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
