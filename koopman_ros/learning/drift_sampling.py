@@ -22,6 +22,7 @@ from koopman_ros.learning.identification import (
     Identified,
     longest_step,
 )
+from koopman_ros.learning.identification.alternatives import TransformedDrift
 from koopman_ros.learning.identification.drift import Segments, steady_point
 from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import IncrementalTraining
@@ -148,11 +149,12 @@ def alternative_models(found: Identified, plant: PlantDescription) -> list[Lifte
     """
     models = []
     for drift in found.alternatives:
+        own = drift.drift if isinstance(drift, TransformedDrift) else drift
         # one that holds no steady state, or does not follow the record, is no model
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
-            if isinstance(drift, DriftModel):
+            if isinstance(own, DriftModel):
                 known, samples = _estimated(replace(found, drift=drift), plant)
-                models.append(Edmd(drift.degree).learn(known, samples))
+                models.append(Edmd(own.degree).learn(known, samples))
     return models
 
 

@@ -16,6 +16,7 @@ from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
+from koopman_ros.learning.identification.alternatives import TransformedDrift
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.model import load, ModelFileError, save
 from koopman_ros.records import BagReadError
@@ -165,8 +166,9 @@ def test_models_of_alternative_drifts_are_kept_beside_the_model(
     """That of a training before goes."""
     drift = accepted[0].found.drift
     monkeypatch.setattr(task_module, 'identify', lambda *_, **__: replace(
-        accepted[0].found, alternatives=(drift, replace(
-            drift, coefficients=1.02 * drift.coefficients))))
+        accepted[0].found, alternatives=(
+            TransformedDrift(drift.box, drift, np.eye(1), np.zeros(1)),
+            replace(drift, coefficients=1.02 * drift.coefficients))))
     (tmp_path / 'new.alternative_7.safetensors').touch()
     told = []
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'),
