@@ -56,7 +56,7 @@ def test_a_file_is_learned_tested_and_reported(folder, capsys):
     assert model.eigenvalues.real == pytest.approx([-0.2], rel=0.02)
     assert {path.name for path in folder.glob('day.*')} == {
         'day.csv', 'day.safetensors', 'day.json', 'day.md', 'day.png', 'day.free_run.png',
-        'day.test.png'}
+        'day.test.png', 'day.alternative_1.safetensors'}
     runs = json.loads((folder / 'day.json').read_text())['free_runs']
     assert [runs[name]['fit_percent']['level'] > 99.0 for name in ('record', 'test')] == [True] * 2
     assert '| test | level |' in (folder / 'day.md').read_text()

@@ -6,17 +6,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 from dataclasses import dataclass, replace
+from functools import cached_property
+import itertools
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws import Law, Linear, Weights
-from koopman_ros.control.laws.base import steady_state_target, Target
+from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
-from koopman_ros.estimation import Estimate
+from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.estimation import AppliedInputs, Estimate, MeasuredState, PendingInputs
 from koopman_ros.execution import Tell
 from koopman_ros.model import LiftedModel, NetworkObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
@@ -51,6 +58,30 @@ class LoopBatch:
     interval: float  #: between samples, in time units of the model
     samples: int
     steps: int  #: of integration, in an interval
+    noise: Array  #: (n_x,) standard deviation of measured states, in scaled deviations
+
+    @property
+    def seconds(self) -> float:
+        """Between samples, in s."""
+        return self.interval * self.plant.model.seconds_per_time_unit
+
+    @cached_property
+    def dead_time(self) -> Array:
+        """(n_u,) of each input, in time units of the model."""
+        return self.plant.model.dead_time / self.plant.model.seconds_per_time_unit
+
+    @cached_property
+    def pieces(self) -> list[tuple[float, NDArray[np.bool_]]]:
+        """Parts of an interval: the length, and (n_u,) which inputs change at its beginning."""
+        shifts = self.dead_time - self.interval * self.whole_samples
+        edges = np.unique(np.append(shifts, 0.0))
+        return [(float(end - begin), shifts == begin) for begin, end in itertools.pairwise(
+            [*edges, self.interval])]
+
+    @cached_property
+    def whole_samples(self) -> NDArray[np.int64]:
+        """(n_u,) of each dead time."""
+        return (self.dead_time / self.interval * (1.0 + 1e-12)).astype(np.int64)
 
     @property
     def weights(self) -> Weights:
@@ -64,11 +95,10 @@ class LoopBatch:
 
     def laws(self, targets: Array, inputs: Array) -> tuple[_Feedback, ...]:
         """Return the law, the averaged one for the true plant, and two linear ones."""
-        model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
-        own = self.law(model, self.tuning, self.law.Parameters())
-        return (_called(own, targets, inputs, seconds), _informed(self, targets, inputs),
-                *(_constant(Linear(one, self.tuning, None), targets, inputs, seconds)
-                  for one in (self.plant.linearised, model)))
+        own = self.law(self.plant.model, self.tuning, self.law.Parameters())
+        return (_operated(own, targets, inputs, self.seconds), _informed(self, targets, inputs),
+                *(_constant(Linear(one, self.tuning, None), targets, inputs, self.seconds)
+                  for one in (self.plant.linearised, self.plant.model)))
 
 
 def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
@@ -99,7 +129,8 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
     ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
     if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
         some = starts[beaten], targets[beaten], inputs[beaten]
-        again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, tell)
+        again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, tell,
+                     operated=False)
         if again is None:
             return None
         excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
@@ -137,6 +168,11 @@ class DriftPlant:
                            - self.rate(behind[:, :n], behind[:, n:]))
         return np.stack(columns, axis=-1) / (2.0 * _DIFFERENCE)
 
+    def holding(self, x: Array, v: Array) -> Array:
+        """Return the inputs (M, n_u) nearest to `v` that hold the states (M, n_x) best."""
+        B = np.nan_to_num(self.slope(x, v)[..., x.shape[1]:])
+        return v - (np.linalg.pinv(B) @ self.rate(x, v)[..., None])[..., 0]
+
     @property
     def linearised(self) -> LiftedModel:
         """The linear model of the plant at the model's nominal point."""
@@ -147,32 +183,30 @@ class DriftPlant:
                        readout=None, input_terms=None, pre_feedback=None, verified_loops=None)
 
 
-def _held_target(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
-    """Return a target of a model with the disturbance under which this input holds it."""
-    try:
-        w = -model.rate_under(v)(x_ref)
-        return steady_state_target(model, x_ref, w) if np.isfinite(w).all() else None
-    except np.linalg.LinAlgError:
-        return None
-
-
-def _called(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Feedback:
-    """Return a law's inputs, found for one state after another."""
-    model, limits = law.model, law.tuning.limits
-    targets = [_held_target(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
-    memory: list[object] = [None] * len(targets)
+def _operated(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Feedback:
+    """Return a law's inputs as a controller finds them, from sample to sample of each loop."""
+    model, states = law.model, law.model.states
+    outputs = Outputs(states.names, states.units, np.eye(model.n_x))
+    level = FallbackLevel('', law, MeasuredState(model, outputs, law.tuning, None), states.names)
+    dead_ns = tuple(round(NANOSECONDS * one) for one in law.tuning.dead_times(model).tolist())
+    # the input that holds the set-point was applied at all times before
+    queues = [AppliedInputs().corrected(u) for u in model.inputs.to_physical(inputs)]
+    memory: list[object] = [None] * len(inputs)
+    goals, period, now = states.to_physical(setpoints), round(NANOSECONDS * seconds), 0
+    with np.errstate(all='ignore'):
+        w = [-model.rate_under(v)(x) for x, v in zip(setpoints, inputs, strict=True)]
 
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
+        nonlocal now
         v = np.full(inputs.shape, np.nan)
         for k in np.flatnonzero(active):
-            target = targets[k]
-            if target is None:
-                continue
-            w = -(target.drift + model.forcing(target.x, target.u))
-            found = law.compute(Estimate(x[k], w), target, memory[k], seconds, None)
+            found = level.compute(goals[k], Estimate(x[k], w[k]), memory[k], seconds, None, None,
+                                  PendingInputs(queues[k], now, dead_ns))[1]
             memory[k] = found.memory
-            if found.failure is None and found.u is not None and np.isfinite(found.u).all():
-                v[k] = model.inputs.to_deviation(limits.within(found.u))
+            if found.u is not None:
+                queues[k] = queues[k].followed_by(now, found.u, dead_ns)
+                v[k] = model.inputs.to_deviation(found.u)
+        now += period
         return v
 
     return act
@@ -183,8 +217,13 @@ def _constant(law: Linear, setpoints: Array, inputs: Array, seconds: float) -> _
     model, limits, n = law.model, law.tuning.limits, setpoints.shape[1]
     endless = np.full(model.n_u, np.inf)
     free = Linear(model, replace(law.tuning, limits=InputLimits(-endless, endless, endless)), None)
-    at_nominal = _called(free, np.zeros((n, n)), np.zeros((n, model.n_u)), seconds)
-    gain = at_nominal(np.eye(n), np.full(n, True)).T
+    gain = np.full((model.n_u, n), np.nan)
+    with contextlib.suppress(np.linalg.LinAlgError):
+        target = steady_state_target(model, np.zeros(n))
+        for k, x in enumerate(np.eye(n)):
+            u = free.compute(Estimate(x, np.zeros(n)), target, None, seconds, None).u
+            if u is not None:
+                gain[:, k] = model.inputs.to_deviation(u)
 
     def act(x: Array, active: NDArray[np.bool_]) -> Array:
         u = model.inputs.to_physical(inputs + (x - setpoints) @ gain.T)
@@ -226,9 +265,13 @@ def _informed(given: LoopBatch, setpoints: Array, inputs: Array) -> _Feedback:
 
 
 def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array],
-         watch: Callable[[float], bool]) -> tuple[Array, NDArray[np.bool_]] | None:
+         watch: Callable[[float], bool], *, operated: bool = True
+         ) -> tuple[Array, NDArray[np.bool_]] | None:
     """
     Run M loops under each of F laws; None where `watch` ended it.
+
+    If the first law is operated, its commands act after the dead time of each input. The other
+    laws predict perfectly: each of their inputs follows the state of the time at which it acts.
 
     :return: costs (F, M), infinite where a loop does not reach the set-point, and whether (M,) the
         first law had no gain on the way.
@@ -238,9 +281,20 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
     n, (M, m) = starts.shape[1], inputs.shape
     y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
     no_gain = np.zeros(M, dtype=bool)
+    rng = np.random.default_rng(0)
+    v = np.tile(inputs, (len(feedbacks), 1, 1))
+    commands: list[Array] = []  # of the first law
 
     def arrived() -> NDArray[np.bool_]:
         return np.all(np.abs(y[..., :n] - setpoints) < _ARRIVED, axis=-1)
+
+    def flow(y: Array, v: Array) -> Array:
+        x = y[..., :n]
+        e, u = x - setpoints, v - inputs
+        cost = np.einsum('...i,ij,...j->...', e, weights.Q, e) + np.einsum(
+            '...i,ij,...j->...', u, weights.R, u)
+        rate = plant.rate(x.reshape(-1, n), v.reshape(-1, m)).reshape(x.shape)
+        return np.concatenate([rate, cost[..., None]], axis=-1)
 
     # a loop that runs away ends as one that failed, whatever overflows meanwhile
     with np.errstate(all='ignore'):
@@ -256,22 +310,22 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
                 active &= there.any(axis=0) & (active & ~there).any(axis=0)
                 if not active.any():
                     break
-            v = np.array([act(x, on) for act, x, on in zip(
-                feedbacks, y[..., :n], active, strict=True)])
-            no_gain |= active[0] & ~np.isfinite(v[0]).all(axis=-1)
-            u = v - inputs
-            held = np.einsum('...i,ij,...j->...', u, weights.R, u)
-
-            def flow(y: Array, v: Array = v, held: Array = held) -> Array:
-                x = y[..., :n]
-                e = x - setpoints
-                cost = np.einsum('...i,ij,...j->...', e, weights.Q, e) + held
-                rate = plant.rate(x.reshape(-1, n), v.reshape(-1, m)).reshape(x.shape)
-                return np.concatenate([rate, cost[..., None]], axis=-1)
-
-            ahead = y
-            for _ in range(given.steps):
-                ahead = runge_kutta_step(flow, ahead, given.interval / given.steps)
-            y = np.where(active[..., None], ahead, y)
+            noise = given.noise * rng.standard_normal((M, n))
+            if operated:
+                commands.append(feedbacks[0](y[0, :, :n] + noise, active[0]))
+                no_gain |= active[0] & ~np.isfinite(commands[-1]).all(axis=-1)
+            for length, changed in given.pieces:
+                now = np.flatnonzero(changed & (number >= given.whole_samples))
+                for k, act in enumerate(feedbacks if len(now) else ()):
+                    if operated and k == 0:
+                        for j in now:
+                            v[0, :, j] = commands[number - given.whole_samples[j]][:, j]
+                    else:
+                        v[k][:, now] = act(y[k, :, :n] + noise, active[k])[:, now]
+                steps = math.ceil(given.steps * length / given.interval)
+                ahead = y
+                for _ in range(steps):
+                    ahead = runge_kutta_step(lambda y: flow(y, v), ahead, length / steps)
+                y = np.where(active[..., None], ahead, y)
         there = arrived()
     return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

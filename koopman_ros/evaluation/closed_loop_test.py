@@ -34,6 +34,8 @@ LOOPS = 128
 MOST_COST = 1.1
 #: Share of the closed loops that may fail.
 MOST_FAILURES = 0.01
+#: Confidence of a statement about the starts that were not drawn.
+CONFIDENCE = 0.99
 
 # A loop starts at least so far from its set-point, in units of the scale.
 _APART = 0.25
@@ -179,6 +181,27 @@ class ClosedLoopTest:
         return f'<ClosedLoopTest: {self}>'
 
 
+def statement(checks: Sequence[ClosedLoopTest], models: int = 1) -> str:
+    """
+    Say which share of all starts may fail, from loops drawn at random; nothing without loops.
+
+    The bound is that of Clopper and Pearson (1934), for the mean over the checks.
+
+    :param models: number of the plants on which the loops ran.
+    """
+    # in here: no node needs it
+    from scipy.special import betaincinv
+
+    loops, failed = (sum(map(int, counts)) for counts in (
+        [one.loops for one in checks], [one.failed.sum() for one in checks]))
+    if not loops:
+        return ''
+    most = betaincinv(failed + 1, loops - failed, CONFIDENCE) if failed < loops else 1.0
+    where = f' on {models} models that explain the record equally well' if models > 1 else ''
+    return (f'{failed} of {loops} loops failed{where}: with {100.0 * CONFIDENCE:g} % confidence '
+            f'at most {float(f"{100.0 * most:.2g}"):g} % of such starts fail')
+
+
 @dataclass(frozen=True)
 class _Undisturbed:
     """A rate of states and manipulated inputs, the measured disturbances at nominal values."""
@@ -196,7 +219,8 @@ class _Undisturbed:
 def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
                           law: type[Law] = StateDependentRiccati,
                           limits: InputLimits | None = None, interval: float = 0.0,
-                          loops: int = LOOPS, watch: Callable[[float], bool] = lambda _: False,
+                          noise: Array | None = None, loops: int = LOOPS, seed: int = 0,
+                          watch: Callable[[float], bool] = lambda _: False,
                           backend: Backend | None = None, disturbances: Sequence[str] = ()
                           ) -> ClosedLoopTest | None:
     """
@@ -208,11 +232,13 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     times the better of two linear laws without failing so, it is poor by itself, and no model
     would help.
 
-    Starts and set-points are where the data are, within the distance that training states have
-    from each other (a scrambled Sobol sequence of fixed seed); if these are not known, they fill
-    the box. Set-points are steady states of that drift, held by an input within its limits; if
-    none is among the data, the nearest ones are taken. All laws get that input, as from a
-    disturbance observer at rest. Inputs are held from sample to sample. Where no law reaches the
+    Starts and set-points are drawn at random where the data are, within the distance that training
+    states have from each other; if these are not known, from the box. Set-points are steady states
+    of that drift, held by an input within its limits; if none is among the data, the nearest ones
+    are taken. All laws get that input, as from a
+    disturbance observer at rest. Inputs are held from sample to sample, and act after the dead
+    time of the model, which the law bridges as in operation, by the inputs under way; the other
+    laws know the state at which each input will act. Where no law reaches the
     set-point within the limits, they run again without: the limits must not hide a model that is
     wrong far from the data.
 
@@ -222,7 +248,9 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     :param limits: of the inputs; by default those of the tuning.
     :param interval: seconds between samples; by default, and at least, half of the fastest
         time constant of the linear loop.
+    :param noise: (n_x,) standard deviation of the measured states, in state units; by default 0.
     :param loops: closed loops to run; fewer where these take many samples.
+    :param seed: of the random starts and set-points.
     :param watch: called with the share that is done; True ends the check.
     :param backend: where the loops run, 32 of them side by side; this process by default.
     :param disturbances: inputs that are measured and not manipulated; they keep their nominal
@@ -242,11 +270,13 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     slowest, fastest = _closed_loop_rates(linear, Weights.physical(
         linear, tuning.state_weight, tuning.input_weight))
     interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
-    samples = math.ceil(_DURATION / (slowest * interval))
+    dead_time = float(np.max(model.dead_time)) / model.seconds_per_time_unit
+    samples = math.ceil((_DURATION / slowest + dead_time) / interval)
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
-    starts, targets, inputs = _cases(plant, limits, loops)
+    starts, targets, inputs = _cases(plant, limits, loops, seed)
     given = LoopBatch(plant, replace(tuning, limits=limits), law, interval, samples,
-                      math.ceil(_STEPS * interval * fastest))
+                      math.ceil(_STEPS * interval * fastest),
+                      np.zeros(model.n_x) if noise is None else noise / model.states.scale)
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
         for first in range(0, max(1, len(starts)), _PART)}
@@ -284,20 +314,18 @@ def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, fl
     return max(float(rates.min()), _SLOWEST * fastest), fastest
 
 
-def _cases(plant: DriftPlant, limits: InputLimits, loops: int) -> tuple[Array, Array, Array]:
+def _cases(plant: DriftPlant, limits: InputLimits, loops: int, seed: int
+           ) -> tuple[Array, Array, Array]:
     """Return starts (M, n_x), set-points (M, n_x) and the inputs (M, n_u) that hold these."""
-    # in here: no node needs it, and it takes long to import
-    from scipy.stats import qmc
-
     model = plant.model
     n, m = model.n_x, model.n_u
-    points = qmc.Sobol(2 * n + m, seed=0).random_base2(math.ceil(math.log2(_ATTEMPTS * loops)))
-    rng = np.random.default_rng(0)
-    anchors, starts = (_within_data(model, part, rng.permutation(len(points)))
-                       for part in (points[:, n:2 * n], points[:, :n]))
+    rng = np.random.default_rng(seed)
+    starts = _within_data(model, loops, rng)
+    anchors = _within_data(model, _ATTEMPTS * loops, rng)
     # the nominal point, too, lest there be none
     x, v = _steady(plant, np.vstack([np.zeros(n), anchors]),
-                   np.vstack([np.zeros(m), _between(model.inputs, points[:, 2 * n:])]))
+                   np.vstack([np.zeros(m), _between(model.inputs, rng.random((
+                       len(anchors), m)))]))
     u = model.inputs.to_physical(v)
     slack = _RESOLUTION * model.inputs.scale
     held = ((u >= limits.lower - slack) & (u <= limits.upper + slack)).all(axis=1)
@@ -309,11 +337,10 @@ def _cases(plant: DriftPlant, limits: InputLimits, loops: int) -> tuple[Array, A
         near = distance <= np.quantile(distance, _NEAREST)
     x, v = x[near], v[near]
     chosen: list[tuple[int, int]] = []
-    for k, start in enumerate(starts[:loops]):
+    for k, start in enumerate(starts):
         apart = np.flatnonzero(np.max(np.abs(x - start), axis=1, initial=0.0) >= _APART)
         if len(apart):
-            # each set-point in its turn
-            chosen.append((k, int(apart[k % len(apart)])))
+            chosen.append((k, int(rng.choice(apart))))
     first, second = np.array(chosen, dtype=np.int64).reshape(-1, 2).T
     return starts[first], x[second], v[second]
 
@@ -323,21 +350,23 @@ def _between(box: Coordinates, shares: Array) -> Array:
     return box.to_deviation(box.lower + shares * (box.upper - box.lower))
 
 
-def _within_data(model: LiftedModel, shares: Array, numbers: NDArray[np.int64]) -> Array:
-    """Return states (M, n_x) where the data are: in the box, or around training states in it."""
-    known = model.training_states
+def _within_data(model: LiftedModel, count: int, rng: np.random.Generator) -> Array:
+    """Draw states (M, n_x) where the data are: in the box, or around training states in it."""
+    known, shares = model.training_states, rng.random((count, model.n_x))
     if known is None:
         return _between(model.states, shares)
     states = model.states
     lower, upper = states.to_deviation(states.lower), states.to_deviation(states.upper)
     around = (2.0 * shares - 1.0) * known.fill_distance * 0.5 * (upper - lower)
-    return np.clip(known.states[numbers % len(known.states)] + around, lower, upper)
+    places = known.states[rng.integers(len(known.states), size=count)]
+    return np.clip(places + around, lower, upper)
 
 
 def _steady(plant: DriftPlant, x: Array, v: Array) -> tuple[Array, Array]:
     """Move states and inputs as little as it takes to rest; those that do not are left out."""
     n = x.shape[1]
     with np.errstate(all='ignore'):
+        v = plant.holding(x, v)
         for _ in range(_NEWTON_STEPS):
             rate, slope = plant.rate(x, v), plant.slope(x, v)
             good = np.isfinite(rate).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))

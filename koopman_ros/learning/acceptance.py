@@ -4,20 +4,27 @@
 """The gate: acceptance of a model by the part of the record that it was not learned from."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array, short_repr
-from koopman_ros.core.units import Display, display_unit, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import (
+    Display,
+    display_unit,
+    quantity_text,
+    SECONDS_PER_TIME_UNIT,
+)
 from koopman_ros.evaluation.closed_loop_test import (
     ClosedLoopTest,
     evaluate_closed_loops,
     LOOPS,
     Rate,
+    statement,
 )
 from koopman_ros.execution import Backend
+from koopman_ros.learning.causes import likely_causes
 from koopman_ros.learning.identification import (
     Drift,
     fitted_starts,
@@ -28,6 +35,11 @@ from koopman_ros.learning.identification import (
 from koopman_ros.learning.identification.drift import prediction_error, Segments
 from koopman_ros.learning.lift.metrics import lifted_rate, LiftMetrics
 from koopman_ros.learning.lift.training import Trained
+from koopman_ros.learning.linearisation import (
+    operating_points,
+    OperatingPoint,
+    unfounded_instability,
+)
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import LINEAR
@@ -37,6 +49,12 @@ _SIGMAS = 5.0
 _NOTICEABLE = 1e-3
 # White errors have none; those of a fitted start stay far below.
 _LEAST_AUTOCORRELATION = 0.3
+# Of the drifts that explain a record as well as the chosen one.
+_MOST_ALTERNATIVES = 5
+# Rounds of closed loops, at least, from which the share of failures is stated.
+_ROUNDS = 4
+# They differ where the mean square of their rates does by more than this share of the motion.
+_DIFFERENT = 0.1
 # A share of the set-points' range that may be missing: noise moves the ends of a record.
 _MISSING = 0.05
 
@@ -77,25 +95,51 @@ class HeldOut:
         return self.rmse(lifted_rate(model, self._seconds))
 
     def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
-                  backend: Backend | None = None) -> ClosedLoopTest:
-        """Close a model's loop on the estimated drift; Stopped where `watch` ended it."""
+                  backend: Backend | None = None, *, drift: Drift | None = None, seed: int = 0
+                  ) -> ClosedLoopTest:
+        """
+        Close a model's loop on the estimated drift; Stopped where `watch` ended it.
+
+        :param drift: the drift to take instead.
+        """
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
-        found = evaluate_closed_loops(model, self._found.drift.rate, loops=loops, watch=watch,
-                                      interval=period * self._seconds, backend=backend,
-                                      disturbances=self._found.disturbances)
+        model = replace(model, dead_time=self._seconds * self._found.dead_time)
+        found = evaluate_closed_loops(
+            model, (drift or self._found.drift).rate, loops=loops, seed=seed, watch=watch,
+            interval=period * self._seconds, noise=np.nan_to_num(self._found.noise),
+            backend=backend, disturbances=self._found.disturbances)
         if found is None:
             raise Stopped
         return found
 
-    def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array) -> str:
+    def further_checks(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
+                       backend: Backend | None) -> tuple[tuple[Drift, ClosedLoopTest], ...]:
+        """Close the loop from other starts, on this drift and on each alternative."""
+        drifts = [self._found.drift, *self._found.alternatives[:_MOST_ALTERNATIVES]]
+        drifts += [self._found.drift] * (_ROUNDS - len(drifts))
+
+        def checked(k: int) -> ClosedLoopTest:
+            return self.law_check(model, loops, lambda share: watch((k + share) / len(drifts)),
+                                  backend, drift=drifts[k], seed=1 + k)
+
+        return tuple((drift, checked(k)) for k, drift in enumerate(drifts))
+
+    def better(self, rmse: Array) -> dict[str, Rate]:
+        """Return the drifts by form that do not err more than a model that errs so (n_x,)."""
+        drifts = [self._found.drift, self._found.linear, *self._found.alternatives]
+        return {drift.form: drift.rate for drift in drifts
+                if _size(self.rmse(drift.rate), self.scale) <= _size(rmse, self.scale)}
+
+    def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array, remedy: str
+                 ) -> str:
         """Say that an error is not clearly below another one, or nothing."""
         own, margin = _size(rmse, self.scale), self._thresholds.margin
         if np.isfinite(own) and own <= (1.0 - margin) * _size(other, self.scale):
             return ''
         return (f'its error on held-out data, {_text(rmse, model)}, is not {100.0 * margin:.0f} % '
-                f'below that of {name}, {_text(other, model)}')
+                f'below that of {name}, {_text(other, model)}: {remedy}')
 
     def reasons(self, model: LiftedModel, rmse: Array, figures: LiftMetrics,
                 law_check: ClosedLoopTest, linear: bool) -> tuple[str, ...]:
@@ -106,14 +150,20 @@ class HeldOut:
         :param linear: whether it is a linear one itself, which need not be better than that.
         """
         reasons = [unusable(model)] + ([] if linear else [self.exceeded(
-            model, 'the best linear model', rmse, self.linear_rmse)])
+            model, 'the best linear model', rmse, self.linear_rmse, 'set model_class to linear')])
         cond, most = figures.fit.cond, self._thresholds.condition
         if not cond <= most:
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
-                           f'{most:.3g}: use fewer coordinates')
+                           f'{most:.3g}: reduce lifted_dimension, or set model_class to best')
         if not law_check.accepted:
-            reasons.append(f'its law does not control the estimated drift: {law_check}')
+            reasons.append(uncontrolled('the estimated drift', law_check))
         return tuple(filter(None, reasons))
+
+
+def uncontrolled(drift: str, check: ClosedLoopTest) -> str:
+    """Say that a law does not control a drift, and what to try."""
+    return (f'its law does not control {drift}: {check}; set model_class to best, or record more '
+            'in that range')
 
 
 @dataclass(frozen=True)
@@ -128,8 +178,18 @@ class AcceptanceResult:
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
+    #: more of them, of which none took part in a choice, on this and alternative drifts; none of a
+    #: model that is refused without them
+    further_checks: tuple[tuple[Drift, ClosedLoopTest], ...] = ()
+    operating_points: tuple[OperatingPoint, ...] = ()  #: with the eigenvalues of the model
 
     __repr__ = short_repr
+
+    @property
+    def statement(self) -> str:
+        """The share of failed loops on all drifts, with its confidence."""
+        checks = [check for _, check in self.further_checks] or [self.law_check]
+        return statement(checks, len({id(drift) for drift, _ in self.further_checks}))
 
     @property
     def accepted(self) -> bool:
@@ -138,14 +198,17 @@ class AcceptanceResult:
 
 
 def evaluate_model(found: Identified, learned: Trained | ClassComparison,
-                   current: LiftedModel | None, thresholds: Thresholds, *, loops: int = LOOPS
-                   ) -> AcceptanceResult:
+                   current: LiftedModel | None, thresholds: Thresholds, *, loops: int = LOOPS,
+                   watch: Callable[[float], bool] = lambda _: False,
+                   backend: Backend | None = None) -> AcceptanceResult:
     """
     Compare a new lift with the present and a linear one, held out, and close its loop.
 
     :param learned: the trained model, or the comparison by :func:`compare_classes`, of which the
         chosen model is judged, and whose closed loops are not run again.
-    :param loops: see :func:`evaluate_closed_loops`.
+    :param loops: like `backend` as for :func:`evaluate_closed_loops`; on each drift.
+    :param watch: called with the share that is done of further loops; True ends.
+    :raises Stopped: when `watch` requested it.
     """
     model, held_out = learned.model, HeldOut(found, thresholds)
     rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
@@ -153,16 +216,24 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     chosen = learned.chosen if isinstance(learned, ClassComparison) else None
     law_check = chosen.law_check if chosen and chosen.excess is not None else None
     if law_check is None:
-        law_check = held_out.law_check(model, loops, lambda _: False)
+        law_check = held_out.law_check(model, loops, lambda _: False, backend)
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
-        beside = held_out.exceeded(model, 'the current model', rmse, current_rmse)
+        beside = held_out.exceeded(model, 'the current model', rmse, current_rmse,
+                                   'keep that one, or reduce acceptance_margin')
         reasons = (*filter(None, [beside]), *reasons)
+    further = () if reasons else held_out.further_checks(model, loops, watch, backend)
+    reasons = (*reasons, *dict.fromkeys(
+        uncontrolled(f'a {drift.form} that explains the record equally well', check)
+        for drift, check in further if check.loops and not check.accepted))
+    points = operating_points(model, law_check.setpoints)
+    reasons = (*reasons, *filter(None, [unfounded_instability(
+        model, found, points, held_out.better(rmse))]))
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
-                            held_out.linear_rmse, found.noise, law_check)
+                            held_out.linear_rmse, found.noise, law_check, further, points)
 
 
 def _autocorrelation(drift: Drift, segments: Segments) -> Array:
@@ -177,10 +248,33 @@ def _autocorrelation(drift: Drift, segments: Segments) -> Array:
     return products / np.where(squares > 0.0, squares, 1.0)
 
 
+def disagreement(found: Identified) -> str:
+    """Say by how much, and where most, drifts that explain the record equally well differ."""
+    if not found.alternatives:
+        return ''
+    box = found.drift.box
+    episodes = [*found.fitted, *found.held_out]
+    x, u = (np.concatenate(parts) for parts in (
+        [one.interpolated() for one in episodes], [one.inputs_at(one.time) for one in episodes]))
+    own = found.drift.rate(x, u)
+    differences = np.array([(one.rate(x, u) - own) / box.states.scale
+                            for one in found.alternatives])
+    squares = np.mean(differences ** 2, axis=(1, 2))
+    share = float(np.sqrt(np.max(squares) / np.mean((own / box.states.scale) ** 2)))
+    if share <= _DIFFERENT:
+        return ''
+    worst = x[int(np.argmax(np.max(np.sum(differences ** 2, axis=2), axis=0)))]
+    place = ', '.join(f'{name} {quantity_text(value, unit)}' for name, unit, value in zip(
+        box.states.names, box.states.units, worst.tolist(), strict=True))
+    return (f'{1 + len(found.alternatives)} drifts that explain the record equally well differ by '
+            f'{100.0 * share:.0f} % of the motion, most at {place}: record longer, with steps of '
+            'the input around that state')
+
+
 def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
               ) -> tuple[str, ...]:
     """Say where the best drift errs by more than white noise explains."""
-    warnings = list(found.warnings)
+    warnings = [*found.warnings, *filter(None, [disagreement(found)])]
     count = sum(len(episode) for episode in found.held_out)
     measured = len(model.states) - found.hidden
     for i, (name, unit) in enumerate(zip(model.states.names[:measured], model.states.units,
@@ -201,9 +295,17 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
             warnings.append(
                 f'the best drift predicts {name} with an error of {error[i]:.3g} {unit}, of which '
                 f'{excess:.3g} {unit} is not noise ({noise:.3g} {unit} from sample to sample): '
-                'there is an unmeasured state or disturbance; measure it, or set '
-                'unmeasured_states')
+                + _remedy(likely_causes(found, i)))
     return tuple(warnings)
+
+
+def _remedy(causes: Sequence[tuple[float, str]]) -> str:
+    """Name the parameters to try, likeliest first."""
+    if not causes:
+        return ('the inputs do not explain it: set unmeasured_states, or record a disturbance as '
+                'another input')
+    return 'change ' + ', or '.join(
+        f'{name} (explains {100.0 * share:.0f} % of its square)' for share, name in causes)
 
 
 def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float]]

@@ -4,6 +4,7 @@
 """Training of models on an estimated drift."""
 
 from collections.abc import Callable
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,16 @@ from koopman_ros.core.datasets import DriftSamples, Episode, PlantDescription
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance import HeldOut, Thresholds
-from koopman_ros.learning.identification import Drift, fitted_starts, Identified, longest_step
+from koopman_ros.learning.identification import (
+    Drift,
+    DriftModel,
+    fitted_starts,
+    Identified,
+    longest_step,
+)
+from koopman_ros.learning.identification.alternatives import TransformedDrift
 from koopman_ros.learning.identification.drift import Segments, steady_point
+from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import IncrementalTraining
 from koopman_ros.learning.lift.metrics import ROUNDING
 from koopman_ros.learning.lift.multistart import Watch
@@ -130,6 +139,23 @@ def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescrip
                    nominal_state=x, nominal_input=u, input_matrix_degree=0,
                    B=drift.input_matrix_at if drift.varying_input_matrix else (
                        drift.input_matrix)), samples
+
+
+def alternative_models(found: Identified, plant: PlantDescription) -> list[LiftedModel]:
+    """
+    Return models of the alternative polynomial drifts of an identification.
+
+    :param plant: as for :func:`learn_lift`.
+    """
+    models = []
+    for drift in found.alternatives:
+        own = drift.drift if isinstance(drift, TransformedDrift) else drift
+        # one that holds no steady state, or does not follow the record, is no model
+        with contextlib.suppress(ValueError, np.linalg.LinAlgError):
+            if isinstance(own, DriftModel):
+                known, samples = _estimated(replace(found, drift=drift), plant)
+                models.append(Edmd(own.degree).learn(known, samples))
+    return models
 
 
 def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thresholds, *,

@@ -163,8 +163,9 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     continuing = [name for name in names if begin is not None and _of_kind(recipes, name, begin)]
     if begin is not None and not continuing:
         raise ValueError(f'no class of {", ".join(names)} can start from a lift '
-                         f'{"with" if begin.identity else "without"} identity coordinates: train '
-                         'a lift of its kind, or pass no initial lift')
+                         f'{"with" if begin.identity else "without"} identity coordinates: set '
+                         f'model_class to {IDENTITY_LIFT if begin.identity else FREE_LIFT}, or '
+                         'leave warm_start_model empty')
     prepared = PreparedSamples.of(plant, samples)
     judge = judge or _judge(prepared, loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+import glob
 import hashlib
 import os
 from pathlib import Path
@@ -28,7 +29,7 @@ from koopman_ros.learning.acceptance import (
     uncovered_setpoints,
 )
 from koopman_ros.learning.downsampling import coverage
-from koopman_ros.learning.drift_sampling import compare_classes
+from koopman_ros.learning.drift_sampling import alternative_models, compare_classes
 from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
@@ -64,7 +65,8 @@ _LEAST_JUMP = 0.1
 # Shares of the whole at which reading, estimating, learning and judging begin and end.
 _STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
            'decide': (0.9, 1.0)}
-_JUDGED = 0.8  # share of deciding in which the closed loops are run
+# Shares of deciding in which the closed loops are run, and further ones, too.
+_JUDGED, _WRITING = 0.8, 0.9
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
 OnProgress = Callable[[float, str], bool]
@@ -86,6 +88,8 @@ class Retrained:
     plant: PlantDescription  #: names, units and nominal point; its time unit is that of the drift
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
+    #: models of other drifts that explain the record equally well
+    alternative_files: tuple[str, ...] = ()
     reduction: Reduction | None = None  #: the part of a long record that is used
     #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
     free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
@@ -132,6 +136,7 @@ class Retrained:
             'reasons': list(self.reasons),
             'warnings': list(self.decision.warnings) if self.decision else [],
             'model_file': self.model_file,
+            'alternative_files': list(self.alternative_files),
             'units': dict(zip((*states.names, *inputs.names), (*states.units, *inputs.units),
                               strict=True)),
             'measurements_read': self.account.measurements,
@@ -168,6 +173,7 @@ class Retrained:
                 'heldout_rx': fit.rx,
                 'condition': fit.cond,
                 'closed_loops': check.loops,
+                'closed_loop_statement': self.decision.statement,
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
                 'closed_loop_cost_beside_linear': check.median_ratio,
@@ -262,14 +268,28 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
-    progress('decide', 0.9, 'writing')
+    progress('decide', _WRITING, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes, learned.chosen.name
                              ).with_disturbances(task.disturbances)
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
-                   reasons=decision.reasons, model_file=str(path), free_runs=runs)
+                   reasons=decision.reasons, model_file=str(path), free_runs=runs,
+                   alternative_files=_save_alternatives(Path(task.output), [
+                       replace(one, dead_time=dead_time)
+                       for one in alternative_models(found, plant)]))
+
+
+def _save_alternatives(output: Path, models: Sequence[LiftedModel]) -> tuple[str, ...]:
+    """Write the alternatives in place of those of the training before; return their files."""
+    for old in output.parent.glob(f'{glob.escape(output.stem)}.alternative_*.safetensors'):
+        old.unlink()
+    files = [output.with_suffix(f'.alternative_{k}.safetensors')
+             for k in range(1, 1 + len(models))]
+    for path, model in zip(files, models, strict=True):
+        save(model, path)
+    return tuple(map(str, files))
 
 
 def _hidden(task: TrainingTask) -> bool:
@@ -364,6 +384,10 @@ class _Progress:
         self('learn', self.learned, f'learning: {now.name}, {now.text}')
         return False
 
+    def judging_further(self, share: float) -> bool:
+        self('decide', _JUDGED + share * (_WRITING - _JUDGED), 'judging: further closed loops')
+        return False
+
     def judging(self, name: str, share: float) -> bool:
         # the closed loops of the last class come after all starts
         done = ('decide', _JUDGED * share) if self.learned == 1.0 else ('learn', self.learned)
@@ -405,7 +429,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
             reasons: tuple[str, ...] = (str(error),)
         progress('decide', _JUDGED, 'judging')
         if learned is not None:
-            decision = evaluate_model(found, learned, bare.present, thresholds)
+            decision = evaluate_model(found, learned, bare.present, thresholds,
+                                      watch=progress.judging_further, backend=backend)
             decision = replace(decision, warnings=(*decision.warnings, *warnings))
             reasons = decision.reasons
         if not reasons:
@@ -432,7 +457,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
     return replace(model, verified_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
         method=f'{found.method}, {found.drift.form}', model_class=model_class,
-        accepted=decision.accepted, reasons=decision.reasons))
+        accepted=decision.accepted, reasons=decision.reasons, closed_loops=decision.statement))
 
 
 def _place(output: Path, accepted: bool) -> Path:

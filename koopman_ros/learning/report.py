@@ -66,6 +66,9 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
     if retrained.model_file:
         yield f'Model file: `{retrained.model_file}`'
+    if retrained.alternative_files:
+        yield 'Models of other drifts that explain the record equally well: ' + ', '.join(
+            f'`{file}`' for file in retrained.alternative_files)
     yield '## Data'
     yield bullets(map(str, retrained.task.bags))
     yield bullets([
@@ -138,6 +141,13 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield (f'Lift: n_z = {learned.model.n_z}, rw = {learned.figures.fit.rw:.2g}, condition number '
            f'{learned.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
            f'1/{learned.model.time_unit}. On the estimated drift {decision.law_check}.')
+    yield f'Eigenvalues of the model at operating points [1/{learned.model.time_unit}]:'
+    yield table(('operating point', 'eigenvalues'), (
+        (point.text(own), ', '.join(f'{value:.3g}' for value in np.real_if_close(
+            point.eigenvalues)))
+        for point in decision.operating_points))
+    if decision.statement:
+        yield f'Simulated closed loops from where the data are: {decision.statement}.'
 
 
 def _label(signals: Coordinates, k: int) -> str:

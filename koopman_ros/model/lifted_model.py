@@ -61,6 +61,7 @@ class Provenance:
     model_class: str = ''
     accepted: bool | None = None  #: verdict of the acceptance test; None for a model never judged
     reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
+    closed_loops: str = ''  #: result of simulated closed loops, with its confidence
 
     def __post_init__(self) -> None:
         if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
@@ -134,6 +135,7 @@ class LiftedModel:
         rates = self.eigenvalues.real
         lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
                   *(f'held-out {name}: {value:.3g}' for name, value in about.metrics.items()),
+                  *[f'simulated closed loops: {about.closed_loops}'] * bool(about.closed_loops),
                   f'acceptance: {about.acceptance}']
         return '\n  '.join(lines)
 

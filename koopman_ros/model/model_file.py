@@ -118,8 +118,9 @@ def check(model: LiftedModel) -> None:
             check_unit(unit)
     for name in ('plant', 'data_digest', 'package_version', 'method'):
         _check_text(name, getattr(origin, name), _MAX_SENTENCE if name == 'method' else _MAX_NAME)
-    for reason in origin.reasons:
-        _check_text('a reason', reason, _MAX_SENTENCE)
+    for kind, text in (('closed_loops', origin.closed_loops),
+                       *(('a reason', reason) for reason in origin.reasons)):
+        _check_text(kind, text, _MAX_SENTENCE)
     for name, value in origin.metrics.items():
         _check_text('the name of a metric', name)
         if not math.isfinite(value):
@@ -146,6 +147,8 @@ def _description(model: LiftedModel) -> dict[str, Any]:
     about: dict[str, Any] = {
         'inputs': _signals(model.inputs), 'provenance': asdict(model.provenance),
         'states': _signals(model.states), 'time_unit': model.time_unit}
+    if not model.provenance.closed_loops:
+        del about['provenance']['closed_loops']
     if isinstance(model.observables, NetworkObservables):
         about['identity'] = model.observables.identity
     if model.dead_time.any():

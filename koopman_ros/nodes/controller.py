@@ -306,7 +306,7 @@ class ControllerNode(ManagedNode):
             unheard_for=time.monotonic() - self._received,
             setpoint_received=self._requests.setpoint_received,
             request=self._requests.complaint,
-            model_refused=self._models.refused,
+            model_refused=self._models.complaint,
             model=lambda: {**self._models.figures(),
                            'dead time change': self._dead_time_change or 'none',
                            'safe input': self._safe_input_warning or 'within reach'})

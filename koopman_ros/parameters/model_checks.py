@@ -6,8 +6,6 @@
 import contextlib
 from dataclasses import dataclass
 from datetime import datetime, UTC
-from pathlib import Path
-import time
 
 import numpy as np
 
@@ -15,18 +13,13 @@ from koopman_ros.control import Controller, State
 from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.status import StatusCode
-from koopman_ros.core.units import NANOSECONDS, quantity_text, shown
+from koopman_ros.core.units import quantity_text, shown
 from koopman_ros.evaluation import compare, PredictionWindows
 from koopman_ros.model import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.signal_topics import Signals, signals_of, words_of
 
 _LONGEST_PATH = 4096  # bytes, as Linux has it
-# What a control step may take of a processor, in s: the largest model that is read takes some
-# milliseconds, and measurements come once a second.
-_LONGEST_STEP = 0.1
-_TRIALS = 3
 
 
 @dataclass(frozen=True)
@@ -91,7 +84,7 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
                              f'{_LONGEST_PATH} bytes): check it')
     path = model_path(name)
     model, digest = load_with_digest(path)
-    if reason := unusable(model):
+    if reason := unusable(model, _with_defaults):
         raise ModelFileError(f'{path}: {reason}')
     if model.provenance.accepted is False and not force:
         raise ModelFileError(
@@ -104,7 +97,6 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
         raise ModelFileError(
             f'{path} has {own}, but this controller was started for {signals}: choose a model of '
             'the same signals, or restart the controller')
-    _refuse_slow(path, model)
     written = 'unknown'
     # the file may be gone since it was read
     with contextlib.suppress(OSError):
@@ -113,28 +105,8 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
     return LoadedModel(name, model, written, digest)
 
 
-def _refuse_slow(path: Path, model: LiftedModel) -> None:
-    controller = built(table_of(model, {'system': ''}).snapshot({}), model)
-    state = State()
-    needed = []
-    for k in range(1, _TRIALS + 1):
-        # of this thread alone, for a busy machine says nothing of a model
-        begun = time.thread_time()
-        state, _, report = controller.step(state, model.states.center, k * NANOSECONDS)
-        if report.reason is not None and report.reason.code is StatusCode.CALCULATION_FAILED:
-            raise ModelFileError(f'{path}: a control step with the model fails '
-                                 f'({report.reason.values["error"]}): train it again')
-        try:
-            controller.equivalent_bias(state)
-        except (ArithmeticError, ValueError) as error:
-            raise ModelFileError(f'{path}: a control step with the model fails ({error}): train '
-                                 'it again') from error
-        needed.append(time.thread_time() - begun)
-    if min(needed) > _LONGEST_STEP:
-        raise ModelFileError(
-            f'{path}: a control step with the model takes {min(needed):.3g} s of processor time, '
-            f'more than the allowed {_LONGEST_STEP:g} s: train a model with fewer coordinates '
-            f'(now n_z = {model.n_z})')
+def _with_defaults(model: LiftedModel) -> Controller:
+    return built(table_of(model, {'system': ''}).snapshot({}), model)
 
 
 def refuse_setpoints(model: LiftedModel, situation: ModelCheckContext) -> None:

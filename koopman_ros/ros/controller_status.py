@@ -79,7 +79,7 @@ class StatusContext:
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
     request: str  #: why the operator's last request was refused or limited, or empty
-    model_refused: str  #: why the last model was refused, or empty
+    model_refused: str  #: why the last model, or that in force, was refused; or empty
     model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
 
     @property

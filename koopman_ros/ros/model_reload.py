@@ -157,6 +157,14 @@ class ModelReload:
         """Put no model in force any more, not even one that is being read."""
         self._ended = True
 
+    @property
+    def complaint(self) -> str:
+        """Why the last model was refused, or why training refused the one in force; or ''."""
+        about = self.in_force.model.provenance
+        return self.refused or ('' if about.accepted is not False else (
+            f'model {self.in_force.name} is in force though it was {about.acceptance}: train it '
+            'again'))
+
     def figures(self) -> dict[str, object]:
         """Return the diagnostics of the current model."""
         return {
@@ -166,6 +174,7 @@ class ModelReload:
             'model reloads': self.reloads,
             'model refused': self.refused or 'none',
             'model check': self.in_force.comparison or 'none',
+            'model acceptance': self.in_force.model.provenance.acceptance,
         }
 
     def _start(self, name: str, situation: ModelCheckContext) -> _Trial:

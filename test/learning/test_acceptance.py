@@ -16,7 +16,7 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 from koopman_ros.learning import evaluate_model, learn_lift, Thresholds
-from koopman_ros.learning.acceptance import uncovered_setpoints
+from koopman_ros.learning.acceptance import disagreement, uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.identification import (
     DriftModel,
@@ -54,11 +54,22 @@ def trained(found, shipped):
 
 @pytest.fixture
 def no_loops(monkeypatch, shipped):
-    """Leave the closed loops out where another figure decides."""
+    """Leave the closed loops out where another figure decides; return their arguments."""
+    given = []
     passed = ClosedLoopTest(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool),
                             np.ones(9), 0)
-    monkeypatch.setattr(sys.modules[evaluate_model.__module__], 'evaluate_closed_loops', lambda *_,
-                        **__: passed)
+    monkeypatch.setattr(sys.modules[evaluate_model.__module__], 'evaluate_closed_loops',
+                        lambda *_, **others: given.append((*_, others)) or passed)
+    return given
+
+
+def test_loops_have_dead_time_noise_and_period_of_the_record(found, trained, no_loops):
+    """A minute is the time unit of the drift; the period is 1 s."""
+    evaluate_model(replace(found, dead_time=np.array([0.2])), trained, None, Thresholds())
+    (model, _, others), *_ = no_loops
+    assert model.dead_time == pytest.approx([12.0])
+    assert others['noise'] == pytest.approx([NOISE], rel=0.15)
+    assert others['interval'] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(('unit', 'seconds'), [('s', 1.0), ('min', 60.0)])
@@ -86,10 +97,10 @@ def test_rate_of_a_state_that_has_diverged(shipped):
 
 
 def test_a_better_lift_is_accepted(found, trained, shipped):
-    decision = evaluate_model(found, trained, shipped, Thresholds())
+    decision = evaluate_model(found, trained, shipped, Thresholds(), loops=32)
     assert decision.accepted
     assert (decision.reasons, decision.warnings) == ((), ())
-    assert decision.law_check.arrived == decision.law_check.loops == 128
+    assert decision.law_check.arrived == decision.law_check.loops == 32
     assert decision.law_check.worst_ratio < 1.01
     # the nominal input, which was not given, holds the nominal state
     states, inputs = trained.model.states, trained.model.inputs
@@ -109,7 +120,7 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
     own = f'{decision.rmse[0]:.4g} K'
     assert decision.reasons == (
         f'its error on held-out data, {own}, is not 10 % below that of the current model, '
-        f'{own}',)
+        f'{own}: keep that one, or reduce acceptance_margin',)
     assert evaluate_model(found, trained, trained.model, Thresholds(margin=0.0)).accepted
 
 
@@ -152,10 +163,40 @@ def test_margin_and_condition_number_decide_and_warnings_are_passed_on(found, tr
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
     decision = evaluate_model(found, wrong, shipped, Thresholds(), loops=16)
-    assert decision.law_check.share_failed == 1.0
+    assert decision.law_check.share_failed > 0.9
     (reason,) = (reason for reason in decision.reasons if 'control' in reason)
-    assert 'the law fails in 16 of 16 closed loops' in reason
+    assert 'of 16 closed loops' in reason
     assert f'{decision.law_check.region}' in reason
+
+
+def test_the_law_is_tried_on_all_drifts_that_explain_the_record(found, trained, tmp_path):
+    def judged(*alternatives):
+        return evaluate_model(replace(found, alternatives=alternatives), trained, None,
+                              Thresholds(), loops=8)
+
+    drift = found.drift
+    decision = judged(replace(drift), replace(drift))
+    assert (decision.reasons, decision.warnings) == ((), ())
+    assert decision.statement.startswith('0 of 32 loops failed on 3 models that explain the rec')
+    # with starts of their own, that of a choice among classes, too
+    starts = [decision.law_check, *(check for _, check in decision.further_checks)]
+    assert len(np.unique(np.concatenate([one.starts[:, 0] for one in starts]))) == 5 * 8
+    decision = judged(replace(drift), replace(drift, B=-drift.B))
+    (reason,) = decision.reasons
+    assert f'does not control a {drift.form} that explains the record equally well' in reason
+    assert 'of 8 closed loops' in reason
+    (warning,) = decision.warnings
+    assert '3 drifts that explain the record equally well differ by ' in warning
+
+
+@pytest.mark.parametrize(('factor', 'said'), [(1.05, False), (1.2, True)])
+def test_drifts_that_differ_are_named(found, factor, said):
+    """All rates are a fifth larger, so the difference is most where the rates are."""
+    drift = found.drift
+    other = replace(drift, coefficients=factor * drift.coefficients, B=factor * drift.B)
+    text = disagreement(replace(found, alternatives=(other,)))
+    assert ('differ by 20 % of the motion, most at temperature' in text) == said
+    assert bool(text) == said
 
 
 @pytest.mark.usefixtures('no_loops')
@@ -167,7 +208,10 @@ def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, 
     assert decision.current_rmse == [np.inf]
     assert decision.accepted
     decision = evaluate_model(found, replace(trained, model=diverging), diverging, Thresholds())
-    assert 'inf K, is not 10 % below that of the current model' in ' '.join(decision.reasons)
+    said = ' '.join(decision.reasons)
+    assert 'inf K, is not 10 % below that of the current model' in said
+    # the drift is stable
+    assert re.search('it is unstable at temperature .* although a drift of degree 3, which', said)
 
 
 @pytest.mark.parametrize('values', [
@@ -187,6 +231,7 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     coloured, warning = decision.warnings
     assert coloured.startswith('the noise of temperature is coloured')
     assert f'temperature with an error of {decision.drift_rmse[0]:.3g} K' in warning
+    assert 'unmeasured_states' in warning
     # the noise is told apart from it
     assert decision.noise == pytest.approx([0.03], rel=0.15)
     assert decision.drift_rmse > 1.5 * decision.noise

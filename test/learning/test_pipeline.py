@@ -16,6 +16,8 @@ from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
+from koopman_ros.learning.identification.alternatives import TransformedDrift
+from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.model import load, ModelFileError, save
 from koopman_ros.records import BagReadError
 from support.known_plants import box
@@ -110,7 +112,7 @@ def test_progress_rises_to_the_end(accepted):
     assert words[0] == 'reading bags'
     assert {'estimating: drift of degree 3', 'learning: identity lift, n_z 2, start 1 of 1',
             'judging: identity lift'} < set(words)
-    assert words[-2:] == ('judging', 'writing')
+    assert words[-2:] == ('judging: further closed loops', 'writing')
 
 
 def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
@@ -126,7 +128,8 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     assert refused.provenance.reasons == retrained.reasons
     again = tmp_path / 'again.safetensors'
     save(replace(refused, provenance=replace(
-        refused.provenance, accepted=True, reasons=())), again)
+        refused.provenance, accepted=True, reasons=(),
+        closed_loops=load(present).provenance.closed_loops)), again)
     assert again.read_bytes() == present.read_bytes()
 
 
@@ -138,12 +141,16 @@ def test_report(accepted):
     figures = json.loads(files[0].read_text())
     assert figures == retrained.summary()
     assert figures['accepted'] is True
+    said = figures['closed_loop_statement']
+    assert said.startswith('0 of ')
+    assert 'simulated closed loops: ' + said in str(load(retrained.model_file))
     assert figures['measurements_used'] == figures['measurements_read'] == 1201
     # UA is 0.8 of 2.092 1/min
     gain = figures['input_gain']['temperature']['coolant_temperature']
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
-    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)',
+    for words in ('is accepted.**', '1201 of 1201 measurements used', '(new.png)', said,
+                  '| operating point | eigenvalues |',
                   f'| the current model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
@@ -151,6 +158,32 @@ def test_report(accepted):
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
     assert diverging.summary()['heldout_error_of_present_lift'] == {'temperature': None}
+
+
+@pytest.mark.usefixtures('learned')
+def test_models_of_alternative_drifts_are_kept_beside_the_model(
+        bag, accepted, tmp_path, monkeypatch):
+    """That of a training before goes."""
+    drift = accepted[0].found.drift
+    monkeypatch.setattr(task_module, 'identify', lambda *_, **__: replace(
+        accepted[0].found, alternatives=(
+            TransformedDrift(drift.box, drift, np.eye(1), np.zeros(1)),
+            replace(drift, coefficients=1.02 * drift.coefficients))))
+    (tmp_path / 'new.alternative_7.safetensors').touch()
+    told = []
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors'),
+                        lambda share, text: told.append((share, text)) or False)
+    assert told == sorted(told, key=lambda pair: pair[0])
+    assert 'judging: further closed loops' in [text for _, text in told]
+    names = ['new.alternative_1.safetensors', 'new.alternative_2.safetensors']
+    assert [Path(file).name for file in retrained.alternative_files] == names
+    assert names[0] in page_of(retrained)
+    assert sorted(path.name for path in tmp_path.glob('*alternative*')) == names
+    x, u = np.linspace(308.0, 320.0, 9)[:, None], np.full((9, 1), 290.0)
+    for file, factor in zip(retrained.alternative_files, (1.0, 1.02), strict=True):
+        rate = lifted_rate(load(file), 60.0)(x, u)
+        own = replace(drift, coefficients=factor * drift.coefficients).rate(x, u)
+        assert rate == pytest.approx(own, abs=1e-6)
 
 
 @pytest.mark.usefixtures('learned')

@@ -182,6 +182,9 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
     done, about = bench.reload()
     assert done
     assert 'too large an error' in about
+    status = ros.wait_for_status(STATUS, lambda s: 'in force though it was refused' in s.message)
+    assert (status.level, 'too large an error' in status.message) == (DiagnosticStatus.WARN, True)
+    assert value(status, 'model acceptance') == 'refused (too large an error)'
     assert change(load_refused_model=False).successful
     assert 'load_refused_model' in bench.reload()[1]
     assert ros.get_parameters('controller', 'model') == [str(file)]

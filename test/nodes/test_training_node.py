@@ -43,8 +43,8 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
                      r'K, that of the present one \d\.\d+ K; written to '
                      rf'{tmp_path}/new\.safetensors',
                      printed)
-    assert sorted(path.name for path in tmp_path.glob('new.*')) == [
-        'new.free_run.png', 'new.json', 'new.md', 'new.png', 'new.safetensors']
+    assert {'new.free_run.png', 'new.json', 'new.md', 'new.png', 'new.safetensors'} == {
+        path.name for path in tmp_path.glob('new.*') if 'alternative' not in path.name}
     assert load(tmp_path / 'new.safetensors').n_z == 2
     # no bag is recorded meanwhile
     assert not list(tmp_path.glob('koopman_ros_*'))

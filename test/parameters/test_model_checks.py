@@ -12,11 +12,10 @@ import sys
 import numpy as np
 import pytest
 
-from koopman_ros.control import State
+from koopman_ros.control import State, usable
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS, to_kelvin
 from koopman_ros.model import LiftedModel, load, ModelFileError, save
-from koopman_ros.parameters import model_checks
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.model_checks import (
     load_suitable,
@@ -97,7 +96,7 @@ def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPa
 
 def slow(patch: pytest.MonkeyPatch) -> None:
     # no model within the bounds takes that long, so the limit is moved
-    patch.setattr(model_checks, '_LONGEST_STEP', 1e-7)
+    patch.setattr(usable, '_LONGEST_STEP', 1e-7)
 
 
 def failing(patch: pytest.MonkeyPatch) -> None:
@@ -120,3 +119,5 @@ def test_model_that_cannot_be_used_is_refused_in_a_short_sentence(
     with pytest.raises(ModelFileError, match=words) as refused:
         load_suitable(name)
     assert len(str(refused.value)) < 250
+    # nor does training accept it
+    assert name != 'reactor_nz4' or re.search(words, usable.unusable(SHIPPED))

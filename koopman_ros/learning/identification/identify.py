@@ -47,7 +47,7 @@ _FITTED = 0.6  # share of them that are fitted; they hold the extremes of all si
 _FEWEST = 8
 # Mean squared errors this close count as equal: on a few segments that hold one estimate against
 # another, chance alone makes such a difference.
-_NEARLY = 1.1
+NEARLY = 1.1
 
 # Called with (steps done, steps in all, what is done now); True ends the estimation.
 Watch = Callable[[int, int, str], bool]
@@ -144,6 +144,8 @@ class Identified:
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()
     warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
+    #: other drifts that explain the samples left out of their fit about as well
+    alternatives: tuple[Drift, ...] = ()
     #: (n_u,) by which the inputs of the segments are later than those of the record, in time
     #: units; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
@@ -217,7 +219,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     if not math.isfinite(least):
         raise ValueError('; '.join(['no drift fits the episodes: record longer, with steps of the '
                                     'input', *failures]))
-    good = [d for d, (_, score) in best.items() if score.cost <= _NEARLY * least]
+    good = [d for d, (_, score) in best.items() if score.cost <= NEARLY * least]
     degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
 
     def monitor(*_: object) -> bool:
@@ -233,6 +235,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
                       (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
+                      alternatives=tuple(best[d][0] for d in good if d != degree),
                       disturbances=plant.disturbance_names)
 
 
@@ -275,7 +278,7 @@ def _candidate(given: _Given, degree: int, tell: Tell) -> _DegreeCandidate:
                            monitor=monitor)
     polished = _score(refined, given.chooser, f'{OUTPUT_ERROR} from {score.method}')
     # the better estimate in theory needs no proof, only that it does no harm
-    best = (refined, polished) if polished.cost <= _NEARLY * score.cost else (model, score)
+    best = (refined, polished) if polished.cost <= NEARLY * score.cost else (model, score)
     return _DegreeCandidate(best, (*(score for _, score in rated), polished), failures)
 
 

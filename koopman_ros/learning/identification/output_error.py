@@ -358,9 +358,9 @@ def _step_slopes(model: Refinable, x: Array, v: Array, steps: Array) -> Array:
     n_x, p = x.shape[-1], len(model.theta)
     y = np.zeros((x[..., 0].size, n_x, 1 + p + n_x))
     y[..., 0], y[..., 1 + p:] = x.reshape(-1, n_x), np.eye(n_x)
-    after = runge_kutta_step(partial(_rates, model, v.reshape(len(y), -1)), y,
+    after = runge_kutta_step(partial(_rates, model, v.reshape(-1, v.shape[-1])), y,
                              steps.reshape(-1, 1, 1))
-    return after[..., 1:].reshape(*x.shape, -1)
+    return after[..., 1:].reshape(*x.shape, p + n_x)
 
 
 def _rates(model: Refinable, v: Array, y: Array) -> Array:

@@ -14,11 +14,13 @@ import numpy as np
 
 from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.learning.identification.alternatives import in_coordinates_of
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
+    NEARLY,
     OUTPUT_ERROR,
     Score,
     stage_by_stage,
@@ -160,7 +162,15 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                 raise
     return replace(record.identified(
         predictor, best.label, [one.score for one in candidates], stage('linear model')),
-        warnings=warnings)
+        warnings=warnings, alternatives=in_coordinates_of(predictor, _equals(best, able), record))
+
+
+def _equals(best: _StructureCandidate, able: Sequence[_StructureCandidate]
+            ) -> list[Predictor[Drift]]:
+    """Return the others with as many states that err about as little as the best ones."""
+    most = NEARLY * min(one.score.cost for one in able)
+    return [Predictor(one.model.drift, one.gain) for one in able
+            if one is not best and one.hidden == best.hidden and one.score.cost <= most]
 
 
 def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:

@@ -84,9 +84,9 @@ class IncrementalTraining:
     def rounds(self, n_x: int) -> tuple[int, ...]:
         """Return the n_z after each round of starts; ValueError when the states need more."""
         if self.n_z < n_x + self.identity:
-            hint = ' as its first coordinates: use Edmd(degree=1) for a linear model'
-            raise ValueError(f'n_z = {self.n_z} is too small for {n_x} states'
-                             + (hint if self.identity else ''))
+            raise ValueError(
+                f'n_z = {self.n_z} is too small for {n_x} states: set lifted_dimension to '
+                f'{n_x + self.identity} or more, or model_class to linear')
         return tuple(range(n_x + self.identity, self.n_z + 1))
 
     def start(self, data: ScaledSamples, n_z: int, parent: TrainedLift | None, seed: int,

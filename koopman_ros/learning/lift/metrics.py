@@ -79,7 +79,7 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     cond = float(np.linalg.cond(S))
     if not cond < _MAX_COND:
         raise ValueError(f'{len(z)} samples do not distinguish {model.n_z} coordinates: use '
-                         'samples that move more, or a smaller n_z')
+                         'samples that move more, or a smaller lifted_dimension (n_z)')
     factor = np.linalg.cholesky(S)
     residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
     reference = np.linalg.solve(factor, dz.T)

@@ -263,7 +263,8 @@ def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bo
         raise TrainingFailed(
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
             f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '
-            'validation episodes): keep the linear model, or excite the plant over a wider range'
+            'validation episodes): set model_class to linear, or excite the plant over a wider '
+            'range'
             + ('' if winner.model.identity else ', or use identity coordinates'))
     law_check = None
     if loops and winner.model.n_u:

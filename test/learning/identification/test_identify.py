@@ -34,6 +34,8 @@ def test_takes_output_error_and_the_right_degree(found):
     assert found.method.startswith('output error from ')
     assert found.drift.degree == 3
     assert found.linear.degree == 1
+    # that of degree 4 explains it as well
+    assert [one.degree for one in found.alternatives] == [4]
     # 480 samples with noise of 2 % of the range: see the bound in test_estimates
     assert CUBIC.misfit(found.drift) < 5.0 * np.sqrt(5.0) * NOISE / np.sqrt(480.0)
     assert found.drift.input_matrix == pytest.approx(CUBIC.B, rel=5e-3)

@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The causes that errors of a drift point to: plants with one each, which the drift lacks."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.datasets import Episode
+from koopman_ros.learning.causes import likely_causes
+from koopman_ros.learning.identification import DriftModel, Identified
+from support.known_plants import box
+
+BOX = box([-2.0], [2.0], [-1.0], [1.0])
+PERIOD, HELD, COUNT, FINE = 0.1, 10, 100, 10
+# dx/dt of a plant with the state x, h not measured, under inputs now and 0.4 s ago, and noise d
+Plant = Callable[[float, float, float, float, float], tuple[float, float]]
+
+
+def record(plant: Plant, seed: int) -> Episode:
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.0, 1.0, COUNT // HELD), HELD * FINE)
+    slow = np.convolve(rng.standard_normal(len(u) + 500), np.ones(500) / 22.0, 'valid')
+    x, h, h_fine, path = rng.uniform(-1.0, 1.0), 0.0, PERIOD / FINE, []
+    for k in range(len(u)):
+        path.append(x)
+        dx, dh = plant(x, h, u[k], u[max(0, k - 4 * FINE)], slow[k])
+        x, h = x + h_fine * dx, h + h_fine * dh
+    time = PERIOD * np.arange(COUNT)
+    noise: Array = 0.01 * rng.standard_normal(COUNT)
+    return Episode(time, (np.array(path)[::FINE] + noise)[:, None], time, u[::FINE][:, None])
+
+
+@pytest.mark.parametrize(('plant', 'first'), [
+    (lambda x, h, u, late, d: (-x + late, 0.0), 'u1.dead_time'),
+    (lambda x, h, u, late, d: (-x + u + 0.5 * x * u, 0.0), 'input_matrix_degree'),
+    (lambda x, h, u, late, d: (-x + u + 0.5 * h, u - 0.3 * h), 'unmeasured_states'),
+    # nothing of the record tells it
+    (lambda x, h, u, late, d: (-x + u + 0.5 * d, 0.0), '')])
+def test_the_likeliest_cause_is_that_of_the_plant(plant: Plant, first: str) -> None:
+    drift = DriftModel(BOX, 1, np.array([[0.0], [-1.0]]), np.array([[0.5]]))
+    episodes = [record(plant, seed) for seed in range(8)]
+    found = Identified(drift, 'known', drift, (), np.full(1, 0.01), tuple(episodes[:6]),
+                       tuple(episodes[6:]))
+    causes = likely_causes(found, 0)
+    assert [name for _, name in causes][:1] == [first] * bool(first), causes
+    assert not first or causes[0][0] > 0.6
