@@ -219,6 +219,11 @@ class SignalTopics:
     #: places of its measured disturbances, by name
     disturbances: Mapping[str, Any] = field(default_factory=dict)
 
+    @classmethod
+    def of(cls, signals: Signals, parameters: Any, kinds: tuple[str, ...] = KINDS) -> SignalTopics:
+        """Return the places that the parameters of a node name."""
+        return cls(signals, parameters.states, parameters.inputs, kinds, parameters.disturbances)
+
     #: measurements of the states, and their predictions
     measured = _role('states', 'topic')
     predicted = _role('states', 'predicted_topic')
