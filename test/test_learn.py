@@ -97,6 +97,9 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
     assert load(folder / 'new.refused.safetensors').disturbances.names == ('rain',)
     assert learned('--disturbances', 'rain', '--input_matrix_degree', '1') == 1
     assert 'input_matrix_degree' in capsys.readouterr().err
+    table(0).assign(**{'rain [mm]': 3.0}).to_csv('day.csv', index=False)
+    assert learned('--disturbances', 'rain') == 1
+    assert 'rain is 3 in the whole record: leave it out' in capsys.readouterr().err
 
 
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):

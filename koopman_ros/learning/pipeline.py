@@ -235,6 +235,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
+    _check_disturbances(plant, episodes)
     dead_time = _dead_time(task, plant, episodes, progress)
     episodes = [late for episode in episodes
                 if (late := episode.delayed(dead_time / seconds)) is not None]
@@ -306,6 +307,16 @@ def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
     progress('read', 0.0, 'reading bags')
     return read_record(source, task.most_samples, task.seed, hidden=_hidden(task),
                        tick=progress.reading(2 * source.size()), backend=backend)
+
+
+def _check_disturbances(plant: PlantDescription, episodes: Sequence[Episode]) -> None:
+    """Raise ValueError for a measured disturbance that does not change in the record."""
+    for name in plant.disturbance_names:
+        j = plant.input_names.index(name)
+        values = np.concatenate([one.u[:, j] for one in episodes])
+        if not np.ptp(values) > 0.0:
+            raise ValueError(f'{name} is {values[0]:.6g} in the whole record: leave it out of the '
+                             'measured disturbances, or record while it changes')
 
 
 def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode],

@@ -121,9 +121,7 @@ class ControllerNode(ManagedNode):
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
         self._counts = status.Counts()
         self._measured = np.full(len(signals.states), np.nan)
-        self._connect(SignalTopics(signals, parameters.states, parameters.inputs,
-                                   disturbances=parameters.disturbances,
-                                   analyses=parameters.every_state))
+        self._connect(SignalTopics.of(signals, parameters))
         self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
         self._diagnostics = self.diagnostics.add_group(self._statuses, status.TASKS)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)

@@ -88,8 +88,7 @@ class PanelNode(LoopNode):
         present = load(model_path(str(name))) if (name := given.get('model')) else None
         self.settings = settings = self.declare_table(panel_table(present, given))
         self._signals = signals = panel_signals(present, given)
-        self._wiring = wiring = SignalTopics(signals, settings.states, settings.inputs,
-                                              disturbances=settings.disturbances)
+        self._wiring = wiring = SignalTopics.of(signals, settings)
         read = settings.read(signals)
         nodes = {PLANT: PLANT, CONTROLLER: settings.controller, TRAINER: settings.trainer}
         self.view = LoopViewModel(signals, read, settings.span, time.time(), {

@@ -81,8 +81,7 @@ class PlantNode(ManagedNode):
         self._commanded = dict.fromkeys(signals.inputs, self._wall_start)
 
         self._received: dict[str, float] = {}  # of the commands for the last measurement
-        wiring = SignalTopics(signals, parameters.states, parameters.inputs, PLANT_KINDS,
-                              parameters.disturbances)
+        wiring = SignalTopics.of(signals, parameters, PLANT_KINDS)
         # the subscriptions first: a controller that hears the measurement has then seen them, too
         self._endpoints = endpoints = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), {

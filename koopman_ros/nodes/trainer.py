@@ -50,8 +50,7 @@ class TrainerNode(ManagedNode):
             name: getattr(settings, name) for name in SIGNALS})
         self.diagnostics.hardware_id = settings.system if present is None else (
             present.provenance.plant or settings.system)
-        wiring = SignalTopics(signals, settings.states, settings.inputs,
-                              disturbances=settings.disturbances)
+        wiring = SignalTopics.of(signals, settings)
         for kind in wiring.kinds:
             # a field that its message type lacks is refused now, not when a bag holds nothing
             list(by_topic(getattr(wiring, kind)))

@@ -76,13 +76,14 @@ class Faceplate:
 
 @dataclass(frozen=True)
 class StateFaceplate(Faceplate):
-    """A measured state."""
+    """A measured state, or a measured disturbance."""
 
     controlled: bool  #: whether it has a set-point
     measured: float
     setpoint: float  #: active set-point
     target: float  #: requested set-point, to which the active one moves
     predicted: float  #: the model's prediction of the measurement
+    disturbance: bool = False  #: whether it is a disturbance
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,9 @@ class SignalValues:
         """Return the last value of a kind."""
         return self.values.get(kind, default)
 
-    def state(self, controlled: bool, limits: Range | None, sensor: Range | None, silent: bool
-              ) -> StateFaceplate:
-        """Return the faceplate of a state with its limits and the range of its sensor."""
+    def state(self, controlled: bool, limits: Range | None, sensor: Range | None, silent: bool,
+              disturbance: bool = False) -> StateFaceplate:
+        """Return the faceplate of a state, or disturbance, with limits and range of the sensor."""
         measured, setpoint = self.get('measured'), self.get('active_setpoints')
         span = _span([self.training, sensor], [measured, setpoint, *(limits or ())])
         abnormal = ''
@@ -130,7 +131,7 @@ class SignalValues:
         return StateFaceplate(
             self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
             self.active, self.plan, controlled, measured, setpoint, self.get('target', setpoint),
-            self.get('predicted'))
+            self.get('predicted'), disturbance)
 
     def input(self, limits: Range | None, silent: bool) -> InputFaceplate:
         """Return the faceplate of an input with its limits."""

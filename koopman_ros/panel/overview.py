@@ -201,7 +201,8 @@ def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
             target.set_text(f'target {own.text(own.target)} {own.unit} (ramping)' if ramps else '')
             entry.show(own, own.target)
         predicted.set_text(f'model prediction {number(own.predicted, own.decimals + 1)} {own.unit}'
-                           if math.isfinite(own.predicted) else '')
+                           if math.isfinite(own.predicted) else
+                           'measured disturbance' if own.disturbance else '')
 
     page.follow(show)
 

@@ -62,7 +62,7 @@ def _charts(now: Snapshot) -> _Charts:
         kinds = ['commands', 'applied', 'planned']
         if isinstance(face, StateFaceplate):
             kinds = ['measured', 'active_setpoints', 'predicted', 'planned'] if (
-                face.controlled) else ['measured', 'predicted']
+                face.controlled) else ['measured', *['predicted'] * (not face.disturbance)]
         found.setdefault((is_input, face.unit), []).extend(
             _Pen(kind, face.name, pen(kind, face.name), f'{pen(kind, face.label)} [{face.unit}]',
                  face.label,

@@ -275,7 +275,8 @@ class LoopViewModel:
             fallback=bool(self._level) and self._level not in (best, 'manual'),
             reason='' if reason == 'none' or no_controller else reason,
             states=tuple(own.state(name in self.signals.controlled, self._bounds(own, 'mpc.{}.{}'),
-                                   self._bounds(own, '{}.sensor_{}'), no_plant)
+                                   self._bounds(own, '{}.sensor_{}'), no_plant,
+                                   name in self._disturbances)
                          for name, own in {**self._states, **self._disturbances}.items()),
             inputs=tuple(own.input(self._bounds(own), no_controller)
                          for own in self._inputs.values()),

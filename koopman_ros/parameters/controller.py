@@ -118,8 +118,7 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
         plugin_class(tuning.estimator or 'measured_state', 'estimator', ESTIMATORS, Estimator)
     except ValueError as error:
         return f'estimator = {tuning.estimator!r}: {error}'
-    return SignalTopics(signals, values.states, values.inputs, disturbances=values.disturbances,
-                        analyses=values.every_state).check()
+    return SignalTopics.of(signals, values).check()
 
 
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:

@@ -148,8 +148,7 @@ def panel_table(present: LiftedModel | None = None,
             except ValueError as error:
                 return (f'{name}.shown_unit = {read[name]!r} must have the dimension of {unit}: '
                         f'{error}')
-        return SignalTopics(signals, values.states, values.inputs,
-                            disturbances=values.disturbances).check()
+        return SignalTopics.of(signals, values).check()
 
     return ParameterTable(
         PanelParameters, check, signals={'states': signals.states, 'inputs': signals.inputs,

@@ -209,5 +209,4 @@ def _cross_check(signals: Signals, values: PlantParameters) -> str:
     if unknown := set(filter(None, values.measured)) - set(signals.states):
         return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}: choose '
                 f'from the states {", ".join(signals.states)}')
-    return SignalTopics(signals, values.states, values.inputs, PLANT_KINDS,
-                        values.disturbances).check()
+    return SignalTopics.of(signals, values, PLANT_KINDS).check()

@@ -239,6 +239,12 @@ class SignalTopics:
     #: places of late values, by name of the state
     analyses: Mapping[str, AnalysisPlaces] = field(default_factory=dict)
 
+    @classmethod
+    def of(cls, signals: Signals, parameters: Any, kinds: tuple[str, ...] = KINDS) -> SignalTopics:
+        """Return the places that the parameters of a node name."""
+        return cls(signals, parameters.states, parameters.inputs, kinds, parameters.disturbances,
+                   getattr(parameters, 'every_state', {}))  # late values are the controller's
+
     #: measurements of the states, and their predictions
     measured = _role('states', 'topic')
     predicted = _role('states', 'predicted_topic')

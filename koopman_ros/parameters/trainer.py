@@ -389,8 +389,7 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
         return ('input_matrix must be a single 0 if physical_model is set, which defines the '
                 'effect of the inputs')
     return (refused(values.physical_model, values.estimated_constants)
-            or SignalTopics(signals, values.states, values.inputs,
-                            disturbances=values.disturbances).check())
+            or SignalTopics.of(signals, values).check())
 
 
 @dataclass(frozen=True)

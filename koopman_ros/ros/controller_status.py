@@ -17,6 +17,7 @@ from koopman_ros.core.status import level_words, StatusCode
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import display_unit, quantity_text, shown, values_by_name
+from koopman_ros.model import Coordinates
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.signal_topics import Signals, words_of
 from koopman_ros.ros.controller_messages import labelled
@@ -244,13 +245,8 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
     if now.model_refused:
         yield MODEL, now.model_refused
     if report.measurement.outside > 0.0:
-        box = states.only(tuple(now.signals.states))
-        outside = [f'{name} is outside the trained range [{shown(lower, unit):.6g}, '
-                   f'{shown(upper, unit):.6g}] {display_unit(unit)}'
-                   for name, unit, lower, upper, value in zip(
-                       box.names, box.units, box.lower.tolist(), box.upper.tolist(),
-                       now.measured.tolist(), strict=True) if not lower <= value <= upper]
-        yield MODEL, (f'{", ".join(outside) or "the state is far from the training data"}: '
+        outside = _untrained(states.only(tuple(now.signals.states)), now.measured)
+        yield MODEL, (f'{outside or "the state is far from the training data"}: '
                       'the model extrapolates')
     if oldest and abs(age) > oldest:
         yield MEASUREMENTS, (
@@ -260,6 +256,8 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         words = words_of(now.signals)
         for fault in now.state.disturbances.faults:
             yield MEASUREMENTS, words(fault)
+        if outside := _untrained(now.controller.model.disturbances, now.state.disturbances.value):
+            yield MODEL, f'{outside}: the model extrapolates'
     if report.target is not None and (short := _out_of_reach(now, report.target)):
         yield SETPOINT, short
     if not report.measurement.follows:
@@ -271,6 +269,16 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         yield MODEL, (
             f'the disturbance estimate is at its bound of {_listed(now, tuning.max_disturbance)} '
             f'of {now.input}: the plant differs from the model; retrain')
+
+
+def _untrained(box: Coordinates, values: Array) -> str:
+    """Return which values (n,) are outside their trained range, or ''."""
+    return ', '.join(
+        f'{name} is outside the trained range [{shown(lower, unit):.6g}, {shown(upper, unit):.6g}]'
+        f' {display_unit(unit)}'
+        for name, unit, lower, upper, value in zip(
+            box.names, box.units, box.lower.tolist(), box.upper.tolist(), values.tolist(),
+            strict=True) if not lower <= value <= upper)
 
 
 def _out_of_reach(now: StatusContext, target: TargetReport) -> str:

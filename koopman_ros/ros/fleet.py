@@ -72,8 +72,7 @@ def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
         if not bags:
             raise ConfigurationError('no bag to train from: set bags')
         signals = trainer_signals(present, {name: getattr(settings, name) for name in SIGNALS})
-        wiring = SignalTopics(signals, settings.states, settings.inputs,
-                              disturbances=settings.disturbances)
+        wiring = SignalTopics.of(signals, settings)
         return task_fields(node, settings, wiring, bags), settings.executor
     finally:
         node.destroy_node()

@@ -115,8 +115,7 @@ def _wiring(given: Mapping[str, Any]) -> tuple[SignalTopics, tuple[str, ...]]:
     signals = trainer.trainer_signals(
         load(model_path(given['model'])) if 'model' in given else None,
         {**{name: getattr(settings, name) for name in SIGNALS}, **given})
-    return SignalTopics(signals, settings.states, settings.inputs,
-                        disturbances=settings.disturbances), settings.topics
+    return SignalTopics.of(signals, settings), settings.topics
 
 
 def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Program]:

@@ -139,7 +139,7 @@ class SignalSubscriber:
 
 
 class MeasuredInputs:
-    """The inputs that were measured last, with their stamps."""
+    """The inputs, or disturbances, as they were measured last, with their stamps."""
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = tuple(names)

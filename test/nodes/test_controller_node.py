@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.core.paths import model_path
@@ -22,7 +23,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load, save
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, STATUS, STEADY, until_read
+from support.controller_bench import Bench, reproduced, STATUS, STEADY, until_read
 from support.nodes import seconds, temperature, value
 
 
@@ -356,3 +357,27 @@ def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
     assert '2 nodes command the coolant' in second.output()
     assert second.stop() == 0
     ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_a_measured_disturbance_that_fails_is_a_warning_and_the_loop_runs_on(
+        ros: Harness) -> None:
+    recorded = ros.listen(String, topics.EVENT_LOG)
+    bench = Bench(ros, {'model': 'reactor_feed', 'feed_temperature.sensor_max': 120.0,
+                        'feed_temperature.timeout': 5.0, 'stuck_sensor_timeout': 0.0})
+    feed = ros.speak(Temperature, 'feed_temperature', to='controller')
+    at = 1.0
+    for celsius, words in (
+            (None, 'no measurement of feed_temperature yet'), (78.0, ''),
+            (math.nan, 'feed_temperature is nan'), (79.0, ''), (130.0, 'outside the range'),
+            (79.5, ''), (None, 'no measurement of feed_temperature for more than 5 s')):
+        for _ in range(8):
+            at += 1.0
+            if celsius is not None:
+                feed.publish(temperature(celsius, at))
+            bench.measure(STEADY, at)
+        bench.status(lambda status, words=words: words in status.message and (
+            status.level == (DiagnosticStatus.WARN if words else DiagnosticStatus.OK)))
+    status = bench.status()
+    assert value(status, 'active law') == 'learned law'
+    assert float(value(status, 'feed_temperature [degC]')) == pytest.approx(79.5)
+    reproduced(recorded)

@@ -37,6 +37,7 @@ from koopman_ros.panel.snapshot import (
     TRAINER,
     WARN,
 )
+from koopman_ros.panel.trend_chart import _charts
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.signal_topics import Signals
@@ -84,6 +85,9 @@ def test_a_measured_disturbance_has_a_faceplate_and_a_trend_without_a_set_point(
     own.take_model({'feed': (to_kelvin(66.0), to_kelvin(76.5))}, {})
     state, feed = own.snapshot(NOW + 2.0).states
     assert (state.name, feed.name, feed.controlled) == ('temperature', 'feed', False)
+    assert (state.disturbance, feed.disturbance) == (False, True)
+    assert [one.key for _, pens in _charts(own.snapshot(NOW + 2.0)) for one in pens
+            if one.signal == 'feed'] == ['feed']
     assert feed.measured == pytest.approx(77.0)
     assert feed.abnormal == 'above the trained range'
     times, values = own.trends.window(['feed'], 0.0, 10.0, 10)['feed']

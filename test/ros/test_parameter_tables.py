@@ -361,8 +361,7 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
     assert task['disturbances'] == ('feed_temperature',)
     assert task['input_gain'] == {'temperature': {
         'coolant_temperature': 0.1, 'feed_temperature': 0.2}}
-    wiring = SignalTopics(signals, settings.states, settings.inputs,
-                          disturbances=settings.disturbances)
+    wiring = SignalTopics.of(signals, settings)
     *_, feed = task_fields(SimpleNamespace(resolve_topic_name='/{}'.format), settings, wiring, ()
                            )['inputs']
     assert (feed['name'], feed['command']) == ('feed_temperature', None)

@@ -178,9 +178,11 @@ def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
     heard = MeasuredInputs(signals.disturbances)
     assert MeasuredInputs(()).with_ages(0) == (None, None)
     state = State()
-    for k, (kelvin, words) in enumerate((
-            (None, 'no measurement of feed_temperature yet: its nominal value 76.85 degC'),
-            (351.0, ''), (math.nan, 'the measured feed_temperature is nan, not finite')), 1):
+    for k, (kelvin, words, expected) in enumerate((
+            (None, 'no measurement of feed_temperature yet: its nominal value 76.85 degC', 76.85),
+            (351.0, '', 77.85),
+            (math.nan, 'the measured feed_temperature is nan, not finite', 77.85),
+            (365.0, '', 91.85)), 1):
         if kelvin is not None:
             heard.take(SignalSample(Time(sec=k), '', {'feed_temperature': kelvin}, True))
         state, _, report = own.step(state, model.states.center, k * NANOSECONDS, None, None,
@@ -198,6 +200,8 @@ def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
                 busy=False, answer_seconds=0.0, no_news=lambda _: None))
         found = statuses(now)
         assert found['measurements'].message.startswith(words or 'in order')
-        assert found['control'].level is (Severity.WARN if words else Severity.OK)
-        assert found['control'].values()['feed_temperature [degC]'] == pytest.approx(
-            76.85 if k == 1 else 77.85)
+        outside = 'feed_temperature is outside the trained range [66.883, 86.6989] degC'
+        assert (outside in found['model'].message) is (kelvin == 365.0)
+        assert found['control'].level is (
+            Severity.OK if kelvin == 351.0 else Severity.WARN)
+        assert found['control'].values()['feed_temperature [degC]'] == pytest.approx(expected)
