@@ -158,20 +158,19 @@ class Controller(ControlStep):
         Correct the estimate by a late value of a state, in its unit, at the time of its stamp.
 
         :return: as :meth:`request_setpoint`.
-        :raises ValueError: for a signal that is no state.
         """
-        history, states = state.history, self.model.states
-        index = states.names.index(signal)
-        newest_ns, oldest_ns = (history.instants[at].time_ns if history.instants else stamp_ns
-                                for at in (-1, 0))
-        found = None
-        if math.isfinite(value) and newest_ns - stamp_ns <= (
-                self.tuning.analysis_delay[index] * NANOSECONDS):
-            try:
+        instants, found = state.history.instants, None
+        newest_ns, oldest_ns = (
+            instants[at].time_ns if instants else stamp_ns for at in (-1, 0))
+        try:
+            # another model may not have the state
+            index = self.model.states.names.index(signal)
+            if math.isfinite(value) and newest_ns - stamp_ns <= (
+                    self.tuning.analysis_delay[index] * NANOSECONDS):
                 with np.errstate(all='ignore'):
                     found = self.estimation.corrected(state, index, value, stamp_ns)
-            except BaseException as error:
-                contained(error)
+        except BaseException as error:
+            contained(error)
         return (state, reason(
             StatusCode.ANALYSIS_REFUSED, signal=signal, age=(newest_ns - stamp_ns) / NANOSECONDS,
             reach=(newest_ns - oldest_ns) / NANOSECONDS)) if found is None else (found, None)

@@ -122,13 +122,14 @@ class Measurements:
         self.frame_id = received.frame_id[:LONGEST_FRAME_ID]
         self._frame_length = len(received.frame_id)
         late = self.assembler.late.total()
-        sampled = {name: value for name, value in received.values.items()
-                   if name not in self._heartbeats}
-        complete = self.assembler.take(received.stamp_ns, sampled) if sampled else None
+        sampled = received.values
         if self._heartbeats:
             now_ns = self._clock.now().nanoseconds
-            self._reported |= {name: (now_ns, value) for name, value in received.values.items()
+            self._reported |= {name: (now_ns, value) for name, value in sampled.items()
                                if name in self._heartbeats}
+            sampled = {name: value for name, value in sampled.items()
+                       if name not in self._heartbeats}
+        complete = self.assembler.take(received.stamp_ns, sampled) if sampled else None
         if not self._active:
             return
         source, at = self._sources.get(received.topic), self._timing.now()
@@ -137,26 +138,28 @@ class Measurements:
         if self.assembler.late.total() > late:
             self._timing.ignore(at)
         if complete is not None:
-            self._sampled(complete[0], dict(zip(
-                self.assembler.names, complete[1].tolist(), strict=True)))
+            self._sampled(*complete)
 
     def _on_sample_time(self) -> None:
         now_ns = self._clock.now().nanoseconds
         # simulated time may stand between two calls that are late
         if self._active and not 0 <= now_ns - self._ticked_ns < self._shortest_ns:
             self._ticked_ns = now_ns
-            self._sampled(now_ns, {})
+            self._sampled(now_ns, np.zeros(0))
 
-    def _sampled(self, stamp_ns: int, sampled: Mapping[str, float]) -> None:
-        """Hand over a measurement, unless a signal is missing."""
-        if self._heartbeats and self._silent(self._clock.now().nanoseconds):
-            return
-        values = {**sampled, **{name: value for name, (_, value) in self._reported.items()}}
-        quality = tuple(int(self._quality.get(name, 0)) for name in self._names)
-        self._wait.take(Sample(
-            stamp_ns, np.array([values[name] for name in self._names]), any(
-                one.conflict or (one.newest is None and self._endpoints.shared(topic))
-                for topic, one in self._sources.items()), quality if any(quality) else None))
+    def _sampled(self, stamp_ns: int, values: Array) -> None:
+        """Hand over a measurement, unless a signal that is reported on change is missing."""
+        if self._heartbeats:
+            if self._silent(self._clock.now().nanoseconds):
+                return
+            known = dict(zip(self.assembler.names, values.tolist(), strict=True)) | {
+                name: value for name, (_, value) in self._reported.items()}
+            values = np.array([known[name] for name in self._names])
+        quality = tuple(int(self._quality.get(name, 0)) for name in self._names) if (
+            any(self._quality.values())) else None
+        self._wait.take(Sample(stamp_ns, values, any(
+            one.conflict or (one.newest is None and self._endpoints.shared(topic))
+            for topic, one in self._sources.items()), quality))
 
     def _on_applied(self, received: SignalSample) -> None:
         self.applied.take(received)
