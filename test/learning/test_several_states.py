@@ -177,8 +177,9 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(short_bag, tmp_path
     """Tank 1 flows into tank 2, so that what it holds shows there."""
     monkeypatch.setattr(task_module, 'identify_unmeasured',
                         partial(identify_unmeasured, highest_degree=2))
-    found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1],
-                                 INPUTS, model_class='polynomial', unmeasured_states=1))
+    found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '',
+                                 STATES[:1], INPUTS, model_class='polynomial',
+                                 unmeasured_states=1))
     assert found.reasons == ()
     assert not any('hidden_1' in warning for warning in found.decision.warnings)
     model = load(found.model_file)
