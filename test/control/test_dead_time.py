@@ -58,7 +58,7 @@ def step(loop, plant, state, duration, *events):
 
 
 @pytest.mark.parametrize(('seconds', 'known'), [
-    (10.0, 9.0), (10.0, 11.0), (30.5, 27.0), (60.0, 54.0), (120.0, 108.0)])
+    (10.0, 11.0), (30.5, 27.0), (120.0, 108.0)])
 def test_a_late_coolant_brings_no_overshoot(seconds, known):
     run = step(*late_reactor(seconds, known), 150.0 + 2.0 * seconds)
     assert SETPOINT - run.states.min() < 0.3
