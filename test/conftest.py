@@ -4,6 +4,7 @@
 """What holds for all tests: their order, checked messages, threads, disturbed trainings."""
 
 from collections.abc import Iterator
+import gc
 import os
 import signal
 
@@ -39,6 +40,16 @@ LONGEST = ('test_unmeasured_states', 'test_benchmarks', 'test_studies', 'test_br
            'test_portions', 'test_managed', 'test_grey_box', 'test_backends', 'test_bumpless',
            'test_command_line', 'test_install_tree', 'test_parameter_ends', 'test_damage',
            'test_estimates', 'test_acceptance', 'test_package')
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Exclude all that the test modules hold from garbage collections: 0.3 s for each."""
+    gc.disable()
+    yield
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
