@@ -141,6 +141,17 @@ def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
     assert len(episode) == 119
 
 
+@pytest.mark.parametrize(('least', 'count'), [(0.024, 2), (0.026, 1)])
+def test_the_smallest_jump_is_in_the_unit_of_the_signal(
+        write: Callable[..., Path], least: float, count: int) -> None:
+    """Levels in m, whose messages are in mm, one of which changes by 25 mm."""
+    path = write([s for k in range(1, 121) for s in (
+        Sent('/tanks', k, {'low': 100.0 + 0.1 * k, 'high': 500.0 + 0.1 * k + 25.0 * (k > 70)}),
+        Sent('/pump_setpoint', None, 2.0, k))])
+    episodes, _ = records.loop_episodes([path], TANKS, [PUMP], least_jumps=[least] * 2)
+    assert len(episodes) == count
+
+
 def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path]) -> None:
     level = RecordedState('level', 'm', MessageField('/level', FLOAT, 'data', 'm'))
     # the stamps are simulated, ten times as fast as the recorder's clock
