@@ -14,6 +14,7 @@ from koopman_ros import records
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import RecordedInput, RecordedState
+from koopman_ros.records.applied_inputs import follows_command
 from support.bag_samples import FLOAT, JOINTS, noted, Sent, TEMPERATURE
 
 WARM = RecordedState('warm', 'K', MessageField('/warm', TEMPERATURE, 'temperature', 'degC'))
@@ -215,6 +216,12 @@ def test_input_that_follows_at_once_changes_with_its_command(
     assert episode.u[:, 0] == pytest.approx(np.array(values) + 273.15)
     # to the time, which no measurement tells
     assert episode.input_time.tolist() == [0.0, 4.5, 14.0]
+
+
+def test_input_that_is_measured_at_a_change_shows_it_before_or_after() -> None:
+    times, held = SECOND * np.arange(6), np.array([1.0, 2.0, 1.0, 3.0, 2.0, 5.0])
+    assert [follows_command(times, held, times[1:], measured) for measured in (
+        held[:-1], held[1:], held[1:] + 1.5)] == [True, True, False]
 
 
 def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callable[..., Path]
