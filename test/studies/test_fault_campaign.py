@@ -136,21 +136,6 @@ def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_p
     assert judge(found, replace(case, missing=()))['reasons'] != []
 
 
-def test_a_case_that_is_not_survived(tmp_path: Path) -> None:
-    """A process that dies, words that nobody reports, and a reactor that stays away."""
-    def play(loop: FaultHarness) -> None:
-        with loop.fault():
-            pass
-        loop.request(53.0)
-        loop.processes['controller'].process.kill()
-
-    result, _ = run(FaultCase('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
-                              says=('nobody says this',)), tmp_path)
-    found = '; '.join(result['reasons'])
-    for words in ('ended early, with code -9', 'not back', 'never said "nobody says this"'):
-        assert words in found
-
-
 def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
     found = run_endurance(tmp_path / 'soak', lambda: None, hours=0.03)
     assert found['reasons'] == []
