@@ -237,6 +237,15 @@ def test_nothing_moves_before_the_plant_rests_and_the_safe_input_is_back_with_th
     assert loop.run(1)[0].command == SAFE
 
 
+def test_where_laws_fail_the_safe_coolant_is_not_left():
+    """It is not the distance from the training data that keeps them off."""
+    loop = Reactor(controller(max_gain=1e-9), REACTOR, rest_of(REACTOR), coolant=SAFE, noise=0.02)
+    samples = loop.run(130)
+    assert levels(samples) == ['hold', 'safe']
+    assert 0.0 < samples[-1].report.measurement.outside < 0.5
+    assert {s.command for s in samples} == {SAFE}
+
+
 def test_a_hot_reactor_that_stands_still_keeps_the_safe_coolant():
     boundary = float(brentq(lambda T: REACTOR.derivative(np.array([T]), np.array([SAFE]))[0],
                             335.0, 380.0))
