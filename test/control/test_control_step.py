@@ -70,6 +70,16 @@ def test_a_start_elsewhere_holds_what_it_finds():
     np.testing.assert_allclose(command, [COOLANT], rtol=0, atol=1e-3)
 
 
+def test_the_input_of_a_law_is_remembered_within_the_range():
+    """A later law takes over from what was commanded, whatever this one would have liked."""
+    loop = plain(shipped('reactor_nz4'), InputLimits(
+        np.array([298.0]), np.array([UPPER]), np.array([np.inf])))
+    state, command, report = measured(loop, started(loop, (321.5,)), START, 1.0)
+    assert report.level == 'sdre'
+    assert report.command.at_range
+    np.testing.assert_array_equal([command, state.law_input], [[298.0]] * 2)
+
+
 def test_what_a_step_returns_and_takes_cannot_be_changed_afterwards():
     loop, asked = controller(), np.array([312.0])
     state = loop.request_setpoint(started(loop), asked)[0]

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import lsq_linear
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
+from koopman_ros.control.setpoint import advance, Setpoint
 from koopman_ros.control.steady_state import reachable_target
 from koopman_ros.core.status import StatusCode, StatusFormatter
 from koopman_ros.core.units import Displays
@@ -297,6 +298,13 @@ def test_schedules_are_kept_per_signal():
     assert tracked == [[0.8, 1.0], [0.8, 1.2], [0.8, 1.2], [0.8, 1.4], [0.8, 1.4], [0.8, 0.9],
                        [0.8, 0.9]]
     assert state.setpoint.scheduled == ()
+
+
+def test_a_request_that_is_due_for_one_signal_leaves_the_ramp_of_the_other():
+    asked = Setpoint(np.array([1.4, 1.0]), np.array([1.0, 1.0]), ((5, np.array([np.nan, 0.9])),))
+    found = advance(asked, np.ones(2), loop(THREE, 'h2', 'h3').controlled, np.full(2, 0.1), 5, 1.0)
+    assert found.requested.tolist() == [1.4, 0.9]
+    assert found.active == pytest.approx([1.1, 0.9])
 
 
 @pytest.mark.parametrize(('signals', 'value', 'message'), [

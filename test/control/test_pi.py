@@ -3,6 +3,8 @@
 
 """The PI law: its equation, limits without windup, hand-over, and a plant without a model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -94,6 +96,15 @@ def test_it_begins_where_another_law_ended():
     assert set(loop.levels) == {'pi'}
     assert loop.commands[0, 0] == pytest.approx(3.0, abs=1e-9)
     assert abs(loop.states[-1, 0]) < 0.3
+
+
+def test_it_takes_no_memory_of_another_law():
+    loop = run(controller(), seconds=20.0).loop
+    fresh, foreign = (
+        loop.controller.step(replace(loop.state, law='mine', law_memory=memory), np.array([4.0]),
+                             loop.state.time_ns + SECOND)[1]
+        for memory in (None, np.array([100.0])))
+    np.testing.assert_array_equal(foreign, fresh)
 
 
 def test_without_a_gain_the_next_level_acts_and_says_why():

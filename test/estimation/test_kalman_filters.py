@@ -99,6 +99,16 @@ def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
     assert predicted == pytest.approx(expected, abs=1e-4 * np.max(np.abs(expected)))
 
 
+def test_sigma_points_of_one_state_have_the_mean_and_covariance_of_a_linear_flow():
+    """Of so few, the one in the middle has a weight as well."""
+    model = linear([[-0.4]], [[0.7]])
+    start, u = Estimate(np.array([0.6]), np.array([0.3])), np.array([0.5])
+    expected, found = (kalman(kind, model, first(model, 1)).predict(start, u, 20.0)
+                       for kind in FILTERS)
+    assert found.x == pytest.approx(expected.x, rel=1e-9)
+    assert found.covariance == pytest.approx(expected.covariance, rel=1e-9)
+
+
 @pytest.mark.parametrize('kind', FILTERS)
 def test_the_covariance_follows_the_nonlinear_flow(kind):
     one = kalman(kind, TRUTH, TEMPERATURE, disturbance_noise=1e-4)

@@ -151,18 +151,6 @@ def test_the_seed_decides_what_is_chosen() -> None:
     assert starts[0] == starts[1] != starts[2]
 
 
-def test_memory_does_not_grow_with_the_record() -> None:
-    whole = long_rest()
-    found = Selection(*(survey(whole).lower, survey(whole).upper), 1, 1000)
-    rng = np.random.default_rng(0)
-    for first in range(0, len(whole), 5000):
-        found.offer(0, whole.part(first, first + 5000), rng)
-        # half of it is thrown away now and then
-        assert sum(len(one.episode) for one in found._held) <= 2000 + 5000
-    # a segment does not keep the episode that it was cut from
-    assert all(one.x.base is None and one.u.base is None for one in found.episodes())
-
-
 def test_short_parts_are_left_out() -> None:
     whole = survey(long_rest())
     found = Selection(whole.lower, whole.upper, 16, 4000)

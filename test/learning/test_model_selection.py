@@ -82,13 +82,6 @@ def test_a_polynomial_drift_is_found_and_taken(bent):
     np.testing.assert_array_equal(linear.model.A, Edmd(1).learn(BENT, training, box).A)
 
 
-def test_the_table_has_a_row_for_each(bent):
-    head, _, *rows = str(bent).splitlines()
-    assert '| rx, test | roll-out of level, m |' in head
-    assert [row.split(' | ')[0][2:] for row in rows] == ['linear', 'polynomial', *RECIPES]
-    assert [row.endswith('| chosen |') for row in rows] == [False, True, False, False]
-
-
 @pytest.mark.parametrize(('asked', 'words'), [
     ({'alone': True}, 'choose must be one of .*, got None'),
     ({'choose': 'lift'}, "choose must be one of linear, .*, identity lift, got 'lift'"),
@@ -96,14 +89,6 @@ def test_the_table_has_a_row_for_each(bent):
 def test_what_cannot_be_compared(asked, words):
     with pytest.raises(ValueError, match=words):
         compare(BENT, bent_samples(), RECIPES, **asked)
-
-
-def test_a_class_may_be_asked_for_and_learned_alone():
-    alone = compare(BENT, bent_samples(), RECIPES, choose='polynomial', alone=True, loops=0)
-    assert [one.name for one in alone.contenders] == ['polynomial']
-    asked = compare(BENT, bent_samples(), {'lift': SMALL}, starts=1, choose='lift', loops=0)
-    assert asked.chosen.name == 'lift'
-    assert len(asked.contenders) == 3
 
 
 def test_a_class_that_cannot_be_learned_has_its_reason():
@@ -114,18 +99,6 @@ def test_a_class_that_cannot_be_learned_has_its_reason():
     assert 'is too small for 1 states' in found.contenders[2].refusal
     with pytest.raises(TrainingFailed, match='a model: a: is none; b: is none'):
         plainest([contender(name, math.inf, 'is none') for name in ('a', 'b')])
-
-
-def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
-    samples = bent_samples()
-    linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    recipes = {'lift': IncrementalTraining(2, hidden_first=3, max_iterations=5)}
-    found = compare(BENT, linear, recipes, starts=1, loops=16)
-    assert found.chosen.name == 'linear'
-    assert 'does not predict the motion better' in found.contenders[2].refusal
-    assert found.contenders[2].model is None
-    with pytest.raises(TrainingFailed, match='does not predict the motion better'):
-        compare(BENT, linear, recipes, starts=1, choose='lift', loops=0)
 
 
 @pytest.mark.parametrize(('failing', 'chosen'), [

@@ -65,6 +65,11 @@ def bag(tmp_path_factory):
     return write_tanks(tmp_path_factory.mktemp('bags') / 'run.mcap')
 
 
+@pytest.fixture(scope='module')
+def short_bag(tmp_path_factory):
+    return write_tanks(tmp_path_factory.mktemp('bags') / 'short.mcap', 500.0)
+
+
 def present_model():
     """Return the linearisation of the tanks."""
     boxes = (Coordinates.spanning(TANKS.state_names, ('m', 'm'), *RANGE, TANKS.nominal_state),
@@ -168,12 +173,13 @@ def test_measured_input_tells_what_the_command_hides(lagging, measured):
         assert drift > 3.0
 
 
-def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monkeypatch):
+def test_a_level_that_is_in_no_bag_is_learned_with_the_other(short_bag, tmp_path, monkeypatch):
     """Tank 1 flows into tank 2, so that what it holds shows there."""
     monkeypatch.setattr(task_module, 'identify_unmeasured',
                         partial(identify_unmeasured, highest_degree=2))
-    found = retrain(TrainingTask((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1],
-                                 INPUTS, model_class='polynomial', unmeasured_states=1))
+    found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '',
+                                 STATES[:1], INPUTS, model_class='polynomial',
+                                 unmeasured_states=1))
     assert found.reasons == ()
     assert not any('hidden_1' in warning for warning in found.decision.warnings)
     model = load(found.model_file)
@@ -189,11 +195,10 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
 
 
 @pytest.fixture(scope='module')
-def by_equations(tmp_path_factory):
+def by_equations(short_bag, tmp_path_factory):
     """Return what the equations make of eight minutes of the lower level alone."""
     folder = tmp_path_factory.mktemp('physical_model')
-    task = TrainingTask((str(write_tanks(folder / 'run.mcap', 500.0)),),
-                        str(folder / 'new.safetensors'), '', STATES[:1], INPUTS,
+    task = TrainingTask((str(short_bag),), str(folder / 'new.safetensors'), '', STATES[:1], INPUTS,
                         model_class='polynomial', physical_model='two_tanks',
                         constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
     # as the process that retrains is given it

@@ -27,7 +27,7 @@ def arguments(folder: Path, bags: dict[str, list[str]], **everywhere: object) ->
 
 
 def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
-    bag = str(write_bag(tmp_path / 'run.mcap', linear_run(900)))
+    bag = str(write_bag(tmp_path / 'run.mcap', linear_run(400)))
     program = ros.start('trainer', arguments=arguments(
         tmp_path, {'a': [bag], 'lost': [str(tmp_path / 'none.mcap')], 'bare': ['']}))
     # one of them could not be trained

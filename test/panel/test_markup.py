@@ -3,11 +3,9 @@
 
 """No text from outside becomes props, a class, a style, markup or code of a page."""
 
-import ast
 import asyncio
 from collections.abc import Iterator
 from concurrent.futures import Future
-from pathlib import Path
 from typing import Any
 
 from nicegui import Client, ui
@@ -15,7 +13,6 @@ from nicegui.page import page
 import pytest
 import yaml
 
-from koopman_ros import panel
 from koopman_ros.panel.alarm_page import alarm_page
 from koopman_ros.panel.layout import attribute, PageLayout, Visitor
 from koopman_ros.panel.model_page import model_page
@@ -121,45 +118,3 @@ def test_exported_parameters_are_yaml_of_the_same_names_whatever_these_are() -> 
     found = {f'{name}\n  :': view for name, view in found.items() if isinstance(view.value, float)}
     read = yaml.safe_load(exported('controller', found))
     assert read == {'controller': {'ros__parameters': dict.fromkeys(found, 1.0)}}
-
-
-# Calls that make of a text more than a text; their arguments are written out in the program.
-_MAKERS = {'props', 'classes', 'style', 'html', 'markdown', 'run_javascript', 'add_head_html',
-           'add_body_html', 'add_css', 'element', 'box', 'tag', 'default_props',
-           'default_classes', 'default_style', 'notify', 'add_slot', 'run_method',
-           'on_js', 'sanitize', 'navigate'}
-#: what passes on an argument that is checked where these are called, or makes it of numbers
-_PASSED_ON = {
-    ('layout.py', 'ui.element(tag).classes(classes)'), ('layout.py', 'ui.element(tag)'),
-    ('layout.py', '_Label(tag, text).classes(classes)'),
-    ('layout.py', 'ui.add_css(CSS)'), ('layout.py', 'ui.add_head_html(WATCH)'),
-    ('layout.py', "element.classes(**{'remove' if shown else 'add': 'hidden'})"),
-    ('layout.py', "element.style(replace=style or 'display: none')"),
-    # the name of a priority
-    ('alarm_page.py', 'priority.classes(replace=word)'),
-}
-
-
-def literal(argument: ast.expr) -> bool:
-    if isinstance(argument, ast.IfExp):
-        return literal(argument.body) and literal(argument.orelse)
-    return isinstance(argument, ast.Constant)
-
-
-def test_props_classes_styles_and_markup_are_written_out_in_the_program() -> None:
-    found = set()
-    for path in Path(panel.__file__).parent.glob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not isinstance(node, ast.Call):
-                continue
-            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(
-                node.func, 'id', '')
-            given = [*node.args, *(keyword.value for keyword in node.keywords)]
-            if name in ('label', '_Label') and len(given) > 1:
-                # tag and classes; between them is the text
-                given = [*given[:1], *given[2:]]
-            elif name not in _MAKERS:
-                continue
-            if not all(map(literal, given)):
-                found.add((path.name, ast.unparse(node)))
-    assert found - {('layout.py', '_Label(tag, text)')} == _PASSED_ON

@@ -171,6 +171,9 @@ def test_noise_repeats_by_seed_and_sample() -> None:
     assert math.isclose(np.std(values), 0.1, rel_tol=0.05)
     assert abs(np.mean(values)) < 5 * 0.1 / math.sqrt(4000)
     assert sensor_noise(0.0, 7, 3) == 0.0
+    # that of another signal is its own
+    other = [sensor_noise(0.1, 7, n, 1) for n in range(1000)]
+    assert abs(np.corrcoef(values[:1000], other)[0, 1]) < 0.15
 
 
 @pytest.mark.parametrize(('value', 'resolution', 'shown'), [

@@ -118,4 +118,4 @@ def test_memory_does_not_grow_with_the_record(
             tracemalloc.stop()
 
     peak(1000)
-    assert peak(7500) < 1.1 * peak(2500)
+    assert peak(4500) < 1.1 * peak(1500)

@@ -14,6 +14,7 @@ from koopman_ros import records
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import RecordedInput, RecordedState
+from koopman_ros.records.applied_inputs import follows_command
 from support.bag_samples import FLOAT, JOINTS, noted, Sent, TEMPERATURE
 
 WARM = RecordedState('warm', 'K', MessageField('/warm', TEMPERATURE, 'temperature', 'degC'))
@@ -141,6 +142,17 @@ def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
     assert len(episode) == 119
 
 
+@pytest.mark.parametrize(('least', 'count'), [(0.024, 2), (0.026, 1)])
+def test_the_smallest_jump_is_in_the_unit_of_the_signal(
+        write: Callable[..., Path], least: float, count: int) -> None:
+    """Levels in m, whose messages are in mm, one of which changes by 25 mm."""
+    path = write([s for k in range(1, 121) for s in (
+        Sent('/tanks', k, {'low': 100.0 + 0.1 * k, 'high': 500.0 + 0.1 * k + 25.0 * (k > 70)}),
+        Sent('/pump_setpoint', None, 2.0, k))])
+    episodes, _ = records.loop_episodes([path], TANKS, [PUMP], least_jumps=[least] * 2)
+    assert len(episodes) == count
+
+
 def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path]) -> None:
     level = RecordedState('level', 'm', MessageField('/level', FLOAT, 'data', 'm'))
     # the stamps are simulated, ten times as fast as the recorder's clock
@@ -204,6 +216,12 @@ def test_input_that_follows_at_once_changes_with_its_command(
     assert episode.u[:, 0] == pytest.approx(np.array(values) + 273.15)
     # to the time, which no measurement tells
     assert episode.input_time.tolist() == [0.0, 4.5, 14.0]
+
+
+def test_input_that_is_measured_at_a_change_shows_it_before_or_after() -> None:
+    times, held = SECOND * np.arange(6), np.array([1.0, 2.0, 1.0, 3.0, 2.0, 5.0])
+    assert [follows_command(times, held, times[1:], measured) for measured in (
+        held[:-1], held[1:], held[1:] + 1.5)] == [True, True, False]
 
 
 def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callable[..., Path]

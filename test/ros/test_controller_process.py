@@ -149,24 +149,6 @@ def test_bursts_of_nonsense_hold_the_coolant_which_goes_on_smoothly(bench: Bench
     assert value(status, 'active law') == 'learned law'
 
 
-def test_runaway_beyond_the_trained_range_goes_down_the_levels_and_up(bench: Bench) -> None:
-    bench.status()
-    way = [*np.arange(STEADY, 67.0, 1.0), *np.arange(67.0, 51.0, -0.15)]
-    before = bench.commands[-1].temperature
-    for k, celsius in enumerate(way, 21):
-        command = bench.measure(float(celsius), float(k)).temperature
-        # 60 K/min
-        assert abs(command - before) <= 1.0 + 1e-9
-        before = command
-    bench.status()
-    statuses = [(value(s, 'active law'), s.level) for s in bench.ros.statuses
-                if s.name == STATUS]
-    laws = [law for law, _ in itertools.groupby(law for law, _ in statuses)]
-    assert laws == ['learned law', 'linear law', 'safe input', 'linear law', 'learned law']
-    assert {level for law, level in statuses if law == 'linear law'} == {DiagnosticStatus.WARN}
-    assert {level for law, level in statuses if law == 'safe input'} == {DiagnosticStatus.ERROR}
-
-
 def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros: Harness) -> None:
     bench = Bench(ros, first=0.0)
     assert seconds(bench.commands[0]) == 0.0

@@ -4,6 +4,7 @@
 """Parts of nodes: what goes with them; what a recorder and a plan write."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import math
 from pathlib import Path
 import threading
@@ -18,7 +19,7 @@ from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.control import Mode, State
+from koopman_ros.control import Controller, Mode, State, StepReport
 from koopman_ros.control.laws import Plan
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
@@ -150,24 +151,39 @@ def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_sta
         'at_limit_warmth [-1 lower, 1 upper]': -1.0}
 
 
+def measured(mode: Mode) -> tuple[Controller, State, StepReport]:
+    """Return a controller of the reactor after three measurements, its state and last report."""
+    model = load(model_path('reactor_nz4'))
+    own = built(table_of(model, {'system': 'reactor'}).snapshot({}), model)
+    state = own.set_mode(State(), mode)
+    for k in range(1, 4):
+        state, _, report = own.step(state, model.states.center, k * 10 ** 9)
+    return own, state, report
+
+
+def context(own: Controller, state: State, report: StepReport, silence: float = 0.0,
+            measurements: int = 3) -> Any:
+    """Return what statuses are made of."""
+    return SimpleNamespace(
+        report=report, state=state, controller=own, signals=signals_of(own.model),
+        reason='a reason', measured=own.model.states.center, setpoint_received=True,
+        parameters=SimpleNamespace(
+            max_measurement_age=5.0, measurement_timeout=0.0, tuning=own.tuning),
+        complaint='', unheard=(), unheard_for=0.0, request='', model_refused='', input='coolant',
+        counts=Counts(measurements=measurements), model=dict, assembler=SimpleNamespace(
+            awaited='', late={}, missing={}, duplicated={}),
+        timing=SimpleNamespace(silence=silence, wall_silence=0.0, paused=False,
+                               without_clock=False, age=math.nan, busy=False, answer_seconds=0.0,
+                               no_news=lambda _: None))
+
+
 @pytest.mark.parametrize(('silence', 'warned'), [(0.6, False), (1.4, False), (2.5, True)])
 def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
         silence: float, warned: bool) -> None:
-    model = load(model_path('reactor_nz4'))
-    own = built(table_of(model, {'system': 'reactor'}).snapshot({}), model)
-    state = own.set_mode(State(), Mode.MANUAL)
-    for k in range(1, 4):
-        state = own.step(state, model.states.center, k * 10 ** 9)[0]
-    state = own.request_manual_input(state, model.inputs.center + 1.0)[0]
+    own, state, _ = measured(Mode.MANUAL)
+    state = own.request_manual_input(state, own.model.inputs.center + 1.0)[0]
     state, _, report = own.hold(state, int((3.0 + silence) * 1e9), None)
-    now = SimpleNamespace(
-        report=report, state=state, controller=own, signals=SIGNALS, measured=model.states.center,
-        parameters=SimpleNamespace(max_measurement_age=5.0, measurement_timeout=0.0),
-        complaint='', unheard=(), unheard_for=0.0, request='', model_refused='', input='coolant',
-        counts=SimpleNamespace(measurements=3),
-        timing=SimpleNamespace(silence=silence, paused=False, without_clock=False, age=math.nan,
-                               no_news=lambda _: None))
-    found = statuses(now)['measurements']
+    found = statuses(context(own, state, report, silence))['measurements']
     assert (found.level is Severity.WARN) is warned
 
 
@@ -187,21 +203,27 @@ def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
             heard.take(SignalSample(Time(sec=k), '', {'feed_temperature': kelvin}, True))
         state, _, report = own.step(state, model.states.center, k * NANOSECONDS, None, None,
                                     *heard.with_ages(k * NANOSECONDS))
-        now = SimpleNamespace(
-            report=report, state=state, controller=own, signals=signals, complaint='', unheard=(),
-            parameters=SimpleNamespace(
-                max_measurement_age=5.0, measurement_timeout=0.0, tuning=own.tuning),
-            unheard_for=0.0, request='', model_refused='', input='coolant', model=dict, reason='',
-            measured=model.states.center, setpoint_received=True,
-            counts=Counts(measurements=k), assembler=SimpleNamespace(
-                awaited='', late={}, missing={}, duplicated={}),
-            timing=SimpleNamespace(
-                silence=0.0, wall_silence=0.0, paused=False, without_clock=False, age=0.0,
-                busy=False, answer_seconds=0.0, no_news=lambda _: None))
-        found = statuses(now)
+        found = statuses(context(own, state, report, measurements=k))
         assert found['measurements'].message.startswith(words or 'in order')
         outside = 'feed_temperature is outside the trained range [66.883, 86.6989] degC'
         assert (outside in found['model'].message) is (kelvin == 365.0)
         assert found['control'].level is (
             Severity.OK if kelvin == 351.0 else Severity.WARN)
         assert found['control'].values()['feed_temperature [degC]'] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(('depth', 'severity'), [
+    (0, Severity.OK), (1, Severity.WARN), (2, Severity.ERROR), (3, Severity.ERROR)])
+def test_another_law_is_a_warning_and_no_law_an_error(depth: int, severity: Severity) -> None:
+    own, state, report = measured(Mode.AUTOMATIC)
+    lower = replace(report, level=own.order.levels[depth], depth=depth)
+    assert statuses(context(own, state, lower))['control'].level is severity
+
+
+def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
+    own, state, report = measured(Mode.AUTOMATIC)
+    assert statuses(context(own, state, report))['model'].level is Severity.OK
+    found = statuses(context(own, state, replace(
+        report, estimate=replace(report.estimate, at_bound=True))))
+    assert (found['model'].level, found['control'].level) == (Severity.WARN,) * 2
+    assert 'at its bound' in found['model'].message

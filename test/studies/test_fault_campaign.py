@@ -9,19 +9,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from koopman_ros.core.status import StatusCode
 from koopman_ros.event_log.records import parse
-from studies.faults import interceptor
 from studies.faults.__main__ import main
 from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
 from studies.faults.cases import CASES, refused_values
 from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
-from studies.faults.interceptor import Packet
-from studies.faults.judge import judge, out_of_range, responses
+from studies.faults.judge import judge
 from studies.faults.plants import FaultPlant, QUADRUPLE_TANK, REACTOR, TWO_TANKS
 from studies.faults.processes import second_controller
 from studies.faults.report import write
@@ -82,17 +79,6 @@ def test_a_missed_bound_is_a_reason(found: LoopTrace, bounds: dict[str, Any], wo
     assert words in reasons(found, **bounds)
 
 
-def test_steps_count_from_the_applied_input_and_from_missed_measurements() -> None:
-    found = trace(coolant=lambda t: 20.0 if t < 100 else 25.0)
-    found.applied[100] = {'coolant_temperature': 24.8}
-    assert not reasons(found)
-    assert judge(found, CASE)['worst_step'] == 0.2
-    for missed, step, allowed in ((1, 2.0, True), (1, 2.1, False), (9, 3.1, False)):
-        found = trace(coolant=lambda t, step=step: 20.0 if t < 100 else 20.0 + step)
-        del found.commands[100 - missed:100]
-        assert bool(reasons(found)) is not allowed
-
-
 def test_commands_must_follow_from_the_records_which_give_the_reason() -> None:
     controller = Recorded()
     for k in range(5):
@@ -107,54 +93,6 @@ def test_commands_must_follow_from_the_records_which_give_the_reason() -> None:
     assert 'do not follow' in reasons(found)
     del found.records[3]
     assert 'are missing' in reasons(found)
-
-
-@pytest.mark.parametrize(('delivered', 'answers', 'expected'), [
-    ([1, 2, 2, 3], [1, 2, 2, 3], (4, 4, 0, 0, 0, 0)),
-    ([1, 2, 3], [1, 3], (3, 2, 1, 0, 0, 0)),
-    ([1, 2, 3], [1, 2, 2, 3], (3, 2, 0, 1, 0, 0)),
-    ([1, 2, 3], [1, 2, 3, 4], (3, 3, 0, 0, 1, 0)),
-    ([1, 2, 3], [2, 1, 3], (3, 3, 0, 0, 0, 1))])
-def test_responses_are_counted(
-        delivered: list[int], answers: list[int], expected: tuple[int, ...]) -> None:
-    assert tuple(responses(delivered, answers).values()) == expected
-
-
-VALUES = [5, 6, 7, 8]
-SENT = [Packet(k * 1_000_000_000, {'x': float(k)}) for k in VALUES]
-BOTH = Packet(7, {'x': 1.0, 'y': 2.0})
-
-
-@pytest.mark.parametrize(('alter', 'values'), [
-    (interceptor.frozen(), [5] * 4),
-    (interceptor.value(lambda seconds, shown: shown + 10.0 * seconds), [5, 16, 27, 38]),
-    (interceptor.lost(), []), (interceptor.lost(0.0), VALUES),
-    (interceptor.twice, [5, 5, 6, 6, 7, 7, 8, 8]), (interceptor.swapped(), [6, 5, 8, 7]),
-    (interceptor.delayed(2), [5, 6])])
-def test_alterations(alter: interceptor.Alteration, values: list[int]) -> None:
-    assert [packet.values['x'] for sent in SENT for packet in alter(sent)] == values
-
-
-@pytest.mark.parametrize(('alter', 'arriving'), [
-    # in one message where the stamp is the same
-    (interceptor.value(lambda *_: 5.0), [BOTH._replace(values={'x': 1.0, 'y': 5.0})]),
-    (interceptor.lost(), [Packet(7, {'x': 1.0})]),
-    (interceptor.twice, [BOTH, Packet(7, {'y': 2.0})]),
-    (interceptor.stamped(lambda stamp_ns: stamp_ns - 2),
-     [Packet(7, {'x': 1.0}), Packet(5, {'y': 2.0})])])
-def test_alterations_of_one_of_two_signals(
-        alter: interceptor.Alteration, arriving: list[Packet]) -> None:
-    assert interceptor.part(alter, 'y')(BOTH) == arriving
-
-
-def test_distances_and_steps_of_several_signals_are_the_largest() -> None:
-    """Of tanks whose levels 3 and 4 have no set-point."""
-    found = LoopTrace(QUADRUPLE_TANK, samples=[(float(t), (0.15, 0.11, t, t)) for t in range(3)],
-                      setpoints=[(0.0, (0.15, 0.1))],
-                      commands=[Command(0.0, (3.0, 3.0), 0), Command(1.0, (3.1, 10.5), 1)])
-    np.testing.assert_allclose(found.errors()[1], 0.01)
-    np.testing.assert_allclose(found.steps()[1], 7.5)
-    assert 'pump_2' in ''.join(out_of_range(found))
 
 
 def test_faults_of_messages_models_and_processes_are_survived(tmp_path: Path) -> None:
@@ -196,21 +134,6 @@ def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_p
     assert result['reasons'] == []
     # with the solver the law would have planned
     assert judge(found, replace(case, missing=()))['reasons'] != []
-
-
-def test_a_case_that_is_not_survived(tmp_path: Path) -> None:
-    """A process that dies, words that nobody reports, and a reactor that stays away."""
-    def play(loop: FaultHarness) -> None:
-        with loop.fault():
-            pass
-        loop.request(53.0)
-        loop.processes['controller'].process.kill()
-
-    result, _ = run(FaultCase('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
-                              says=('nobody says this',)), tmp_path)
-    found = '; '.join(result['reasons'])
-    for words in ('ended early, with code -9', 'not back', 'never said "nobody says this"'):
-        assert words in found
 
 
 def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:

@@ -320,6 +320,10 @@ def test_input_outside_a_narrowed_range_returns_at_its_rate():
     found = compute(law(OSCILLATOR[1], limits=limits(1.0, 2.0)), [0.0, 0.0], previous=3.0)
     assert found.failure is None
     assert found.u == pytest.approx([2.8])
+    # in the whole plan, also where it would help to stay outside
+    plan = compute(law(OSCILLATOR[1], limits=limits(1.0, 2.0)), [50.0, 0.0], previous=3.0).plan
+    reach = 3.0 - 2.0 * (plan.times[:len(plan.inputs)] + PERIOD)
+    assert plan.inputs[:12, 0] == pytest.approx(np.maximum(1.0, reach)[:12], abs=1e-6)
 
 
 @pytest.mark.parametrize('own', [

@@ -101,7 +101,11 @@ def test_a_known_input_matrix_is_kept():
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
 
-def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days():
+def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypatch):
+    # the first of all networks that is good enough
+    monkeypatch.setattr(unmeasured_states, '_UNITS', (8,))
+    monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
+
     # no polynomial has the corner of an outlet that opens at a level
     def outlet(x, u):
         y, w = x
@@ -117,15 +121,14 @@ def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days():
     assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
 
 
-@pytest.mark.parametrize('bounded', [True, False])
-def test_no_network_that_may_diverge_far_from_the_data_is_offered(bounded, monkeypatch):
-    monkeypatch.setattr(NetworkDrift, 'bounded', bounded)
+def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
+    monkeypatch.setattr(NetworkDrift, 'bounded', False)
     monkeypatch.setattr(unmeasured_states, '_UNITS', (1,))
     monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
     found = identify_unmeasured(PLANT, [record(
         lambda x, u: np.array([x[1] - 0.4 * x[0] - 2.0 * max(0.0, x[0] - 0.3), 1.5 * (u - x[1])]),
         samples=300, size=0.8)], 1, highest_degree=1)
-    assert any('network' in score.method for score in found.scores) is bounded
+    assert not any('network' in score.method for score in found.scores)
 
 
 def test_a_record_whose_simulations_all_diverge_is_refused():
