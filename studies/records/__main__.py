@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Run the study (needs the `learn` and `bench` requirements): table, figures, records, models."""
+
+from collections.abc import Sequence
+import contextlib
+from functools import partial
+from importlib.util import find_spec
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+import warnings
+
+import numpy as np
+import pandas as pd
+
+from koopman_ros import learn_files
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.plots import table
+from koopman_ros.learning import simulate
+from koopman_ros.model import load
+from koopman_ros.records import read
+from studies import report
+from studies.campaign import Campaign, conclude, Metrics, Models, read_options, run_campaign
+from studies.records.baselines import BASELINES, chosen, Data
+from studies.records.sets import RecordSet, SETS
+
+OWN = 'koopman_ros'
+_HELP = 'docs/results/records.md says where each public record is to be had'
+
+
+def learned(one: RecordSet, files: Sequence[Path], folder: Path, seed: int
+            ) -> tuple[Metrics, Models]:
+    """Learn by the command with its defaults; return the figures of the free run on the test."""
+    output = folder / f'seed_{seed}.safetensors'
+    *train, test = map(str, files)
+    with (output.with_suffix('.log').open('w') as log, contextlib.redirect_stdout(log),
+          contextlib.redirect_stderr(log)):
+        begin = time.process_time()
+        status = learn_files.main([
+            *train, '--states', *one.states, '--inputs', *one.inputs, '--test', test,
+            '--training_seed', str(seed), '--model_output', str(output)])
+        seconds = time.process_time() - begin
+    if status == 1:
+        raise ValueError(output.with_suffix('.log').read_text().splitlines()[-1])
+    summary = json.loads(output.with_suffix('.json').read_text())
+    if not summary['model_file']:
+        return {'accepted': False, 'seconds': seconds}, {}
+    run = simulate(load(summary['model_file']), read(test, one.states, one.inputs), one.init)
+    return {'accepted': status == 0, 'diverged': run.diverged, 'seconds': seconds,
+            'error': dict(zip(run.names, run.rmse.tolist(), strict=True)),
+            'fit': dict(zip(run.names, run.fit.tolist(), strict=True))}, {}
+
+
+def by_baseline(one: RecordSet, files: Sequence[Path], name: str, _: int
+                ) -> tuple[Metrics, Models]:
+    """Return the figures of another method; its sample is the longest of the records."""
+    frames = [pd.read_csv(file) for file in files]
+    periods = [float(np.median(np.diff(frame.iloc[:, 0]))) for frame in frames]
+    frames = [frame[::max(1, round(max(periods) / period))]
+              for frame, period in zip(frames, periods, strict=True)]
+    raw: list[Data] = [(frame[[*one.inputs]].to_numpy(), frame[[*one.states]].to_numpy())
+                       for frame in frames]
+    if one.above_first:
+        raw = [(u, y - y[0]) for u, y in raw]
+    together = [np.concatenate(parts) for parts in zip(*raw[:-1], strict=True)]
+    *records, (u, y) = [tuple((values - every.mean(axis=0)) / every.std(axis=0)
+                              for values, every in zip(data, together, strict=True))
+                        for data in raw]
+    begin = time.process_time()
+    run, options = chosen(BASELINES[name], records, one.init)
+    with warnings.catch_warnings(), np.errstate(all='ignore'):
+        warnings.simplefilter('ignore')
+        errors = (run(u, y[:one.init]) - y)[one.init:]
+    squares = np.nan_to_num(np.sum(errors ** 2, axis=0), nan=np.inf)
+    y = y[one.init:]
+    names = [state.partition(' ')[0] for state in one.states]
+
+    def of(values: Array) -> dict[str, float | bool | None]:
+        return dict(zip(names, values.tolist(), strict=True))
+
+    return {'diverged': not np.all(np.isfinite(squares)),
+            'seconds': time.process_time() - begin, 'options': {**options},
+            'error': of(together[1].std(axis=0) * np.sqrt(squares / len(y))),
+            'fit': of(100.0 * (1.0 - np.sqrt(squares / np.sum((y - y.mean(axis=0)) ** 2, axis=0)))),
+            }, {}
+
+
+def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, scheduler: str
+                ) -> Campaign:
+    """Write the records as files, and run every method on them."""
+    own, others = {}, {}
+    for name in names:
+        place, one = output / name, SETS[name]
+        place.mkdir(parents=True, exist_ok=True)
+        train, test = one.frames(folder)
+        files = [*(place / f'train_{k}.csv' for k in range(1, 1 + len(train))), place / 'test.csv']
+        for file, frame in zip(files, [*train, test], strict=True):
+            frame.to_csv(file, index=False)
+        own[f'{name}/{OWN}'] = partial(learned, one, files, place)
+        others |= {f'{name}/{method}': partial(by_baseline, one, files, method)
+                   for method, baseline in BASELINES.items() if find_spec(baseline.package)}
+    campaign = run_campaign(1, others, scheduler)
+    campaign.add(run_campaign(seeds, own, scheduler))
+    return campaign
+
+
+def table_of(summary: dict[str, Any]) -> str:
+    """Return the table: error and fit of each method by state, ours as median and worst seed."""
+    rows = []
+    for name, one in SETS.items():
+        for state in one.states if name in summary else ():
+            label, _, unit = state.partition(' ')
+            cells = []
+            for method in (OWN, *BASELINES):
+                found = summary[name].get(method, {})
+                errors, fits = (found.get(figure, {}).get(label) for figure in ('error', 'fit'))
+                if errors is None:
+                    cells.append('')
+                    continue
+                best, worst = (
+                    f'{by(report.present(errors)):.3g}; {also(report.present(fits)):.1f} %'
+                    if report.present(errors) else 'diverges'
+                    for by, also in ((report.statistics.median, report.statistics.median),
+                                     (max, min)))
+                lost = len(errors) - len(report.present(errors))
+                cells.append(best + (f' ({worst})' if len(errors) > 1 else '')
+                             + (f', {lost} diverge' if lost and report.present(errors) else ''))
+            rows.append((f'{name}: {label} {unit}', *cells,
+                         report.share(summary[name].get(OWN, {}).get('accepted')), one.published))
+    return table(('error; fit of the free run', f'{OWN}, median (worst seed)', *BASELINES,
+                  'accepted', 'published'), rows)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the sets that are there."""
+    options = read_options(
+        args, 'records', 'Learn models of measured records with default settings, beside other '
+        'methods.', 'out/studies-records', 3, 'joblib', SETS, records='../shared/records')
+    if not options.records.is_dir():
+        print(f'there is no folder {options.records}: give it by RECORDS=folder; {_HELP}. '
+              'Simulated records only.', file=sys.stderr)
+    names = []
+    for name in options.plants or SETS:
+        missing = [file for file in SETS[name].files if not (options.records / file).is_file()]
+        if not missing:
+            names.append(name)
+        elif options.records.is_dir():
+            print(f'{name} is left out, without {", ".join(missing)}: {_HELP}', file=sys.stderr)
+
+    def written(_: Campaign, summary: dict[str, Any]) -> str:
+        text = table_of(summary)
+        print(text)
+        report.write(options.output, 'Measured records', [
+            report.opening(summary), text, 'Options of the other methods are those with the best '
+            'free run on held-out data; `summary.json` has them.'],
+            packages=(*report.PACKAGES, 'nfoursid', 'sysidentpy', 'pykoop'))
+        return 'models and records'
+
+    return conclude(options.seeds, options.output, lambda: campaign_of(
+        names, options.records, options.output, options.seeds, options.scheduler), written)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

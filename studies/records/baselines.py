@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Other methods: ARX, N4SID, polynomial NARX and EDMDc.
+
+Each takes records (u, y) of (N, n_u) and (N, n_y), of zero mean and unit spread, and returns a
+free run from inputs (N, n_u) and first outputs (init, n_y) to outputs (N, n_y). Its options are
+those with the best free run on the last third of each record; then it learns from everything.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TypeAlias
+import warnings
+
+import numpy as np
+import pandas as pd
+
+from koopman_ros.core.arrays import Array
+
+Data: TypeAlias = tuple[Array, Array]
+FreeRun: TypeAlias = Callable[[Array, Array], Array]
+
+
+def arx(records: Sequence[Data], order: int, delay: int) -> FreeRun:
+    """Fit y from `order` past outputs, and as many inputs from `delay` samples on."""
+    first = order + delay
+
+    def row(u: Array, y: Array, t: int) -> Array:
+        return np.concatenate([[1.0], y[t - order:t].ravel(),
+                               u[t - delay - order + 1:t - delay + 1].ravel()])
+
+    rows = np.array([row(u, y, t) for u, y in records for t in range(first, len(y))])
+    found = np.linalg.lstsq(rows, np.concatenate([y[first:] for _, y in records]), rcond=None)[0]
+
+    def run(u: Array, begin: Array) -> Array:
+        y = np.vstack([begin, np.empty((len(u) - len(begin), begin.shape[1]))])
+        for t in range(len(begin), len(u)):
+            y[t] = row(u, y, t) @ found
+        return y
+
+    return run
+
+
+def n4sid(records: Sequence[Data], order: int) -> FreeRun:
+    """Identify a state space of an order by NFourSID."""
+    from nfoursid.nfoursid import NFourSID
+    u, y = (np.concatenate(parts) for parts in zip(*records, strict=True))
+    n_u, n_y = u.shape[1], y.shape[1]
+    program = NFourSID(pd.DataFrame(np.hstack([u, y]), columns=range(n_u + n_y)),
+                       [*range(n_u, n_u + n_y)], [*range(n_u)], num_block_rows=2 * order)
+    program.subspace_identification()
+    found = program.system_identification(order)[0]
+
+    def outputs(u: Array, x: Array) -> Array:
+        y = np.empty((len(u), n_y))
+        for t, now in enumerate(u):
+            y[t] = found.c @ x + found.d @ now
+            x = found.a @ x + found.b @ now
+        return y
+
+    def run(u: Array, begin: Array) -> Array:
+        size, rest = len(begin), np.zeros(order)
+        # the state at the start by least squares
+        responses = [outputs(0.0 * u[:size], unit).ravel() for unit in np.eye(order)]
+        x = np.linalg.lstsq(np.transpose(responses), (
+            begin - outputs(u[:size], rest)).ravel(), rcond=None)[0]
+        return outputs(u, x)
+
+    return run
+
+
+def narx(records: Sequence[Data], order: int, degree: int) -> FreeRun:
+    """Choose terms of a polynomial of past samples for each output, by SysIdentPy's FROLS."""
+    from sysidentpy.basis_function import Polynomial
+    from sysidentpy.model_structure_selection import FROLS
+    from sysidentpy.parameter_estimation import LeastSquares
+    u, y = (np.concatenate(parts) for parts in zip(*records, strict=True))
+    lags = [*range(1, order + 1)]
+    programs = [FROLS(
+        order_selection=True, n_info_values=15, info_criteria='bic', ylag=lags,
+        xlag=[lags] * u.shape[1] if u.shape[1] > 1 else lags, estimator=LeastSquares(),
+        basis_function=Polynomial(degree=degree)) for _ in range(y.shape[1])]
+    for program, output in zip(programs, y.T, strict=True):
+        program.fit(X=u, y=output[:, None])
+
+    def run(u: Array, begin: Array) -> Array:
+        early = len(begin) - order
+        return np.vstack([begin, np.column_stack([
+            program.predict(X=u[early:], y=output[early:, None])[order:, 0]
+            for program, output in zip(programs, begin.T, strict=True)])])
+
+    return run
+
+
+def edmdc(records: Sequence[Data], delays: int, degree: int) -> FreeRun:
+    """Fit pykoop's EDMD with inputs on monomials of delayed samples."""
+    import pykoop
+    n_u, n_y = records[0][0].shape[1], records[0][1].shape[1]
+    program = pykoop.KoopmanPipeline([
+        ('delays', pykoop.DelayLiftingFn(n_delays_state=delays, n_delays_input=delays)),
+        ('monomials', pykoop.PolynomialLiftingFn(order=degree))], pykoop.Edmd(alpha=1e-6))
+    program.fit(np.vstack([np.hstack([np.full((len(y), 1), k), y, u])
+                           for k, (u, y) in enumerate(records)]), n_inputs=n_u,
+                episode_feature=True)
+
+    def run(u: Array, begin: Array) -> Array:
+        early = len(begin) - program.min_samples_
+        return np.vstack([begin[:early], program.predict_trajectory(
+            begin[early:], u[early:], episode_feature=False)[:, :n_y]])
+
+    return run
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A method, the package that it needs, and the values of its options that are tried."""
+
+    fit: Callable[..., FreeRun]
+    package: str
+    options: Mapping[str, Sequence[int]]
+
+
+BASELINES = {
+    'ARX': Baseline(arx, 'numpy', {'order': range(1, 9), 'delay': range(5)}),
+    'N4SID': Baseline(n4sid, 'nfoursid', {'order': range(1, 11)}),
+    'NARX': Baseline(narx, 'sysidentpy', {'order': (1, 2, 3, 4), 'degree': (2, 3)}),
+    'EDMDc': Baseline(edmdc, 'pykoop', {'delays': (0, 1, 2, 4, 8), 'degree': (1, 2)})}
+
+
+def chosen(baseline: Baseline, records: Sequence[Data], init: int
+           ) -> tuple[FreeRun, dict[str, int]]:
+    """Return a free run by the best options, and these."""
+    parts = [[(u[:cut], y[:cut]), (u[cut:], y[cut:])] for u, y in records
+             for cut in (2 * len(y) // 3,)]
+    errors: dict[tuple[int, ...], float] = {}
+    with warnings.catch_warnings(), np.errstate(all='ignore'):
+        warnings.simplefilter('ignore')
+        for values in product(*baseline.options.values()):
+            try:
+                run = baseline.fit([early for early, _ in parts], *values)
+                errors[values] = sum(float(np.sum((run(u, y[:init]) - y)[init:] ** 2))
+                                     for _, (u, y) in parts)
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+                errors[values] = np.inf  # too few samples for so many terms, or a divergence
+        best = min(errors, key=lambda values: np.nan_to_num(errors[values], nan=np.inf))
+        return baseline.fit(records, *best), dict(zip(baseline.options, best, strict=True))
