@@ -71,12 +71,11 @@ def by_baseline(one: RecordSet, files: Sequence[Path], name: str, _: int
                               for values, every in zip(data, together, strict=True))
                         for data in raw]
     begin = time.process_time()
-    run, options = chosen(BASELINES[name], records, one.init)
     with warnings.catch_warnings(), np.errstate(all='ignore'):
         warnings.simplefilter('ignore')
+        run, options = chosen(BASELINES[name], records, one.init)
         errors = (run(u, y[:one.init]) - y)[one.init:]
-    squares = np.nan_to_num(np.sum(errors ** 2, axis=0), nan=np.inf)
-    y = y[one.init:]
+    squares = np.nan_to_num(np.mean(errors ** 2, axis=0), nan=np.inf)
     names = [state.partition(' ')[0] for state in one.states]
 
     def of(values: Array) -> dict[str, float | bool | None]:
@@ -84,9 +83,8 @@ def by_baseline(one: RecordSet, files: Sequence[Path], name: str, _: int
 
     return {'diverged': not np.all(np.isfinite(squares)),
             'seconds': time.process_time() - begin, 'options': {**options},
-            'error': of(together[1].std(axis=0) * np.sqrt(squares / len(y))),
-            'fit': of(100.0 * (1.0 - np.sqrt(squares / np.sum((y - y.mean(axis=0)) ** 2, axis=0)))),
-            }, {}
+            'error': of(together[1].std(axis=0) * np.sqrt(squares)),
+            'fit': of(100.0 * (1.0 - np.sqrt(squares) / y[one.init:].std(axis=0)))}, {}
 
 
 def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, scheduler: str

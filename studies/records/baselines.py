@@ -5,15 +5,15 @@
 Other methods: ARX, N4SID, polynomial NARX and EDMDc.
 
 Each takes records (u, y) of (N, n_u) and (N, n_y), of zero mean and unit spread, and returns a
-free run from inputs (N, n_u) and first outputs (init, n_y) to outputs (N, n_y). Its options are
-those with the best free run on the last third of each record; then it learns from everything.
+free run from inputs (N, n_u) and first outputs (init, n_y) to outputs (N, n_y). Its options, with
+a dead time of the inputs, are those with the best free run on held-out data: each record in turn,
+or the last third of the only one. Then it learns from everything.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TypeAlias
-import warnings
 
 import numpy as np
 import pandas as pd
@@ -24,16 +24,13 @@ Data: TypeAlias = tuple[Array, Array]
 FreeRun: TypeAlias = Callable[[Array, Array], Array]
 
 
-def arx(records: Sequence[Data], order: int, delay: int) -> FreeRun:
-    """Fit y from `order` past outputs, and as many inputs from `delay` samples on."""
-    first = order + delay
-
+def arx(records: Sequence[Data], order: int) -> FreeRun:
+    """Fit each output from past outputs and inputs, as many as `order`, by least squares."""
     def row(u: Array, y: Array, t: int) -> Array:
-        return np.concatenate([[1.0], y[t - order:t].ravel(),
-                               u[t - delay - order + 1:t - delay + 1].ravel()])
+        return np.concatenate([[1.0], y[t - order:t].ravel(), u[t - order:t].ravel()])
 
-    rows = np.array([row(u, y, t) for u, y in records for t in range(first, len(y))])
-    found = np.linalg.lstsq(rows, np.concatenate([y[first:] for _, y in records]), rcond=None)[0]
+    rows = np.array([row(u, y, t) for u, y in records for t in range(order, len(y))])
+    found = np.linalg.lstsq(rows, np.concatenate([y[order:] for _, y in records]), rcond=None)[0]
 
     def run(u: Array, begin: Array) -> Array:
         y = np.vstack([begin, np.empty((len(u) - len(begin), begin.shape[1]))])
@@ -95,13 +92,13 @@ def narx(records: Sequence[Data], order: int, degree: int) -> FreeRun:
     return run
 
 
-def edmdc(records: Sequence[Data], delays: int, degree: int) -> FreeRun:
+def edmdc(records: Sequence[Data], delays: int, degree: int, ridge: int) -> FreeRun:
     """Fit pykoop's EDMD with inputs on monomials of delayed samples."""
     import pykoop
     n_u, n_y = records[0][0].shape[1], records[0][1].shape[1]
     program = pykoop.KoopmanPipeline([
         ('delays', pykoop.DelayLiftingFn(n_delays_state=delays, n_delays_input=delays)),
-        ('monomials', pykoop.PolynomialLiftingFn(order=degree))], pykoop.Edmd(alpha=1e-6))
+        ('monomials', pykoop.PolynomialLiftingFn(order=degree))], pykoop.Edmd(alpha=10.0 ** ridge))
     program.fit(np.vstack([np.hstack([np.full((len(y), 1), k), y, u])
                            for k, (u, y) in enumerate(records)]), n_inputs=n_u,
                 episode_feature=True)
@@ -123,27 +120,40 @@ class Baseline:
     options: Mapping[str, Sequence[int]]
 
 
+_DELAYS = (-1, 0, 1, 2)  # samples; -1 lets the input of a sample act on its output
 BASELINES = {
-    'ARX': Baseline(arx, 'numpy', {'order': range(1, 9), 'delay': range(5)}),
+    'ARX': Baseline(arx, 'numpy', {'order': range(1, 11)}),
     'N4SID': Baseline(n4sid, 'nfoursid', {'order': range(1, 11)}),
     'NARX': Baseline(narx, 'sysidentpy', {'order': (1, 2, 3, 4), 'degree': (2, 3)}),
-    'EDMDc': Baseline(edmdc, 'pykoop', {'delays': (0, 1, 2, 4, 8), 'degree': (1, 2)})}
+    'EDMDc': Baseline(edmdc, 'pykoop', {
+        'delays': (0, 2, 5), 'degree': (1, 2), 'ridge': (-6, -2)})}
 
 
 def chosen(baseline: Baseline, records: Sequence[Data], init: int
            ) -> tuple[FreeRun, dict[str, int]]:
     """Return a free run by the best options, and these."""
-    parts = [[(u[:cut], y[:cut]), (u[cut:], y[cut:])] for u, y in records
-             for cut in (2 * len(y) // 3,)]
+    parts = [(records[:k] + records[k + 1:], records[k]) for k in range(len(records))]
+    if len(records) == 1:
+        (u, y), cut = records[0], 2 * len(records[0][1]) // 3
+        parts = [([(u[:cut], y[:cut])], (u[cut:], y[cut:]))]
     errors: dict[tuple[int, ...], float] = {}
-    with warnings.catch_warnings(), np.errstate(all='ignore'):
-        warnings.simplefilter('ignore')
-        for values in product(*baseline.options.values()):
-            try:
-                run = baseline.fit([early for early, _ in parts], *values)
-                errors[values] = sum(float(np.sum((run(u, y[:init]) - y)[init:] ** 2))
-                                     for _, (u, y) in parts)
-            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-                errors[values] = np.inf  # too few samples for so many terms, or a divergence
-        best = min(errors, key=lambda values: np.nan_to_num(errors[values], nan=np.inf))
-        return baseline.fit(records, *best), dict(zip(baseline.options, best, strict=True))
+    for values in product(_DELAYS, *baseline.options.values()):
+        try:
+            errors[values] = sum(
+                float(np.sum((_fitted(baseline, some, values)(u, y[:init]) - y)[init:] ** 2))
+                for some, (u, y) in parts)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            errors[values] = np.inf  # too few samples for so many terms, or a divergence
+    best = min(errors, key=lambda values: np.nan_to_num(errors[values], nan=np.inf))
+    return _fitted(baseline, records, best), dict(
+        zip(('delay', *baseline.options), best, strict=True))
+
+
+def _fitted(baseline: Baseline, records: Sequence[Data], values: Sequence[int]) -> FreeRun:
+    delay, *options = values
+
+    def late(u: Array) -> Array:
+        return u[np.clip(np.arange(len(u)) - delay, 0, len(u) - 1)]
+
+    run = baseline.fit([(late(u), y) for u, y in records], *options)
+    return lambda u, begin: run(late(u), begin)
