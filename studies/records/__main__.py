@@ -24,7 +24,15 @@ from koopman_ros.learning import simulate
 from koopman_ros.model import load
 from koopman_ros.records import read
 from studies import report
-from studies.campaign import Campaign, conclude, Metrics, Models, read_options, run_campaign
+from studies.campaign import (
+    Campaign,
+    conclude,
+    Experiment,
+    Metrics,
+    Models,
+    read_options,
+    run_campaign,
+)
 from studies.records.baselines import BASELINES, chosen, Data
 from studies.records.sets import RecordSet, SETS
 
@@ -90,7 +98,8 @@ def by_baseline(one: RecordSet, files: Sequence[Path], name: str, _: int
 def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, scheduler: str
                 ) -> Campaign:
     """Write the records as files, and run every method on them."""
-    own, others = {}, {}
+    own: dict[str, Experiment] = {}
+    others: dict[str, Experiment] = {}
     for name in names:
         place, one = output / name, SETS[name]
         place.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import lstsq
 
 from koopman_ros.core.arrays import Array
 
@@ -30,7 +31,7 @@ def arx(records: Sequence[Data], order: int) -> FreeRun:
         return np.concatenate([[1.0], y[t - order:t].ravel(), u[t - order:t].ravel()])
 
     rows = np.array([row(u, y, t) for u, y in records for t in range(order, len(y))])
-    found = np.linalg.lstsq(rows, np.concatenate([y[order:] for _, y in records]), rcond=None)[0]
+    found = lstsq(rows, np.concatenate([y[order:] for _, y in records]))[0]
 
     def run(u: Array, begin: Array) -> Array:
         y = np.vstack([begin, np.empty((len(u) - len(begin), begin.shape[1]))])
@@ -61,9 +62,8 @@ def n4sid(records: Sequence[Data], order: int) -> FreeRun:
     def run(u: Array, begin: Array) -> Array:
         size, rest = len(begin), np.zeros(order)
         # the state at the start by least squares
-        responses = [outputs(0.0 * u[:size], unit).ravel() for unit in np.eye(order)]
-        x = np.linalg.lstsq(np.transpose(responses), (
-            begin - outputs(u[:size], rest)).ravel(), rcond=None)[0]
+        responses = [outputs(0.0 * u[:size], unit).ravel() for unit in np.identity(order)]
+        x = lstsq(np.transpose(responses), (begin - outputs(u[:size], rest)).ravel())[0]
         return outputs(u, x)
 
     return run
@@ -129,7 +129,7 @@ BASELINES = {
         'delays': (0, 2, 5), 'degree': (1, 2), 'ridge': (-6, -2)})}
 
 
-def chosen(baseline: Baseline, records: Sequence[Data], init: int
+def chosen(baseline: Baseline, records: list[Data], init: int
            ) -> tuple[FreeRun, dict[str, int]]:
     """Return a free run by the best options, and these."""
     parts = [(records[:k] + records[k + 1:], records[k]) for k in range(len(records))]
