@@ -23,6 +23,7 @@ import pytest
 import rclpy
 import yaml
 
+from koopman_ros import learn_files
 from koopman_ros.control.laws import Plan
 from koopman_ros.core.message_fields import KNOWN_TYPES, place
 from koopman_ros.model import load
@@ -32,6 +33,7 @@ from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
+from studies.records.table import table_of as records_table
 from support.nodes import type_support
 
 __all__ = ['type_support']
@@ -74,11 +76,12 @@ def test_commands_are_right_as_they_stand(page: Path, tmp_path: Path) -> None:
     ('ros2 topic echo /temprature', 'temprature'),
     ("ros2 service call /trainer/record std_srvs/srv/Trigger '{data: true}'", 'record'),
     ('ros2 launch koopman_ros loop.launch.py sistem:=two_tanks', 'sistem'),
+    ('.venv/bin/python -m koopman_ros.learn day.csv --order 2', '2'),
     ('.venv/bin/python examples/none.py', 'none.py'), ('python -m koopman_ros.none', 'none'),
     ('rso2 topic list', 'rso2')])
 def test_wrong_commands_are_found(text: str, words: str, tmp_path: Path) -> None:
     (tmp_path / 'page.md').write_text(f'```sh\n{text}\n```\n')
-    with pytest.raises(Exception, match=words):
+    with pytest.raises((Exception, SystemExit), match=words):
         _check_commands(tmp_path / 'page.md', tmp_path)
 
 
@@ -101,11 +104,12 @@ def test_model_of_signals_alone_is_saved_as_the_page_has_it(
 
 @pytest.mark.parametrize('page', sorted(ROOT.glob('docs/results/*.md')),
                          ids=lambda page: page.stem)
-def test_tables_of_results_name_their_command(page: Path) -> None:
+def test_tables_of_results_name_their_command_and_summary(page: Path) -> None:
     head, *sections = re.split('^## ', page.read_text(), flags=re.MULTILINE)
-    for section in sections:
-        if '\n|' in section:
-            assert re.search(r'`make [a-z]|[Mm]easured once', head + section), section
+    for section in ('', *sections):
+        if '\n|' in (section or head):
+            assert re.search(r'`make [a-z]', head + section), section
+            assert re.search(r'\[`\w+\.json`\]\(\w+\.json\)', head + section), section
 
 
 STEP = 'set-point −10 K'
@@ -187,6 +191,11 @@ def test_table_of_noisy_data_has_the_figures_of_its_summary() -> None:
         values = found[part][figure]
         for cell, value in zip(row[1:], (np.median(values), max(values)), strict=True):
             _agrees(cell.removesuffix(' K'), float(value))
+
+
+def test_table_of_measured_records_is_that_of_its_summary() -> None:
+    summary = json.loads((ROOT / 'docs/results/records.json').read_text())
+    assert records_table(summary) in (ROOT / 'docs/results/records.md').read_text()
 
 
 @each_page
@@ -396,6 +405,8 @@ def _check_command(command: list[str], folder: Path) -> None:
                 assert f"'{argument.partition(':=')[0]}'" in text, argument
         case ['ros2', 'run', 'plotjuggler', 'plotjuggler', '-l', path]:
             assert Path(path).is_file()
+        case ['python', '-m', 'koopman_ros.learn', *arguments]:
+            learn_files.command_parser().parse_args(arguments)
         case ['python' | 'python3', '-m', module, *_]:
             assert find_spec(module), module
         case ['python', '-c', code]:

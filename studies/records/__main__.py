@@ -19,7 +19,6 @@ import pandas as pd
 
 from koopman_ros import learn_files
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.plots import table
 from koopman_ros.learning import simulate
 from koopman_ros.model import load
 from koopman_ros.records import read
@@ -35,8 +34,8 @@ from studies.campaign import (
 )
 from studies.records.baselines import BASELINES, chosen, Data
 from studies.records.sets import RecordSet, SETS
+from studies.records.table import OWN, table_of
 
-OWN = 'koopman_ros'
 _HELP = 'docs/results/records.md says where each public record is to be had'
 
 
@@ -113,33 +112,6 @@ def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, sc
     campaign = run_campaign(1, others, scheduler)
     campaign.add(run_campaign(seeds, own, scheduler))
     return campaign
-
-
-def table_of(summary: dict[str, Any]) -> str:
-    """Return the table: error and fit of each method by state, ours as median and worst seed."""
-    rows = []
-    for name, one in SETS.items():
-        for state in one.states if name in summary else ():
-            label, _, unit = state.partition(' ')
-            cells = []
-            for method in (OWN, *BASELINES):
-                found = summary[name].get(method, {})
-                errors, fits = (found.get(figure, {}).get(label) for figure in ('error', 'fit'))
-                if errors is None:
-                    cells.append('')
-                    continue
-                best, worst = (
-                    f'{by(report.present(errors)):.3g}; {also(report.present(fits)):.1f} %'
-                    if report.present(errors) else 'diverges'
-                    for by, also in ((report.statistics.median, report.statistics.median),
-                                     (max, min)))
-                lost = len(errors) - len(report.present(errors))
-                cells.append(best + (f' ({worst})' if len(errors) > 1 else '')
-                             + (f', {lost} diverge' if lost and report.present(errors) else ''))
-            rows.append((f'{name}: {label} {unit}', *cells,
-                         report.share(summary[name].get(OWN, {}).get('accepted')), one.published))
-    return table(('error; fit of the free run', f'{OWN}, median (worst seed)', *BASELINES,
-                  'accepted', 'published'), rows)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from koopman_ros import learn_files
-from studies.records import __main__ as study
+from studies.records import __main__ as study, table
 from studies.records.baselines import BASELINES, chosen
 from studies.records.sets import Frames, RecordSet, SETS
 from support.quick_retraining import quick_retraining
@@ -58,11 +58,12 @@ def frames(_: Path) -> Frames:
 def test_sets_at_hand_are_run_and_stand_in_the_table(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
         ) -> None:
-    monkeypatch.setattr(study, 'SETS', {
-        'tanks': RecordSet(('level [m]',), ('pump [V]',), frames),
-        'hair_dryer': SETS['hair_dryer']})
-    monkeypatch.setattr(study, 'BASELINES', {
-        'ARX': replace(BASELINES['ARX'], options={'order': (1, 2)})})
+    arx = replace(BASELINES['ARX'], options={'order': (1, 2)})
+    for module in (study, table):
+        monkeypatch.setattr(module, 'SETS', {
+            'tanks': RecordSet(('level [m]',), ('pump [V]',), frames),
+            'hair_dryer': SETS['hair_dryer']})
+        monkeypatch.setattr(module, 'BASELINES', {'ARX': arx})
     program = learn_files.main
     monkeypatch.setattr(learn_files, 'main', lambda words: program(
         [*words, '--model_class', 'linear']))
@@ -74,13 +75,14 @@ def test_sets_at_hand_are_run_and_stand_in_the_table(
     found = json.loads((tmp_path / 'summary.json').read_text())
     assert found['tanks']['ARX']['fit']['level'][0] > 99.0
     assert found['tanks'][study.OWN]['fit']['level'][0] > 90.0
-    assert '| tanks: level [m] |' in (tmp_path / 'report.md').read_text()
+    assert '| `tanks`: level [m] |' in (tmp_path / 'report.md').read_text()
     assert (tmp_path / 'tanks' / 'seed_0.log').is_file()
 
 
 def test_a_folder_that_is_not_there_is_a_sentence(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
         ) -> None:
-    monkeypatch.setattr(study, 'SETS', {'hair_dryer': SETS['hair_dryer']})
+    for module in (study, table):
+        monkeypatch.setattr(module, 'SETS', {'hair_dryer': SETS['hair_dryer']})
     assert study.main(['--records', str(tmp_path / 'none'), '--output', str(tmp_path)]) == 0
     assert 'there is no folder' in capsys.readouterr().err
