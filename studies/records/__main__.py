@@ -57,7 +57,7 @@ def learned(one: RecordSet, files: Sequence[Path], folder: Path, seed: int
     if not summary['model_file']:
         return {'accepted': False, 'seconds': seconds}, {}
     run = simulate(load(summary['model_file']), read(test, one.states, one.inputs), one.init)
-    return {'accepted': status == 0, 'diverged': run.diverged, 'seconds': seconds,
+    return {'accepted': status == 0, 'seconds': seconds,
             'error': dict(zip(run.names, run.rmse.tolist(), strict=True)),
             'fit': dict(zip(run.names, run.fit.tolist(), strict=True))}, {}
 
@@ -88,8 +88,7 @@ def by_baseline(one: RecordSet, files: Sequence[Path], name: str, _: int
     def of(values: Array) -> dict[str, float | bool | None]:
         return dict(zip(names, values.tolist(), strict=True))
 
-    return {'diverged': not np.all(np.isfinite(squares)),
-            'seconds': time.process_time() - begin, 'options': {**options},
+    return {'seconds': time.process_time() - begin, 'options': {**options},
             'error': of(together[1].std(axis=0) * np.sqrt(squares)),
             'fit': of(100.0 * (1.0 - np.sqrt(squares) / y[one.init:].std(axis=0)))}, {}
 

@@ -13,7 +13,8 @@ import pandas as pd
 import pytest
 
 from koopman_ros import learn_files
-from studies.records import __main__ as study, table
+from studies.records import __main__ as study
+from studies.records import table
 from studies.records.baselines import BASELINES, chosen
 from studies.records.sets import Frames, RecordSet, SETS
 from support.quick_retraining import quick_retraining
