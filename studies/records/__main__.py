@@ -19,6 +19,7 @@ import pandas as pd
 
 from koopman_ros import learn_files
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.plots import bullets
 from koopman_ros.learning import simulate
 from koopman_ros.model import load
 from koopman_ros.records import read
@@ -133,7 +134,9 @@ def main(args: list[str] | None = None) -> int:
         text = table_of(summary)
         print(text)
         report.write(options.output, 'Measured records', [
-            report.opening(summary), text, 'Options of the other methods are those with the best '
+            report.opening(summary), text, bullets(
+                f'{name}: published {SETS[name].published}' for name in names
+                if SETS[name].published), 'Options of the other methods are those with the best '
             'free run on held-out data; `summary.json` has them.'],
             packages=(*report.PACKAGES, 'nfoursid', 'sysidentpy', 'pykoop'))
         return 'models and records'

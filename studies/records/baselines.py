@@ -23,6 +23,7 @@ from koopman_ros.core.arrays import Array
 
 Data: TypeAlias = tuple[Array, Array]
 FreeRun: TypeAlias = Callable[[Array, Array], Array]
+_ROWS = 20  # of the block Hankel matrices of N4SID
 
 
 def arx(records: Sequence[Data], order: int) -> FreeRun:
@@ -43,12 +44,19 @@ def arx(records: Sequence[Data], order: int) -> FreeRun:
 
 
 def n4sid(records: Sequence[Data], order: int) -> FreeRun:
-    """Identify a state space of an order by NFourSID."""
+    """Identify from the record, as NFourSID takes one, that simulates all of them best."""
+    def error(run: FreeRun) -> float:
+        return float(sum(np.sum((run(u, y[:_ROWS]) - y) ** 2) for u, y in records))
+
+    return min((_n4sid(*one, order) for one in records), key=error)
+
+
+def _n4sid(u: Array, y: Array, order: int) -> FreeRun:
+    """Identify a state space of an order."""
     from nfoursid.nfoursid import NFourSID
-    u, y = (np.concatenate(parts) for parts in zip(*records, strict=True))
     n_u, n_y = u.shape[1], y.shape[1]
     program = NFourSID(pd.DataFrame(np.hstack([u, y]), columns=range(n_u + n_y)),
-                       [*range(n_u, n_u + n_y)], [*range(n_u)], num_block_rows=2 * order)
+                       [*range(n_u, n_u + n_y)], [*range(n_u)], num_block_rows=_ROWS)
     program.subspace_identification()
     found = program.system_identification(order)[0]
 

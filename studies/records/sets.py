@@ -108,7 +108,7 @@ def _cooled_reactor(_: Path) -> Frames:
 SETS = {
     'cascaded_tanks': RecordSet(
         ('level [V]',), ('pump [V]',), _tanks, ('cascaded_tanks.csv',),
-        published='0.34 V (Relan et al., 2017); grey box 0.18 V'),
+        published='0.34 V by a nonlinear state space (Relan et al., 2017), 0.18 V by a grey box'),
     'hair_dryer': RecordSet(
         ('temperature [V]',), ('heater [V]',), _hair_dryer, ('hairdryer.csv',)),
     'tclab': RecordSet(

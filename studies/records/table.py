@@ -23,9 +23,8 @@ def table_of(summary: Mapping[str, Any]) -> str:
             rows.append((
                 f'`{name}`: {label} {unit}',
                 *(_cell(summary[name].get(method, {}), label) for method in (OWN, *BASELINES)),
-                share(summary[name].get(OWN, {}).get('accepted')), one.published))
-    return table(('error; fit', f'{OWN}, median (worst)', *BASELINES, 'accepted', 'published'),
-                 rows)
+                share(summary[name].get(OWN, {}).get('accepted'))))
+    return table(('error; fit [%]', f'{OWN} (worst seed)', *BASELINES, 'accepted'), rows)
 
 
 def _cell(found: Mapping[str, Any], label: str) -> str:
@@ -33,7 +32,7 @@ def _cell(found: Mapping[str, Any], label: str) -> str:
         return ''
     errors, fits = found['error'][label], found['fit'][label]
     known = present(errors)
-    text = f'{median(errors):.3g}; {median(fits):.1f} %' if known else 'diverges'
+    text = f'{median(errors):.3g}; {median(fits):.1f}' if known else 'diverges'
     if len(known) < len(errors) and known:
         return f'{text} ({len(errors) - len(known)} of {len(errors)} diverge)'
-    return text + (f' ({max(known):.3g}; {min(present(fits)):.1f} %)' if len(known) > 1 else '')
+    return text + (f' ({max(known):.3g}; {min(present(fits)):.1f})' if len(known) > 1 else '')
