@@ -34,6 +34,7 @@ from studies.campaign import (
     run_campaign,
 )
 from studies.records.baselines import BASELINES, chosen, Data
+from studies.records.dead_times import one_plant, PLANTS
 from studies.records.sets import RecordSet, SETS
 from studies.records.table import OWN, table_of
 
@@ -94,8 +95,8 @@ def by_baseline(one: RecordSet, files: Sequence[Path], name: str, _: int
             'fit': of(100.0 * (1.0 - np.sqrt(squares) / y[one.init:].std(axis=0)))}, {}
 
 
-def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, scheduler: str
-                ) -> Campaign:
+def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, scheduler: str,
+                dead_times: bool) -> Campaign:
     """Write the records as files, and run every method on them."""
     own: dict[str, Experiment] = {}
     others: dict[str, Experiment] = {}
@@ -111,6 +112,8 @@ def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, sc
                    for method, baseline in BASELINES.items() if find_spec(baseline.package)}
     campaign = run_campaign(1, others, scheduler)
     campaign.add(run_campaign(seeds, own, scheduler))
+    if dead_times:
+        campaign.add(run_campaign(PLANTS, {'dead_times': one_plant}, scheduler))
     return campaign
 
 
@@ -142,7 +145,8 @@ def main(args: list[str] | None = None) -> int:
         return 'models and records'
 
     return conclude(options.seeds, options.output, lambda: campaign_of(
-        names, options.records, options.output, options.seeds, options.scheduler), written)
+        names, options.records, options.output, options.seeds, options.scheduler,
+        not options.plants), written)
 
 
 if __name__ == '__main__':

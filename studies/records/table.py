@@ -15,7 +15,11 @@ OWN = 'koopman_ros'
 
 
 def table_of(summary: Mapping[str, Any]) -> str:
-    """Return the table: error and fit of each method by state, ours as median and worst seed."""
+    """
+    Return the table: error and fit of each method by state, ours as median and worst seed.
+
+    Below it stands the share of dead times that are found.
+    """
     rows = []
     for name, one in SETS.items():
         for state in one.states if name in summary else ():
@@ -24,7 +28,11 @@ def table_of(summary: Mapping[str, Any]) -> str:
                 f'`{name}`: {label} {unit}',
                 *(_cell(summary[name].get(method, {}), label) for method in (OWN, *BASELINES)),
                 share(summary[name].get(OWN, {}).get('accepted'))))
-    return table(('error; fit [%]', f'{OWN} (worst seed)', *BASELINES, 'accepted'), rows)
+    text = table(('error; fit [%]', f'{OWN} (worst seed)', *BASELINES, 'accepted'), rows)
+    if 'dead_times' in summary:
+        text += (f'\n\nDead times found within a sample: '
+                 f'{share(summary["dead_times"]["within_a_sample"])} simulated plants.')
+    return text
 
 
 def _cell(found: Mapping[str, Any], label: str) -> str:

@@ -70,7 +70,7 @@ def test_sets_at_hand_are_run_and_stand_in_the_table(
         [*words, '--model_class', 'linear']))
     with quick_retraining(8, degrees=(1,)):
         assert study.main(['--records', str(tmp_path), '--output', str(tmp_path), '--seeds', '1',
-                           '--scheduler', '']) == 0
+                           '--scheduler', '', 'tanks', 'hair_dryer']) == 0
     printed = capsys.readouterr()
     assert 'hairdryer.csv' in printed.err
     found = json.loads((tmp_path / 'summary.json').read_text())
@@ -85,5 +85,8 @@ def test_a_folder_that_is_not_there_is_a_sentence(
         ) -> None:
     for module in (study, table):
         monkeypatch.setattr(module, 'SETS', {'hair_dryer': SETS['hair_dryer']})
-    assert study.main(['--records', str(tmp_path / 'none'), '--output', str(tmp_path)]) == 0
+    monkeypatch.setattr(study, 'PLANTS', 2)
+    assert study.main(['--records', str(tmp_path / 'none'), '--output', str(tmp_path),
+                       '--scheduler', '']) == 0
+    assert '2 of 2' in (tmp_path / 'report.md').read_text()
     assert 'there is no folder' in capsys.readouterr().err
