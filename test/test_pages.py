@@ -102,6 +102,21 @@ def test_model_of_signals_alone_is_saved_as_the_page_has_it(
     assert load('signals.safetensors').states.names == ('temperature',)
 
 
+@pytest.mark.skipif(not (ROOT.parent / 'shared' / 'records' / 'tclab_hybrid.csv').is_file(),
+                    reason='the record of the heater board is not at hand')
+def test_the_record_of_the_heater_board_is_as_the_page_has_it(
+        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    (block,) = re.findall(r'```python\n(.*?)```',
+                          (ROOT / 'docs/tutorials/measured_record.md').read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(block, names)
+    assert 'hybrid' in capsys.readouterr().out
+    first = [names['pd'].read_csv(f'../shared/records/tclab_{log}.csv').iloc[0, 3:].max()
+             for log in ('energy', 'mimo', 'hybrid')]
+    assert min(first[:2]) > 20.0 > first[2]
+
+
 @pytest.mark.parametrize('page', sorted(ROOT.glob('docs/results/*.md')),
                          ids=lambda page: page.stem)
 def test_tables_of_results_name_their_command_and_summary(page: Path) -> None:
