@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs panel-pictures config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -123,6 +123,17 @@ studies-saddle: $(VENV)/saddle.stamp  ## control of the unstable reactor, temper
 studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## comparison with do-mpc and LQG on three partly measured plants, SEEDS=10, 5 min -> out/studies-partial
 	$(BIN)/python -m studies.partly_measured --seeds $(SEEDS)
+
+# SysIdentPy asks for an older NumPy than the other packages, and works with this one.
+$(VENV)/records.stamp: setup.py $(LOCK) $(VENV)/bench.stamp
+	$(INSTALL) --editable '.[learn,bench]'
+	$(BIN)/python -m pip install --quiet --no-deps sysidentpy==0.9.0
+	@touch $@
+
+studies-records: SEEDS = 3
+studies-records: RECORDS = ../shared/records
+studies-records: $(VENV)/records.stamp  ## learning from measured records beside ARX, N4SID, NARX, EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
+	$(BIN)/python -m studies.records --records $(RECORDS) --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## benchmarks against other programs, 20 min (BENCH=--quick: 2 min) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)

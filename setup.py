@@ -59,8 +59,8 @@ setup(
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'numba',
-                  'pysindy==2.1.0'],
+        'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'nfoursid',
+                  'numba', 'pykoop', 'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'argon2-cffi',

@@ -42,7 +42,7 @@ _DEFAULTS = {'model_class': BEST, 'model_output': ''}
 
 def main(arguments: list[str] | None = None) -> int:
     """Learn, print the result, and return the exit code."""
-    options = vars(_parser().parse_args(arguments))
+    options = vars(command_parser().parse_args(arguments))
     try:
         present = _loaded(options.get('model', ''))
         states, inputs, disturbances = _wanted(options, present)
@@ -58,7 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
 
-def _parser() -> argparse.ArgumentParser:
+def command_parser() -> argparse.ArgumentParser:
+    """Return the options of the command."""
     parser = argparse.ArgumentParser(
         'learn', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add: Callable[..., Any] = parser.add_argument
@@ -84,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
         many = isinstance(default, tuple)
         notes = '; '.join(filter(None, (
             row.range_text if not row.choices else '', '' if many or row.default == '' else
-            f'default: {default or "the name of the record"}')))
+            f'default: {"the name of the record" if default == "" else default}')))
         options.add_argument(
             f'--{row.name}', type=type(default[0] if many else default),
             default=argparse.SUPPRESS, nargs='+' if many else None, choices=row.choices or None,

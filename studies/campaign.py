@@ -31,7 +31,8 @@ Experiment: TypeAlias = Callable[[int], tuple[Metrics, Models]]  # from a seed
 
 def read_options(args: list[str] | None, module: str, description: str, output: str = '',
                  seeds: int = 0, scheduler: str | None = None, plants: Iterable[str] = (),
-                 flags: Mapping[str, str] | None = None) -> argparse.Namespace:
+                 flags: Mapping[str, str] | None = None, records: str = ''
+                 ) -> argparse.Namespace:
     """
     Read the options of a study.
 
@@ -40,6 +41,7 @@ def read_options(args: list[str] | None, module: str, description: str, output: 
     :param scheduler: default place of the runs, None for no such option.
     :param plants: plants to choose from.
     :param flags: further switches, with their help.
+    :param records: default folder of measured records; '' for no such option.
     """
     parser = argparse.ArgumentParser(prog=f'python -m studies.{module}', description=description)
     if plants:
@@ -57,6 +59,9 @@ def read_options(args: list[str] | None, module: str, description: str, output: 
             'for a process on each core, joblib:N for N of them, tcp://... for the workers of a '
             'Dask scheduler, an empty text for this process (default: '
             f'{"%(default)s" if scheduler else "this process"})')
+    if records:
+        parser.add_argument('--records', type=Path, default=Path(records),
+                            help='folder of the measured records (default: %(default)s)')
     for flag, text in (flags or {}).items():
         parser.add_argument(f'--{flag}', action='store_true', help=text)
     options = parser.parse_args(args)

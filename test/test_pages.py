@@ -23,6 +23,7 @@ import pytest
 import rclpy
 import yaml
 
+from koopman_ros import learn_files
 from koopman_ros.control.laws import Plan
 from koopman_ros.core.message_fields import KNOWN_TYPES, place
 from koopman_ros.model import load
@@ -32,6 +33,7 @@ from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
+from studies.records.table import table_of as records_table
 from support.nodes import type_support
 
 __all__ = ['type_support']
@@ -78,13 +80,29 @@ def test_model_of_signals_alone_is_saved_as_the_page_has_it(
     assert load('signals.safetensors').states.names == ('temperature',)
 
 
+@pytest.mark.skipif(not (ROOT.parent / 'shared' / 'records' / 'tclab_hybrid.csv').is_file(),
+                    reason='the record of the heater board is not at hand')
+def test_the_record_of_the_heater_board_is_as_the_page_has_it(
+        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    (block,) = re.findall(r'```python\n(.*?)```',
+                          (ROOT / 'docs/tutorials/measured_record.md').read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(block, names)
+    assert 'hybrid' in capsys.readouterr().out
+    first = [names['pd'].read_csv(f'../shared/records/tclab_{log}.csv').iloc[0, 3:].max()
+             for log in ('energy', 'mimo', 'hybrid')]
+    assert min(first[:2]) > 20.0 > first[2]
+
+
 @pytest.mark.parametrize('page', sorted(ROOT.glob('docs/results/*.md')),
                          ids=lambda page: page.stem)
-def test_tables_of_results_name_their_command(page: Path) -> None:
+def test_tables_of_results_name_their_command_and_summary(page: Path) -> None:
     head, *sections = re.split('^## ', page.read_text(), flags=re.MULTILINE)
-    for section in sections:
-        if '\n|' in section:
-            assert re.search(r'`make [a-z]|[Mm]easured once', head + section), section
+    for section in ('', *sections):
+        if '\n|' in (section or head):
+            assert re.search(r'`make [a-z]', head + section), section
+            assert re.search(r'\[`\w+\.json`\]\(\w+\.json\)', head + section), section
 
 
 STEP = 'set-point −10 K'
@@ -179,6 +197,11 @@ def test_table_of_noisy_data_has_the_figures_of_its_summary() -> None:
         values = found[part][figure]
         for cell, value in zip(row[1:], (np.median(values), max(values)), strict=True):
             _agrees(cell.removesuffix(' K'), float(value))
+
+
+def test_table_of_measured_records_is_that_of_its_summary() -> None:
+    summary = json.loads((ROOT / 'docs/results/records.json').read_text())
+    assert records_table(summary) in (ROOT / 'docs/results/records.md').read_text()
 
 
 @each_page
@@ -389,6 +412,8 @@ def _check_command(command: list[str], folder: Path) -> None:
                 assert f"'{argument.partition(':=')[0]}'" in text, argument
         case ['ros2', 'run', 'plotjuggler', 'plotjuggler', '-l', path]:
             assert Path(path).is_file()
+        case ['python', '-m', 'koopman_ros.learn', *arguments] if arguments:
+            learn_files.command_parser().parse_args(arguments)
         case ['python' | 'python3', '-m', module, *_]:
             assert find_spec(module), module
         case ['python', '-c', code]:

@@ -203,6 +203,7 @@ class PlantNode(ManagedNode):
         duration_ns = round(self._settings.duration * NANOSECONDS)
         if duration_ns and instant > self._start_ns + duration_ns:
             self._phase = RunPhase.FINISHED
+            self.get_logger().info(self._phase.value)
         elif instant > _LAST_STAMP_NS:
             self._phase = RunPhase.OUT_OF_STAMPS
             self.get_logger().error(self._phase.value)

@@ -45,7 +45,7 @@ class Bench:
         self.sent_ns: list[int] = []  # when each was measured
         ros.node.create_subscription(
             Temperature, reactor.TEMPERATURE, self._on_measurement, topics.LOOP_QOS)
-        ros.start(
+        self.process = ros.start(
             'plant', {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 3600.0, **parameters})
         before()
         self._commands = ros.node.create_publisher(
@@ -200,6 +200,7 @@ def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> 
     bench.resume()
     assert bench.wait_for_more(1)[0].temperature == pytest.approx(initial, abs=0.5)
     bench.status(lambda s: s.message == 'finished: simulated duration reached')
+    ros.wait_until(lambda: 'finished: simulated duration' in bench.process.output())
     ros.wait_until(lambda: len(bench.measured) >= 301)
     assert [seconds(message) for message in bench.measured] == pytest.approx(
         [10.0 + 0.7 * k for k in range(301)], abs=1e-9)
