@@ -1356,7 +1356,7 @@ static void automatic(koopman_state *s, int fault, double outside, double elapse
     const koopman_supervisor before = s->supervisor;
     request_t to = allowed(&before, outside);
     target_t target;
-    double u[NU], start[NXU];
+    double u[NU] = {0}, start[NXU];
     int targeted = 0, found = 0, from = model_level(&before);
     if (fault != KOOPMAN_OK) to = (request_t){KOOPMAN_HOLD, 1, {fault, fault}};
     copy(NXU, s->target, start);
