@@ -602,7 +602,7 @@ static int law(int linear, const double *x, const target_t *target, double h, do
     double B[NX * NU], K[NU * NR], e[NR], M[NR * NX], slope[NX * NX], D[NX * NX], action[NX * NX];
     double by_error[NU], KM[NU * NX];
     int status = KOOPMAN_NOT_STABILISABLE, n = NX;
-    input_matrix(linear, x, u, B, NULL);
+    input_matrix(linear, x, NULL, B, NULL);
     input_secant(x, target->x, target->u, D);
     if (CLOSED && !linear) {
         /* re-centred: e = N(x) - N(x_ref), e' = (A + H C) e + N' B v */
@@ -667,7 +667,7 @@ static int equilibrium(int linear, const double *w, const int *free, const doubl
     rate_under(linear, y, y + NX, w, rate, J);
     for (int count = 0; count < 30; count++) {
         double length = 0.0, slope = 0.0, share = 1.0;
-        input_matrix(linear, y, y + NX, B, NULL);
+        input_matrix(linear, y, NULL, B, NULL);
         for (int i = 0; i < NX; i++) {
             wanted[i] = -rate[i];
             for (int j = 0; j < n; j++) {
@@ -766,7 +766,7 @@ static int find_target(int linear, const double *setpoint, const double *w, cons
         copy(NX, goal, y);
         drift(linear, y, f, J);
         add(NX, 1.0, w, f);
-        input_matrix(linear, y, y + NX, B, NULL);
+        input_matrix(linear, y, NULL, B, NULL);
         pseudo_inverse(NX, NU, B, inverse);
         mul(NU, NX, 1, inverse, f, y + NX);
         for (int i = 0; i < NU; i++) y[NX + i] = -y[NX + i];
@@ -788,7 +788,7 @@ static int find_target(int linear, const double *setpoint, const double *w, cons
     }
     copy(NX, y, target->x);
     copy(NU, y + NX, target->u);
-    input_matrix(linear, y, y + NX, B, NULL);
+    input_matrix(linear, y, NULL, B, NULL);
     mul(NX, NU, 1, B, y + NX, added);
     for (int i = 0; i < NX; i++) target->forcing[i] = added[i] + w[i];
     return 1;
@@ -1313,7 +1313,7 @@ static void recover(koopman_state *s, int fault, double outside)
     u_deviation(NOMINAL, u);
     u_deviation(SAFE, u_safe);
     add(NU, -1.0, u_safe, u);
-    input_matrix(0, x, u, B, NULL);
+    input_matrix(0, x, NULL, B, NULL);
     mul(NX, NU, 1, B, u, rate);
     for (int i = 0; i < NX; i++) toward += x[i] * rate[i];
     if (outside > 0.0 && !(toward < 0.0)) return;

@@ -109,6 +109,9 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
             fault = str(rng.choice(['', 'silent', 'nan', 'jump', 'stuck', 'manual', 'stiff',
                                     'repeated', 'pushed'], p=[0.6, *[0.05] * 8]))
             left = int(rng.integers(1, 80 if fault in ('', 'stuck', 'pushed') else 20))
+            if rng.random() < 0.2:
+                # a plant that has left its model does not come back by itself
+                x = np.zeros(model.n_x)
             w = rng.normal(size=model.n_x) * (0.5 if fault == 'pushed' else 0.02) * np.max(
                 np.abs(model.B), initial=0.0)
         left -= 1
