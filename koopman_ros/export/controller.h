@@ -41,12 +41,7 @@ typedef struct {
 
 /* All that is remembered from one call to the next; none of it is to be changed. */
 typedef struct {
-    int status, cause;
-} koopman_reason;
-
-typedef struct {
-    int level, resumes;
-    koopman_reason reason;
+    int level, resumes, status, cause;
     int64_t bad_since, better_since;
 } koopman_supervisor;
 

@@ -95,6 +95,6 @@ def _model(rng: np.random.Generator) -> LiftedModel:
         input_terms=InputTerms(0.2 * rng.normal(size=(PolynomialObservables.total_degree(
             n, 2).n_z, n, m))) if rng.random() < 0.3 else None,
         pre_feedback=0.2 * rng.normal(size=(m, n)) if rng.random() < 0.3 else None,
-        verified_loops=VerifiedLoops(some, some[::-1], rng.random(30) < 0.3)
+        verified_loops=VerifiedLoops(some, rng.uniform(-1.0, 1.0, (30, n)), rng.random(30) < 0.3)
         if rng.random() < 0.3 else None,
         dead_time=rng.choice([0.0, 1.0], m))
