@@ -38,6 +38,7 @@ ALLOWED = {
     'event_log': {'records', 'control', 'model', 'parameters'},
     'parameters': {'control', 'estimation', 'evaluation', 'execution', 'model', 'plants'},
     'execution': set(),
+    'export': {'control', 'estimation', 'model', 'parameters'},
     'panel': {'records', 'execution', 'model', 'parameters', 'event_log'},
     'ros': {'control', 'evaluation', 'event_log', 'execution', 'model', 'parameters', 'plants',
             'records'},

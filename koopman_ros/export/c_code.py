@@ -52,7 +52,7 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
     model = controller.model
     about = [f'A control loop of {model.provenance.plant}, exported by koopman_ros {__version__}.',
              *(f'{role}: {", ".join(f"{name} [{unit}]" for name, unit in signals)}'
-               for role, signals in _signals(controller).items())]
+               for role, signals in signals(controller).items())]
     parts = {
         'ABOUT': '\n'.join(f' * {line}' for line in about),
         'SIZES': '\n'.join(f'#define KOOPMAN_{name} {value}' for name, value in sizes.items()),
@@ -60,7 +60,7 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
         'TABLES': '\n'.join(_table(name, value) for name, value in tables.items())}
     found = {}
     for name in ('controller.h', 'controller.c'):
-        text = (files(__package__) / name).read_text()
+        text = (files(__package__) / 'templates' / name).read_text()
         for part, value in parts.items():
             text = text.replace(f'@{part}@', value)
         found[name] = text
@@ -89,7 +89,8 @@ def _check(controller: Controller) -> None:
                               'exported: train a model of a lower degree')
 
 
-def _signals(controller: Controller) -> dict[str, list[tuple[str, str]]]:
+def signals(controller: Controller) -> dict[str, list[tuple[str, str]]]:
+    """Return names and units of the entries of each array, in their order."""
     return {role: list(zip(of.names, of.units, strict=True)) for role, of in (
         ('measured', controller.measured), ('set-points', controller.controlled),
         ('inputs', controller.model.inputs), ('states', controller.model.states))}
