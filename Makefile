@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs panel-pictures config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -119,6 +119,9 @@ studies-unstable: $(VENV)/bench.stamp  ## training on an unstable reactor under 
 studies-saddle: SEEDS = 10
 studies-saddle: $(VENV)/saddle.stamp  ## control of the unstable reactor, temperature measured only, SEEDS=10, 30 min
 	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
+
+studies-export: $(VENV)/run.stamp  ## compare exported C code with the controller: bundled models and 50 random ones, 10,000 samples each, 1 h
+	$(BIN)/python -m studies.exported_loops
 
 studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## comparison with do-mpc and LQG on three partly measured plants, SEEDS=10, 5 min -> out/studies-partial

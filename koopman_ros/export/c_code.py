@@ -139,7 +139,8 @@ def _tables(controller: Controller) -> dict[str, Any]:
         'FASTEST_RATE': model.linearised.fastest_rate / model.seconds_per_time_unit,
         'FASTEST_MODE': np.max(np.abs(np.linalg.eigvals(model.linearised.A)))
         / model.seconds_per_time_unit,
-        'BANDWIDTH': tuning.observer_bandwidth, 'STUCK_TIMEOUT': tuning.sensor.stuck_sensor_timeout,
+        'BANDWIDTH': tuning.observer_bandwidth,
+        'STUCK_TIMEOUT': tuning.sensor.stuck_sensor_timeout,
         'HOLD_TIMEOUT': tuning.hold_timeout, 'RECOVERY_TIME': tuning.recovery_time,
         'TRANSFER_TIME': tuning.bumpless_transfer_time, 'FILTER_TIME': tuning.setpoint_filter_time,
         'MAX_GAIN': tuning.max_gain, 'MAX_RESIDUAL': tuning.max_riccati_residual,

@@ -18,7 +18,6 @@ from typing import Any
 
 from koopman_ros import __version__
 from koopman_ros.control import Controller
-from koopman_ros.core.paths import model_path
 from koopman_ros.export import cortex_m4
 from koopman_ros.export.c_code import c_code, ExportError, signals
 from koopman_ros.export.vectors import columns, vectors
@@ -38,8 +37,8 @@ def main(arguments: list[str] | None = None) -> int:
     add('model', help='name of a bundled model, or path of a .safetensors file')
     add('--law', default='sdre', choices=('sdre', 'linear'), help='best law; better ones of '
         'fallback_order are left out (default: sdre)')
-    add('--parameters', type=Path, metavar='FILE', help='parameter file of the controller node; by '
-        'default its defaults for the plant of the model')
+    add('--parameters', type=Path, metavar='FILE', help='parameter file of the controller node; '
+        'by default its defaults for the model')
     add('--sample_period', type=float, required=True, metavar='S',
         help='shortest time between two calls, in s')
     add('--output', type=Path, default=Path('controller'), metavar='FOLDER',
