@@ -11,7 +11,6 @@ can be exported.
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 import itertools
 import math
 from pathlib import Path
@@ -26,7 +25,7 @@ import numpy as np
 from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.signals import Outputs
-from koopman_ros.export import c_code
+from koopman_ros.export import c_code, example
 from koopman_ros.export.command_line import loop
 from koopman_ros.export.vectors import vectors
 from koopman_ros.model import (
@@ -58,6 +57,7 @@ class Agreement:
 
     error: float  #: largest error of a command, relative
     different: tuple[int, ...]  #: samples with another level, status or cause
+    seen: frozenset[tuple[str, ...]]  #: the levels, statuses and causes
     seconds: float  #: of a step in C
 
 
@@ -65,9 +65,8 @@ def compared(controller: Controller, samples: int, interval: float, seed: int = 
              compiler: str = 'gcc', flags: Sequence[str] = ()) -> Agreement:
     """Compile the code of a loop, run both over a sequence, and compare the answers."""
     with tempfile.TemporaryDirectory() as place:
-        folder, example = Path(place), files('koopman_ros.export') / 'templates' / 'example.c'
-        for name, text in {**c_code(controller, interval), 'example.c': example.read_text()
-                           }.items():
+        folder = Path(place)
+        for name, text in {**c_code(controller, interval), 'example.c': example()}.items():
             (folder / name).write_text(text)
         program = folder / 'example'
         subprocess.run([compiler, *FLAGS, *flags, folder / 'controller.c', folder / 'example.c',
@@ -78,7 +77,9 @@ def compared(controller: Controller, samples: int, interval: float, seed: int = 
         answers = subprocess.run([program], input=calls, capture_output=True, text=True,
                                  check=True).stdout.splitlines()
         seconds = (time.perf_counter() - begin) / samples
-    return Agreement(*disagreement(controller, [answer for _, answer in rows], answers), seconds)
+    wanted, n = [answer for _, answer in rows], controller.model.n_u
+    return Agreement(*disagreement(controller, wanted, answers),
+                     frozenset(tuple(answer[n:]) for answer in wanted), seconds)
 
 
 def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answers: Sequence[str]

@@ -45,8 +45,8 @@ ALLOWED = {
     'nodes': {'control', 'evaluation', 'event_log', 'execution', 'model', 'panel', 'parameters',
               'plants', 'records', 'ros'},
     'testing': {'ros'},
-    'demo': {'control', 'evaluation', 'learning', 'model', 'parameters', 'plants', 'records',
-             'ros', 'testing'},
+    'demo': {'control', 'evaluation', 'export', 'learning', 'model', 'parameters', 'plants',
+             'records', 'ros', 'testing'},
 }
 
 

@@ -308,7 +308,7 @@ def test_operation_quotes_what_diagnostics_say() -> None:
 
 
 # Programs of others, which do nothing here.
-FOREIGN = ('sudo', 'git', 'rosdep', 'colcon', 'pip', 'dask')
+FOREIGN = ('gcc', 'sudo', 'git', 'rosdep', 'colcon', 'pip', 'dask')
 ANY = 'any'  # node that has the parameters of all
 # In place of a program: notes name and arguments.
 STUB = f"""#!/bin/sh

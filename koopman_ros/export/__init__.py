@@ -3,6 +3,6 @@
 
 """Export of a control loop as C code."""
 
-from koopman_ros.export.c_code import c_code, ExportError
+from koopman_ros.export.c_code import c_code, example, ExportError
 
-__all__ = ['ExportError', 'c_code']
+__all__ = ['ExportError', 'c_code', 'example']

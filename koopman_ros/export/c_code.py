@@ -67,6 +67,11 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
     return found
 
 
+def example() -> str:
+    """Return the program ``example.c``, which reads calls and prints answers."""
+    return (files(__package__) / 'templates' / 'example.c').read_text()
+
+
 def _check(controller: Controller) -> None:
     """Raise an error for what the C code has not."""
     for name in controller.levels:

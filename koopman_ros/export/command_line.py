@@ -19,13 +19,13 @@ from typing import Any
 from koopman_ros import __version__
 from koopman_ros.control import Controller
 from koopman_ros.export import cortex_m4
-from koopman_ros.export.c_code import c_code, ExportError, signals
+from koopman_ros.export.c_code import c_code, example, ExportError, signals
 from koopman_ros.export.vectors import columns, vectors
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.model_checks import load_suitable, LoadedModel
 from koopman_ros.parameters.signal_topics import file_parameters
 
-_VECTORS = 500
+_VECTORS = 200
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -90,12 +90,10 @@ def write(loaded: LoadedModel, controller: Controller, sample_period: float, out
             for call, answer in vectors(controller, _VECTORS, sample_period)]
     table = io.StringIO()
     csv.writer(table, lineterminator='\n').writerows([columns(controller), *rows])
-    templates = files(__package__) / 'templates'
-    code |= {'test_vectors.csv': table.getvalue(),
-             'example.c': (templates / 'example.c').read_text()}
+    code |= {'test_vectors.csv': table.getvalue(), 'example.c': example()}
     for name, text in code.items():
         (output / name).write_text(text)
-    readme = (templates / 'README.md').read_text()
+    readme = (files(__package__) / 'templates' / 'README.md').read_text()
     for name, text in _facts(loaded, controller, sample_period, output,
                              table.getvalue()).items():
         readme = readme.replace(f'@{name}@', text)

@@ -13,7 +13,6 @@ import pytest
 from koopman_ros.control import Controller
 from koopman_ros.export import c_code, cortex_m4, ExportError
 from koopman_ros.export.command_line import main
-from koopman_ros.export.vectors import vectors
 from koopman_ros.model import PolynomialObservables
 from studies.exported_loops import (
     bundled_loops,
@@ -34,41 +33,35 @@ def needs(*programs: str) -> pytest.MarkDecorator:
 
 
 @pytest.mark.parametrize(('name', 'compiler', 'flags'), [
-    pytest.param(name, compiler, flags, marks=needs(compiler))
-    for compiler, flags, names in (
-        ('gcc', SANITIZERS, ('reactor_nz4', 'fed_reactor', 'quadruple_tank', 'two_state_example',
-                             'two_state_saddle')),
-        ('clang', (), ('reactor_nz4', 'quadruple_tank')))
-    for name in names])
+    pytest.param(name, compiler, flags, marks=needs(compiler)) for name, compiler, flags in (
+        ('reactor_nz4', 'clang', ()), ('fed_reactor', 'gcc', ()), ('quadruple_tank', 'gcc', ()),
+        ('two_state_example', 'gcc', SANITIZERS), ('two_state_saddle', 'gcc', ()))])
 def test_code_of_bundled_models_gives_the_commands_and_codes_of_the_controller(
         name: str, compiler: str, flags: tuple[str, ...]) -> None:
     controller, interval = BUNDLED[name]
-    found = compared(controller, 200, interval, compiler=compiler, flags=flags)
+    found = compared(controller, 100, interval, compiler=compiler, flags=flags)
     assert found.error <= 1e-9
     assert found.different == ()
 
 
 @needs('gcc')
-@pytest.mark.parametrize('seed', [0, 3, 4, 17, 23, 48])
-def test_code_of_any_kind_of_loop_gives_the_commands_and_codes_of_the_controller(seed: int
-                                                                                 ) -> None:
-    found = compared(random_loop(seed), 150, INTERVAL, seed, flags=SANITIZERS)
-    assert found.error <= 1e-9
-    assert found.different == ()
-
-
-def test_sequences_reach_every_level_and_most_codes() -> None:
-    rows = [answer for seed in (0, 4, 17) for _, answer in vectors(
-        BUNDLED['reactor_nz4'][0], 300, 1.0, seed)]
-    assert {row[1] for row in rows} == {'0', '1', '2', '3', '4'}
-    assert len({row[2] for row in rows}) >= 7
+def test_code_of_any_kind_of_loop_gives_the_commands_and_codes_of_the_controller() -> None:
+    seen: set[tuple[str, ...]] = set()
+    for seed in (0, 3, 4, 17, 23, 48):
+        found = compared(random_loop(seed), 100, INTERVAL, seed, flags=SANITIZERS)
+        assert found.error <= 1e-9
+        assert found.different == ()
+        seen |= found.seen
+    levels, statuses = ({row[k] for row in seen} for k in (0, 1))
+    assert levels >= {'0', '1', '2', '3', '4'}
+    assert len(statuses) >= 8
 
 
 @needs(cortex_m4.COMPILER, cortex_m4.EMULATOR)
 def test_a_cortex_m4_gives_the_same_commands(tmp_path: Path) -> None:
     assert main(['reactor_nz4', '--parameters', str(PLANTS / 'reactor.yaml'), '--sample_period',
                  '1', '--output', str(tmp_path)]) == 0
-    rows = (tmp_path / 'test_vectors.csv').read_text().splitlines()[1:101]
+    rows = (tmp_path / 'test_vectors.csv').read_text().splitlines()[1:41]
     found = cortex_m4.run(tmp_path, '\n'.join(rows))
     controller, _ = BUNDLED['reactor_nz4']
     error, different = disagreement(controller, [row.split(',')[-4:] for row in rows],
@@ -95,7 +88,7 @@ def test_the_program_writes_an_example_that_repeats_its_test_vectors(
     answers = subprocess.run([tmp_path / 'example'], input=table, check=True,
                              capture_output=True, text=True).stdout.splitlines()
     wanted = [row.split(',')[-5:] for row in table.splitlines()[1:]]
-    assert len(wanted) == 500
+    assert len(wanted) == 200
     error, different = disagreement(BUNDLED['two_tanks'][0], wanted, answers)
     assert error <= 1e-9
     assert not different
