@@ -170,7 +170,7 @@ def _tables(controller: Controller) -> dict[str, Any]:
         'WEIGHT': hidden[0], 'BIAS': hidden[1], 'AT_ZERO': hidden[2], 'POWERS': powers,
         'LIFT': np.concatenate((states_first, output), axis=1),
         'DRIFT': np.zeros((n, 0)) if model.readout is None else model.readout,
-        'A': model.A, 'INPUT_MATRIX': model.B, 'INPUT_INVERSE': model.input_inverse(),
+        'DYNAMICS': model.A, 'INPUT_MATRIX': model.B, 'INPUT_INVERSE': model.input_inverse(),
         'SLOPE': model.linearised.A, 'PRE_FEEDBACK': model.pre_feedback_slope,
         'TERMS': np.zeros(0) if terms is None else terms.coefficients,
         'TERM_POWERS': np.zeros(0, dtype=int) if terms is None else (

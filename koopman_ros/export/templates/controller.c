@@ -280,10 +280,10 @@ static void drift(int linear, const double *x, double *f, double *J)
     mul(NZ, N_PSI, 1, LIFT, psi, z);
     mul(NZ, N_PSI, NX, LIFT, slope, N);
     pseudo_inverse(NZ, NX, N, onto);
-    mul(NZ, NZ, 1, A, z, rate);
+    mul(NZ, NZ, 1, DYNAMICS, z, rate);
     mul(NX, NZ, 1, onto, rate, f);
     plus(-1.0, NZ, NX, 1, N, f, rate);
-    mul(NZ, NZ, NX, A, N, AN);
+    mul(NZ, NZ, NX, DYNAMICS, N, AN);
     EACH(k, N_PHI) {
         double rest = 0.0;
         mul(NX, NX, 1, bend + k * NX * NX, f, by_bend);
@@ -564,13 +564,13 @@ static int law(int linear, const double *x, const target_t *target, double h, do
         mul(NZ, N_PSI, NX, LIFT, psi_H, H);
         add(NX * NX, -1.0, PRE_FEEDBACK, D);
         plus(1.0, NZ, NX, NX, N, D, H);
-        copy(NZ * NZ, A, loop);
+        copy(NZ * NZ, DYNAMICS, loop);
         EACH(i, NZ) add(NX, 1.0, H + i * NX, loop + i * NZ);
         mul(NZ, NX, NU, N, B, push);
         n = NZ;
         status = riccati(NZ, loop, push, h, K);
         if (status == KOOPMAN_OK && !READ_OUT) {
-            plus(1.0, NZ, NZ, NX, A, M, H);
+            plus(1.0, NZ, NZ, NX, DYNAMICS, M, H);
             pseudo_inverse(NZ, NX, N, onto);
             mul(NX, NZ, NX, onto, H, slope);
         }

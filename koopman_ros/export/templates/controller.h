@@ -8,6 +8,10 @@
 
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 @SIZES@
 
 /* The control level that acts; the levels of the laws are numbered from the best one, 0. */
@@ -74,5 +78,9 @@ void koopman_init(koopman_state *state, const double *applied);
 
 /* Find the command; state is used and renewed. Without a command so far it is the safe input. */
 void koopman_step(koopman_state *state, const koopman_inputs *inputs, koopman_outputs *outputs);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif
