@@ -22,7 +22,7 @@ from koopman_ros.control import Controller
 from koopman_ros.control.laws.riccati import closed
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import DisturbanceObserver, ExtendedKalmanFilter, MeasuredState
-from koopman_ros.model import PolynomialObservables
+from koopman_ros.model import NetworkObservables, PolynomialObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
 
 _LAWS = ('sdre', 'linear')
@@ -116,13 +116,13 @@ def _tables(controller: Controller) -> dict[str, Any]:
     best, n = controller.best, controller.model.n_x
     states, inputs, estimator = model.states, model.inputs, best.estimator
     lift, terms, loops = model.observables, model.input_terms, model.verified_loops
-    network = not isinstance(lift, PolynomialObservables)
     states_first = np.eye(model.n_z, n) if model.identity else np.zeros((model.n_z, n))
     if isinstance(lift, PolynomialObservables):
         powers, count = lift.exponents[n:], model.n_z - n
         output = np.eye(model.n_z)[:, n:]
         hidden = np.zeros((0, n)), np.zeros(0), np.zeros(0)
     else:
+        assert isinstance(lift, NetworkObservables)
         powers, count = np.zeros((0, n), dtype=int), len(lift.W)
         output = np.concatenate((np.zeros((model.n_z - len(lift.V), count)), lift.V))
         hidden = lift.W, lift.b, lift.value_at_zero
@@ -136,7 +136,7 @@ def _tables(controller: Controller) -> dict[str, Any]:
         'N_TERMS': 0 if terms is None else len(terms.coefficients),
         'N_TRAINING': 0 if trained is None else len(trained.states),
         'N_LOOPS': 0 if loops is None else len(loops.lost),
-        'NETWORK': network, 'READ_OUT': model.readout is not None,
+        'NETWORK': isinstance(lift, NetworkObservables), 'READ_OUT': model.readout is not None,
         'CLOSED': closed(model), 'KALMAN': kalman, 'REMEMBERS': estimator.remembers,
         'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == len(outputs.C),

@@ -124,16 +124,14 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
             setpoint = rng.uniform(box.lower, box.upper) * rng.choice([1.0, 1.0, 10.0])
         if fault != 'stuck' or not len(y):
             y = outputs.of(model.states.to_physical(x)) + noise * rng.normal(size=len(noise))
-        seen: Array | None = y.copy()
-        if fault == 'silent':
-            seen = None
-        elif fault == 'nan':
+        seen = y.copy()
+        if fault == 'nan':
             seen[rng.integers(len(y))] = rng.choice([math.nan, math.inf, 1e300])
         elif fault == 'jump' and left % 4 == 0:
             seen[0] += 10.0 * (model.states.upper - model.states.lower)[0]
         manual = fault == 'manual'
         call = Call(
-            elapsed_ns, seen, setpoint,
+            elapsed_ns, None if fault == 'silent' else seen, setpoint,
             inputs.to_physical(acting) if fault == 'stiff' else none, manual,
             rng.uniform(inputs.lower, inputs.upper) if manual and left % 7 == 0 else none)
         state, command, report = answered(controller, state, call, now_ns)
