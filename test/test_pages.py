@@ -522,7 +522,7 @@ def _words() -> set[str]:
                                   for path in ROOT.glob(f'{part}/**/*'))]
     wirings = map(preset_wiring, ('reactor', 'two_tanks'))
     of_topics = ' '.join(topic for wiring in wirings if wiring for topic in wiring.topics)
-    return {word for path in paths if path.suffix in ('', '.py', '.yaml') and path.is_file()
+    return {word for path in paths if path.suffix in ('', '.py', '.yaml', '.h') and path.is_file()
             for word in re.findall(r'\w+', f'{path.stem} {path.read_text()}')
             } | set(re.findall(r'\w+', of_topics))
 

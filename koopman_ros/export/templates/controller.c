@@ -1218,13 +1218,14 @@ static void automatic(koopman_state *s, int fault, double outside, double elapse
         level = s->supervisor.level;
         if (level >= LAWS) break;
         koopman_estimate estimate = s->estimate;
-        int status = KOOPMAN_NO_STEADY_STATE, linear = LINEAR[level];
+        int status = KOOPMAN_NO_STEADY_STATE, linear = LINEAR[level], lost;
         transfer(&estimate, from, level);
         targeted = find_target(linear, s->setpoint, estimate.w, s->targeted ? start : NULL, &target);
+        lost = level + 1 < LAWS && !linear && failed_near(estimate.x, target.x);
         if (targeted) status = evaluate_ahead(s, linear, &estimate, &target, interval, u);
         if (status != KOOPMAN_OK)
             to = (request_t){level + 1, 0, KOOPMAN_LAW_FAILED, status};
-        else if (level + 1 < LAWS && !linear && failed_near(estimate.x, target.x))
+        else if (lost)
             to = (request_t){level + 1, 0, KOOPMAN_LOST_HERE, KOOPMAN_LOST_HERE};
         else break;
     }
@@ -1361,7 +1362,7 @@ void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_output
             command(s, fault, NAN, elapsed, interval, counted);
         }
     }
-    int level = s->manual ? KOOPMAN_MANUAL : s->supervisor.level;
+    int level = s->manual ? KOOPMAN_MANUAL : s->supervisor.level < 0 ? 0 : s->supervisor.level;
     int status = s->manual ? fault : s->supervisor.status;
     int cause = s->manual ? fault : s->supervisor.cause;
     outputs->level = s->commanded ? level : KOOPMAN_SAFE;
