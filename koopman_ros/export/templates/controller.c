@@ -39,8 +39,7 @@ static void fill(int n, double value, double *to) { EACH(i, n) to[i] = value; }
 /* y = y + f x */
 static void add(int n, double f, const double *x, double *y) { EACH(i, n) y[i] += f * x[i]; }
 
-static double dot(int n, const double *x, const double *y)
-{
+static double dot(int n, const double *x, const double *y) {
     double sum = 0.0;
     EACH(i, n) sum += x[i] * y[i];
     return sum;
@@ -48,37 +47,31 @@ static double dot(int n, const double *x, const double *y)
 
 static double size_of(int n, const double *x) { return sqrt(dot(n, x, x)); }
 
-static int finite(int n, const double *x)
-{
+static int finite(int n, const double *x) {
     EACH(i, n) if (!isfinite(x[i])) return 0;
     return 1;
 }
 
 /* Copy a block (m, n) of a matrix with rows of `from_width` to one with rows of `to_width`. */
-static void block(int m, int n, int from_width, const double *from, int to_width, double *to)
-{
+static void block(int m, int n, int from_width, const double *from, int to_width, double *to) {
     EACH(i, m) copy(n, from + i * from_width, to + i * to_width);
 }
 
-static void diagonal(int n, double value, double *A)
-{
+static void diagonal(int n, double value, double *A) {
     fill(n * n, 0.0, A);
     EACH(i, n) A[i * n + i] = value;
 }
 
-static void transpose(int m, int n, const double *A, double *At)
-{
+static void transpose(int m, int n, const double *A, double *At) {
     EACH(i, m) EACH(j, n) At[j * m + i] = A[i * n + j];
 }
 
-static void symmetric(int n, double *A)
-{
+static void symmetric(int n, double *A) {
     EACH(i, n) EACH(j, i) A[i * n + j] = A[j * n + i] = 0.5 * (A[i * n + j] + A[j * n + i]);
 }
 
 /* C (m, n) = C + f A B of A (m, k), B (k, n) */
-static void plus(double f, int m, int k, int n, const double *A, const double *B, double *C)
-{
+static void plus(double f, int m, int k, int n, const double *A, const double *B, double *C) {
     EACH(i, m) EACH(l, k) add(n, f * A[i * k + l], B + l * n, C + i * n);
 }
 
@@ -88,14 +81,12 @@ static void plus_turned(double f, int m, int k, int n, const double *A, const do
     EACH(l, k) EACH(i, m) add(n, f * A[l * m + i], B + l * n, C + i * n);
 }
 
-static void mul(int m, int k, int n, const double *A, const double *B, double *C)
-{
+static void mul(int m, int k, int n, const double *A, const double *B, double *C) {
     fill(m * n, 0.0, C);
     plus(1.0, m, k, n, A, B, C);
 }
 
-static void swap(int n, double *x, double *y)
-{
+static void swap(int n, double *x, double *y) {
     EACH(i, n) {
         double kept = x[i];
         x[i] = y[i], y[i] = kept;
@@ -103,8 +94,7 @@ static void swap(int n, double *x, double *y)
 }
 
 /* B (n, m) = A^-1 B by elimination with pivots; A is used up. */
-static void solve(int n, int m, double *A, double *B)
-{
+static void solve(int n, int m, double *A, double *B) {
     EACH(k, n) {
         int pivot = k;
         for (int i = k + 1; i < n; i++)
@@ -122,8 +112,7 @@ static void solve(int n, int m, double *A, double *B)
 }
 
 /* Turn rows x, y of n so that they are x c - y s and x s + y c. */
-static void turn(int n, double c, double s, double *x, double *y)
-{
+static void turn(int n, double c, double s, double *x, double *y) {
     EACH(i, n) {
         double kept = x[i];
         x[i] = c * kept - s * y[i], y[i] = s * kept + c * y[i];
@@ -131,8 +120,7 @@ static void turn(int n, double c, double s, double *x, double *y)
 }
 
 /* X (n, m) = pseudo-inverse of A (m, n), by one-sided Jacobi rotations; returns the norm of A. */
-static double pseudo_inverse(int m, int n, const double *A, double *X)
-{
+static double pseudo_inverse(int m, int n, const double *A, double *X) {
     int rows = m > n ? m : n, few = m > n ? n : m, turned = 1;
     double U[MOST * MOST], V[MOST * MOST], largest = 0.0;
     if (m >= n) transpose(m, n, A, U); else copy(m * n, A, U);
@@ -159,52 +147,47 @@ static double pseudo_inverse(int m, int n, const double *A, double *X)
     return largest;
 }
 
-/* --- The model, in scaled deviations from the nominal point ------------------------------- */
+/* --- The model, in scaled deviations from the nominal point --- */
 
 static void deviation(int n, const double *center, const double *scale, const double *value,
-                      double *x)
-{
+                      double *x) {
     EACH(i, n) x[i] = (value[i] - center[i]) / scale[i];
 }
 
 static void physical(int n, const double *center, const double *scale, const double *x,
-                     double *value)
-{
+                     double *value) {
     EACH(i, n) value[i] = center[i] + x[i] * scale[i];
 }
 
-static double apart(const double *a, const double *b)
-{
+static double apart(const double *a, const double *b) {
     double distance = 0.0;
     EACH(i, NX) distance = larger(distance, fabs((a[i] - b[i]) / HALF_WIDTH[i]));
     return distance;
 }
 
 /* Distance of a state, in its units, from the training data in half-ranges. */
-static double distance(const double *state)
-{
+static double distance(const double *state) {
     double x[NX], out = 0.0, nearest = INFINITY;
     deviation(OF_X, state, x);
     if (!finite(NX, x)) return INFINITY;
-    EACH(i, NX) out = larger(out, larger(CORNERS[i] - x[i], x[i] - CORNERS[NX + i]) / HALF_WIDTH[i]);
+    EACH(i, NX)
+        out = larger(out, larger(CORNERS[i] - x[i], x[i] - CORNERS[NX + i]) / HALF_WIDTH[i]);
     EACH(k, N_TRAINING) nearest = smaller(nearest, apart(TRAINING + k * NX, x));
     return N_TRAINING ? larger(out, nearest - FILL_DISTANCE) : out;
 }
 
 /* Whether the law failed in the tested loop nearest to a state and a set-point (NX). */
-static int failed_near(const double *x, const double *x_ref)
-{
+static int failed_near(const double *x, const double *x_ref) {
     double nearest[2] = {INFINITY, INFINITY};
     EACH(k, N_LOOPS) {
-        double away = larger(apart(LOOP_STARTS + k * NX, x), apart(LOOP_SETPOINTS + k * NX, x_ref));
-        nearest[LOOP_LOST[k]] = smaller(nearest[LOOP_LOST[k]], away);
+        double start = apart(LOOP_STARTS + k * NX, x), end = apart(LOOP_SETPOINTS + k * NX, x_ref);
+        nearest[LOOP_LOST[k]] = smaller(nearest[LOOP_LOST[k]], larger(start, end));
     }
     return nearest[1] < nearest[0];
 }
 
 /* Product of the powers of x, differentiated by x_i and x_j where these are not negative. */
-static double monomial(const int *powers, const double *x, int i, int j)
-{
+static double monomial(const int *powers, const double *x, int i, int j) {
     double value = 1.0;
     EACH(k, NX) {
         int power = powers[k];
@@ -216,8 +199,7 @@ static double monomial(const int *powers, const double *x, int i, int j)
 }
 
 /* psi = (x, phi(x)), its derivatives (N_PSI, NX), and second ones of phi (N_PHI, NX, NX). */
-static void features(const double *x, double *psi, double *slope, double *bend)
-{
+static void features(const double *x, double *psi, double *slope, double *bend) {
     copy(NX, x, psi);
     diagonal(NX, 1.0, slope);
     EACH(k, N_PHI) {
@@ -233,14 +215,12 @@ static void features(const double *x, double *psi, double *slope, double *bend)
     }
 }
 
-static void between(const double *x_ref, const double *x, int node, double *at)
-{
+static void between(const double *x_ref, const double *x, int node, double *at) {
     EACH(i, NX) at[i] = x_ref[i] + NODES[node] * (x[i] - x_ref[i]);
 }
 
 /* Secants M of psi and H of psi' w (N_PSI, NX) between two states. */
-static void secants(const double *x, const double *x_ref, const double *w, double *M, double *H)
-{
+static void secants(const double *x, const double *x_ref, const double *w, double *M, double *H) {
     double psi[N_PSI], slope[N_PSI * NX], bend[N_PHI_ * NX * NX], at[NX];
     fill(N_PSI * NX, 0.0, M);
     fill(N_PSI * NX, 0.0, H);
@@ -261,8 +241,7 @@ static void secants(const double *x, const double *x_ref, const double *w, doubl
 }
 
 /* The drift f (NX) and its derivative J (NX, NX), of the model or of its linearisation. */
-static void drift(int linear, const double *x, double *f, double *J)
-{
+static void drift(int linear, const double *x, double *f, double *J) {
     double psi[N_PSI], slope[N_PSI * NX], bend[N_PHI_ * NX * NX], z[NZ], N[NZ * NX], rate[NZ];
     double onto[NX * NZ], AN[NZ * NX], bent[NX * NX] = {0}, square[NX * NX], by_bend[NX];
     if (linear) {
@@ -301,8 +280,7 @@ static void drift(int linear, const double *x, double *f, double *J)
 }
 
 /* B(x) (NX, NU); where J is not NULL, also the derivative (NX, NX) of B(x) u. */
-static void input_matrix(int linear, const double *x, const double *u, double *B, double *J)
-{
+static void input_matrix(int linear, const double *x, const double *u, double *B, double *J) {
     copy(NX * NU, INPUT_MATRIX, B);
     if (J) fill(NX * NX, 0.0, J);
     EACH(k, linear ? 0 : N_TERMS) {
@@ -315,8 +293,7 @@ static void input_matrix(int linear, const double *x, const double *u, double *B
 
 /* rate = f(x) + B(x) u + w, and its derivative J (NX, NX) */
 static void rate_under(int linear, const double *x, const double *u, const double *w, double *rate,
-                       double *J)
-{
+                       double *J) {
     double B[NX * NU], bend[NX * NX];
     drift(linear, x, rate, J);
     input_matrix(linear, x, u, B, bend);
@@ -327,8 +304,8 @@ static void rate_under(int linear, const double *x, const double *u, const doubl
 
 /* D with (B(x) - B(x_ref)) u = D (x - x_ref), and slope = D + the mean of the drift's derivative
  * from x_ref to x, both (NX, NX) */
-static void averaged(const double *x, const double *x_ref, const double *u, double *slope, double *D)
-{
+static void averaged(const double *x, const double *x_ref, const double *u, double *slope,
+                     double *D) {
     double M[N_PSI * NX], H[N_PSI * NX], at[NX], f[NX], B[NX * NU], J[NX * NX];
     fill(NX * NX, 0.0, D);
     fill(NX * NX, 0.0, slope);
@@ -347,7 +324,7 @@ static void averaged(const double *x, const double *x_ref, const double *u, doub
     add(NX * NX, 1.0, D, slope);
 }
 
-/* --- The sampled Riccati equation -------------------------------------------------------------- */
+/* --- The sampled Riccati equation --- */
 
 /* D of exp(F h) = I + D by its power series over a part of h, which is then doubled; y(0)' S y(0)
  * is the integral of y' diag(W) y under y' = F y (Van Loan 1978). */
@@ -394,8 +371,7 @@ static void over_interval(int n, double h, const double *F, const double *W, dou
 /* H = P of the discrete equation P = A' P (I + G P)^-1 A + H with A = I + D, by doubling (E. K.-W.
  * Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77 (2004)); returns 0 where A does not
  * vanish. D, which keeps its digits where the interval is short, and G are used up. */
-static int doubled(int n, double *D, double *G, double *H)
-{
+static int doubled(int n, double *D, double *G, double *H) {
     double left[NR * NR], Y[NR * NR], V[NR * NR], T[NR * NR];
     EACH(step, 40) {
         diagonal(n, 1.0, left);
@@ -427,8 +403,7 @@ static int doubled(int n, double *D, double *G, double *H)
 
 /* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
  * continuous one where h is 0; the first NX states are weighted. Returns a status. */
-static int riccati(int n, const double *A, const double *B, double h, double *K)
-{
+static int riccati(int n, const double *A, const double *B, double h, double *K) {
     double F[NN * NN] = {0}, W[NN] = {0}, E[NN * NN], S[NN * NN], step[NR * NR], push[NR * NU];
     double Q[NR * NR] = {0}, R[NU * NU] = {0}, cross[NU * NR] = {0}, by_push[NU * NR], terms;
     double by_cross[NU * NR], left[NU * NU], right[NU * NR], D[NR * NR], G[NR * NR], P[NR * NR];
@@ -451,7 +426,7 @@ static int riccati(int n, const double *A, const double *B, double h, double *K)
         block(NU, n, N, S + n * N, n, cross);
         block(NU, NU, N, S + n * N + n, NU, R);
     }
-    /* without the cross term: step - push R^-1 cross, G = push R^-1 push', Q - cross' R^-1 cross */
+    /* without the cross term: step - push R^-1 cross, push R^-1 push', Q - cross' R^-1 cross */
     transpose(n, NU, push, by_push);
     copy(NU * NU, R, left);
     solve(NU, n, left, by_push);
@@ -505,15 +480,14 @@ static int riccati(int n, const double *A, const double *B, double h, double *K)
     return pseudo_inverse(NU, n, K, onto) <= MAX_GAIN ? KOOPMAN_OK : KOOPMAN_GAIN_TOO_LARGE;
 }
 
-/* --- Control laws --------------------------------------------------------------------------- */
+/* --- Control laws --- */
 
 typedef struct {
     double x[NX], u[NU], forcing[NX];   /* forcing: B(x) u + w */
 } target_t;
 
 /* Whether e' = slope e + action e(last sample) decays, or e' = (slope + action) e where h is 0. */
-static int decays(const double *slope, const double *action, double h)
-{
+static int decays(const double *slope, const double *action, double h) {
     double F[4 * NX * NX] = {0}, W[2 * NX] = {0}, D[4 * NX * NX], S[4 * NX * NX], step[NX * NX];
     double next[NX * NX];
     int n = h > 0.0 ? 2 * NX : NX;
@@ -539,8 +513,7 @@ static int decays(const double *slope, const double *action, double h)
 }
 
 /* u (NU) = u_ref - K e by the law of a model, in deviations; returns its status. */
-static int law(int linear, const double *x, const target_t *target, double h, double *u)
-{
+static int law(int linear, const double *x, const target_t *target, double h, double *u) {
     double B[NX * NU], K[NU * NR], e[NR], M[NR * NX], slope[NX * NX], D[NX * NX], action[NX * NX];
     double KM[NU * NX];
     int status = KOOPMAN_NOT_STABILISABLE, n = NX;
@@ -590,13 +563,12 @@ static int law(int linear, const double *x, const target_t *target, double h, do
     return decays(slope, action, h) ? KOOPMAN_OK : KOOPMAN_PREDICTED_UNSTABLE;
 }
 
-/* --- Steady states ---------------------------------------------------------------------------- */
+/* --- Steady states --- */
 
 /* Solve f(x) + B(x) u + w = 0 for the free ones of y = (x, u) by Gauss-Newton steps, each to the
  * solution nearest to an anchor, in units of reach; returns 0 where there is none. */
 static int equilibrium(int linear, const double *w, const int *free, const double *anchor,
-                       const double *reach, double *y)
-{
+                       const double *reach, double *y) {
     double rate[NX], J[NX * NX], B[NX * NU], scaled[NX * NXU], onto[NXU * NX], step[NXU];
     int index[NXU], n = 0;
     EACH(i, NXU) if (free[i]) index[n++] = i;
@@ -631,8 +603,7 @@ static int equilibrium(int linear, const double *w, const int *free, const doubl
 }
 
 /* Index in y of the input furthest outside its range, and by how much. */
-static int furthest(const double *y, double *excess)
-{
+static int furthest(const double *y, double *excess) {
     int worst = 0;
     *excess = -INFINITY;
     EACH(i, NU) {
@@ -643,15 +614,13 @@ static int furthest(const double *y, double *excess)
 }
 
 /* Hold the input at index k of y at the end of its range that it has left. */
-static void hold_at_end(int k, int *free, double *y)
-{
+static void hold_at_end(int k, int *free, double *y) {
     y[k] = smaller(larger(y[k], LOWER_V[k - NX]), UPPER_V[k - NX]);
     free[k] = 0;
 }
 
 /* y: the steady state with some states at a set-point, begun from y; returns 0 for none. */
-static int partial_target(int linear, const double *goal, const double *w, double *y)
-{
+static int partial_target(int linear, const double *goal, const double *w, double *y) {
     double anchor[NXU], reach[NXU], found[NXU], excess;
     int free[NXU];
     EACH(i, NXU) anchor[i] = 0.0, reach[i] = 1.0, free[i] = 1;
@@ -671,8 +640,7 @@ static int partial_target(int linear, const double *goal, const double *w, doubl
 }
 
 /* y: the steady state nearest to a target y that inputs within their range hold, if there is. */
-static void reachable_target(int linear, const double *w, double *y)
-{
+static void reachable_target(int linear, const double *w, double *y) {
     double anchor[NXU], reach[NXU], found[NXU], excess;
     int free[NXU], worst;
     copy(NXU, y, anchor);
@@ -690,8 +658,7 @@ static void reachable_target(int linear, const double *w, double *y)
 
 /* The steady state of a set-point (NC), in state units, under a disturbance; 0 for none. */
 static int find_target(int linear, const double *setpoint, const double *w, const double *start,
-                       target_t *target)
-{
+                       target_t *target) {
     double goal[NC], y[NXU] = {0}, f[NX], B[NX * NU], J[NX * NX], inverse[NU * NX], u[NU];
     int k, inside = 1;
     EACH(i, NC) k = CONTROLLED[i], goal[i] = (setpoint[i] - X_CENTER[k]) / X_SCALE[k];
@@ -717,13 +684,12 @@ static int find_target(int linear, const double *setpoint, const double *w, cons
     return 1;
 }
 
-/* --- Estimation --------------------------------------------------------------------------------- */
+/* --- Estimation --- */
 
 #define WIDTH (KALMAN ? 1 + NP : 1)
 
 /* w (NX) within max_disturbance; none where it is not finite. */
-static void bounded(double *w)
-{
+static void bounded(double *w) {
     double v[NU], share = 0.0;
     mul(NU, NX, 1, INPUT_INVERSE, w, v);
     EACH(i, NU) share = larger(share, fabs(v[i]) / MAX_DISTURBANCE[i]);
@@ -732,8 +698,7 @@ static void bounded(double *w)
 
 /* Rates of x and, in the columns behind it, of its derivatives by what x and w were. */
 static void variations(int linear, const double *u, const double *w, const double *whole,
-                       double *rate)
-{
+                       double *rate) {
     double x[NX], f[NX], J[NX * NX];
     block(NX, 1, WIDTH, whole, 1, x);
     rate_under(linear, x, u, w, f, J);
@@ -745,28 +710,25 @@ static void variations(int linear, const double *u, const double *w, const doubl
 }
 
 /* P (NP, NP) = F P F' */
-static void congruent(const double *F, double *P)
-{
+static void congruent(const double *F, double *P) {
     double FP[NP * NP];
     mul(NP, NP, NP, F, P, FP);
     EACH(i, NP) EACH(j, NP) P[i * NP + j] = dot(NP, FP + i * NP, F + j * NP);
 }
 
-static int usable(const koopman_estimate *estimate)
-{
+static int usable(const koopman_estimate *estimate) {
     return finite(NX, estimate->x) && finite(NX, estimate->w) && (
         !estimate->certain || finite(NP * NP, estimate->P));
 }
 
 /* Predict an estimate under an input (NU), in its units, for some seconds; 0 where it is lost: by
  * Heun's steps, or by those of order 4 with the variations of the Kalman filter. */
-static int predicted(int linear, koopman_estimate *estimate, const double *input, double seconds)
-{
+static int predicted(int linear, koopman_estimate *estimate, const double *input, double seconds) {
     static const double ahead[2][4] = {{0.0, 1.0}, {0.0, 0.5, 0.5, 1.0}};
     static const double parts[2][4] = {{3.0, 3.0}, {1.0, 2.0, 2.0, 1.0}};
     double u[NU], whole[NX * WIDTH] = {0}, at[NX * WIDTH], rate[NX * WIDTH] = {0}, F[NP * NP];
-    double sum[NX * WIDTH], count = ceil(seconds * (KALMAN ? FASTEST_MODE * 2.0 : FASTEST_RATE * 10.0));
-    double h = seconds / TIME_UNIT / (count = larger(1.0, count)), *P = estimate->P;
+    double sum[NX * WIDTH], rates = seconds * (KALMAN ? FASTEST_MODE * 2.0 : FASTEST_RATE * 10.0);
+    double count = larger(1.0, ceil(rates)), h = seconds / TIME_UNIT / count, *P = estimate->P;
     if (!(count <= (KALMAN ? 40.0 : 20.0))) return 0;
     deviation(OF_U, input, u);
     EACH(i, NX) {
@@ -798,8 +760,7 @@ static int predicted(int linear, koopman_estimate *estimate, const double *input
 }
 
 /* Take the outputs of a state (NX) into account, so many seconds after the last ones. */
-static void correct(koopman_estimate *estimate, const double *x, double seconds)
-{
+static void correct(koopman_estimate *estimate, const double *x, double seconds) {
     double error[NX], shown[NY], *P = estimate->P, p = exp(-BANDWIDTH * seconds);
     double HP[NY * NP], S[NY * NY], gain[NP * NY], keep[NP * NP];
     copy(NX, x, error);
@@ -832,8 +793,7 @@ static void correct(koopman_estimate *estimate, const double *x, double seconds)
 }
 
 /* What is left of a rate (NX) as a disturbance */
-static void as_disturbance(const double *rate, double *w)
-{
+static void as_disturbance(const double *rate, double *w) {
     copy(NX, rate, w);
     if (KALMAN) mul(NX, NX, 1, ONTO_DISTURBANCES, rate, w);
     bounded(w);
@@ -841,8 +801,7 @@ static void as_disturbance(const double *rate, double *w)
 
 /* Start from a measured state (NX): with the disturbance as known, or where u (NU) is not NULL the
  * one under which u holds the plant. */
-static void restart(int linear, koopman_estimate *estimate, const double *x, const double *u)
-{
+static void restart(int linear, koopman_estimate *estimate, const double *x, const double *u) {
     double rate[NX], J[NX * NX], none[NX] = {0};
     if (!estimate->known || !REMEMBERS) fill(NX, 0.0, estimate->w);
     if (u && REMEMBERS) {
@@ -857,20 +816,17 @@ static void restart(int linear, koopman_estimate *estimate, const double *x, con
 }
 
 /* The level without regard to a passing reason. */
-static int settled(const koopman_supervisor *s)
-{
+static int settled(const koopman_supervisor *s) {
     return s->resumes >= 0 ? s->resumes : s->level < 0 ? 0 : s->level;
 }
 
 /* The level in terms of whose model the estimate is. */
-static int model_level(const koopman_supervisor *s)
-{
+static int model_level(const koopman_supervisor *s) {
     return settled(s) < LAWS ? settled(s) : LAWS - 1;
 }
 
 /* Transfer an estimate from the model of a level to that of another; the plant's rate stays. */
-static void transfer(koopman_estimate *estimate, int before, int now)
-{
+static void transfer(koopman_estimate *estimate, int before, int now) {
     double f[NX], rate[NX], J[NX * NX];
     if (before == now || !REMEMBERS || !estimate->known) return;
     drift(LINEAR[before], estimate->x, rate, J);
@@ -879,31 +835,27 @@ static void transfer(koopman_estimate *estimate, int before, int now)
     as_disturbance(rate, estimate->w);
 }
 
-/* --- Time, and inputs under way ------------------------------------------------------------------- */
+/* --- Time, and inputs under way --- */
 
 /* Seconds since a time; 0 if it never was. */
-static double since(const koopman_state *s, int64_t time)
-{
+static double since(const koopman_state *s, int64_t time) {
     return time == NEVER ? 0.0 : (double)(s->now - time) / SECOND;
 }
 
 /* The last input applied by a time, or the first one, by its place in the queue. */
-static int applied_by(const koopman_state *s, int64_t time)
-{
+static int applied_by(const koopman_state *s, int64_t time) {
     int k = s->queued - 1;
     while (k > 0 && s->applied_at[k] > time) k--;
     return k;
 }
 
 /* The input (NU) that acts on the plant from a time on. */
-static void acting(const koopman_state *s, int64_t time, double *u)
-{
+static void acting(const koopman_state *s, int64_t time, double *u) {
     EACH(i, NU) u[i] = s->applied[applied_by(s, time - DEAD_TIME[i])][i];
 }
 
 /* The end of the time from begin on, up to end, in which the same input (NU) acts. */
-static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double *u)
-{
+static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double *u) {
     EACH(k, s->queued) EACH(i, NU) {
         int64_t edge = s->applied_at[k] + DEAD_TIME[i];
         if (edge > begin && edge < end) end = edge;
@@ -913,8 +865,7 @@ static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double 
 }
 
 /* Append an input in place of those from its time on; drop those that no longer act. */
-static void enqueue(koopman_state *s, int64_t time, const double *u)
-{
+static void enqueue(koopman_state *s, int64_t time, const double *u) {
     int begin = 0;
     while (s->queued > 0 && s->applied_at[s->queued - 1] >= time) s->queued--;
     if (!LONGEST_DEAD_TIME) begin = s->queued;
@@ -930,8 +881,7 @@ static void enqueue(koopman_state *s, int64_t time, const double *u)
 }
 
 /* Predict an estimate up to now, where there is one; as uncertain as at first where it is lost. */
-static void predict(const koopman_state *s, double elapsed, koopman_estimate *estimate)
-{
+static void predict(const koopman_state *s, double elapsed, koopman_estimate *estimate) {
     koopman_estimate before = *estimate;
     int linear = LINEAR[model_level(&s->supervisor)];
     double u[NU];
@@ -945,9 +895,8 @@ static void predict(const koopman_state *s, double elapsed, koopman_estimate *es
     }
 }
 
-/* The state (NX) of a measurement; what that leaves open is as estimated, or as in a steady state. */
-static void position(const koopman_estimate *estimate, const double *y, double *state)
-{
+/* The state (NX) of a measurement; what that leaves open is as estimated, or in a steady state. */
+static void position(const koopman_estimate *estimate, const double *y, double *state) {
     double rest[NY], none[NX] = {0}, anchor[NXU] = {0}, reach[NXU], found[NXU] = {0};
     int free[NXU];
     mul(NX, NY, 1, FROM_OUTPUTS, y, state);
@@ -965,10 +914,10 @@ static void position(const koopman_estimate *estimate, const double *y, double *
 
 /* Check a measurement (NY) against the last accepted one, of `before`, and renew that in s. */
 static int check(const koopman_state *before, koopman_state *s, const double *y, double elapsed,
-                 double outside, int *moved)
-{
+                 double outside, int *moved) {
     koopman_estimate moves = before->estimate;
-    double seconds = since(s, before->accepted_at), worst = 0.0, change[NY], travel[NY] = {0}, way[NX];
+    double seconds = since(s, before->accepted_at), worst = 0.0, change[NY], way[NX];
+    double travel[NY] = {0};
     int first = before->accepted_at == NEVER, still = 0, stuck = 0;
     *moved = 0;
     EACH(i, NY) {
@@ -1004,19 +953,18 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
     return stuck ? KOOPMAN_FROZEN : KOOPMAN_OK;
 }
 
-/* Take into account that the last command was not followed, where the applied inputs are measured. */
-static void follow(koopman_state *s, const double *applied)
-{
+/* Take into account that the last command was not followed, where applied inputs are measured. */
+static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
     copy(NU, s->command, last);
     EACH(i, finite(NU, applied) ? NU : 0)
         last[i] = smaller(larger(last[i], applied[i] - TOLERANCE[i]), applied[i] + TOLERANCE[i]);
 }
 
-/* Check a measurement and take it into account: the state (NX) it stands for, in its units, and its
- * distance from the training data. */
-static int observe(koopman_state *s, const double *y, double elapsed, double *outside, double *state)
-{
+/* Check a measurement and take it into account: the state (NX) it stands for, in its units, and
+ * its distance from the training data. */
+static int observe(koopman_state *s, const double *y, double elapsed, double *outside,
+                   double *state) {
     const koopman_state before = *s;
     koopman_estimate *estimate = &s->estimate;
     double x[NX], u[NU], held[NU], silent = since(s, before.accepted_at);
@@ -1044,15 +992,14 @@ static int observe(koopman_state *s, const double *y, double elapsed, double *ou
     return KOOPMAN_OK;
 }
 
-/* --- The control step --------------------------------------------------------------------------------- */
+/* --- The control step --- */
 
 typedef struct {
     int level, passing, status, cause;
 } request_t;
 
 /* Fall back at once, and recover when that was possible for long enough. */
-static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, int64_t now)
-{
+static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, int64_t now) {
     int from = settled(s);
     int64_t better = s->better_since == NEVER ? now : s->better_since;
     koopman_supervisor next = {to.level, -1, to.status, to.cause, NEVER, NEVER};
@@ -1074,8 +1021,7 @@ static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, 
 }
 
 /* The level that the distance from the training data allows; a margin is left at half of it. */
-static request_t allowed(const koopman_supervisor *s, double outside)
-{
+static request_t allowed(const koopman_supervisor *s, double outside) {
     for (int k = LAWS - 1; k >= 0; k--) {
         int below = k < LAWS - 1 ? k + 1 : KOOPMAN_SAFE;
         if (outside > 0.0 && outside > (settled(s) >= below ? 0.5 : 1.0) * MARGIN[k])
@@ -1085,8 +1031,7 @@ static request_t allowed(const koopman_supervisor *s, double outside)
 }
 
 /* Bring a command within its range, and within its rate. */
-static void limit(const double *wanted, const double *previous, double seconds, double *u)
-{
+static void limit(const double *wanted, const double *previous, double seconds, double *u) {
     EACH(i, NU) {
         double reach = isinf(RATE_LIMIT[i]) ? INFINITY : RATE_LIMIT[i] * larger(0.0, seconds);
         double value = smaller(larger(wanted[i], U_LOWER[i]), U_UPPER[i]);
@@ -1096,8 +1041,8 @@ static void limit(const double *wanted, const double *previous, double seconds, 
 }
 
 /* Evaluate a law, in units within range; returns its status. */
-static int evaluate(int linear, const double *x, const target_t *target, double interval, double *u)
-{
+static int evaluate(int linear, const double *x, const target_t *target, double interval,
+                    double *u) {
     double v[NU], wanted[NU];
     int status = law(linear, x, target, interval / TIME_UNIT, v);
     if (status != KOOPMAN_OK) return status;
@@ -1109,9 +1054,9 @@ static int evaluate(int linear, const double *x, const target_t *target, double 
 /* Predict an estimate from one time to another, short pieces by their mean; 0 where it is lost.
  * Inputs with a dead time up to `acts` are held at `held`. */
 static int ahead(const koopman_state *s, int linear, int64_t begin, int64_t end, int64_t acts,
-                 const double *held, koopman_estimate *estimate)
-{
-    double step = FASTEST_RATE > 0.0 ? 0.1 / FASTEST_RATE : INFINITY, time = 0.0, u[NU], mean[NU] = {0};
+                 const double *held, koopman_estimate *estimate) {
+    double step = FASTEST_RATE > 0.0 ? 0.1 / FASTEST_RATE : INFINITY, time = 0.0, u[NU];
+    double mean[NU] = {0};
     for (int64_t next; begin < end; begin = next) {
         next = piece(s, begin, end, u);
         double seconds = (double)(next - begin) / SECOND, count;
@@ -1130,8 +1075,7 @@ static int ahead(const koopman_state *s, int linear, int64_t begin, int64_t end,
 /* Evaluate the law for each input at the state predicted for the time at which it acts; the faster
  * inputs follow the law until then. */
 static int evaluate_ahead(const koopman_state *s, int linear, koopman_estimate *estimate,
-                          const target_t *target, double interval, double *u)
-{
+                          const target_t *target, double interval, double *u) {
     const double span = (double)(LONGEST_DEAD_TIME - SHORTEST_DEAD_TIME);
     double held[NU], later[NU], count = interval > 0.0 ? ceil(span / SECOND / interval) : 1.0;
     int status;
@@ -1159,8 +1103,7 @@ static int evaluate_ahead(const koopman_state *s, int linear, koopman_estimate *
 }
 
 /* Follow how far the plant has come back where the safe input keeps it outside. */
-static void recover(koopman_state *s, int fault, double outside)
-{
+static void recover(koopman_state *s, int fault, double outside) {
     double state[NX], x[NX], u[NU], u_safe[NU], B[NX * NU], rate[NX];
     int was = s->recovering, kept = s->supervisor.bad_since == NEVER
         && s->supervisor.better_since == NEVER;
@@ -1190,8 +1133,7 @@ static void recover(koopman_state *s, int fault, double outside)
 }
 
 /* Let the offset of a bumpless transfer fade with d (1 + t/T) exp(-t/T). */
-static void fade(koopman_state *s, double seconds)
-{
+static void fade(koopman_state *s, double seconds) {
     double share = seconds / TRANSFER_TIME, offset = 0.0, feed = 0.0;
     EACH(i, NU) {
         s->offset[i] = exp(-share) * (s->offset[i] + share * s->feed[i]);
@@ -1204,8 +1146,7 @@ static void fade(koopman_state *s, double seconds)
 
 /* The input before limits that a law, or none, gives, and the state with it. */
 static void automatic(koopman_state *s, int fault, double outside, double elapsed, double interval,
-                      double *wanted)
-{
+                      double *wanted) {
     const koopman_supervisor before = s->supervisor;
     request_t to = allowed(&before, outside);
     target_t target = {{0.0}, {0.0}, {0.0}};
@@ -1220,7 +1161,8 @@ static void automatic(koopman_state *s, int fault, double outside, double elapse
         koopman_estimate estimate = s->estimate;
         int status = KOOPMAN_NO_STEADY_STATE, linear = LINEAR[level], lost;
         transfer(&estimate, from, level);
-        targeted = find_target(linear, s->setpoint, estimate.w, s->targeted ? start : NULL, &target);
+        targeted = find_target(linear, s->setpoint, estimate.w, s->targeted ? start : NULL,
+                               &target);
         lost = level + 1 < LAWS && !linear && failed_near(estimate.x, target.x);
         if (targeted) status = evaluate_ahead(s, linear, &estimate, &target, interval, u);
         if (status != KOOPMAN_OK)
@@ -1259,8 +1201,7 @@ static void automatic(koopman_state *s, int fault, double outside, double elapse
 
 /* Command, after a measurement that is accepted or has a fault, or without one. */
 static void command(koopman_state *s, int fault, double outside, double elapsed, double interval,
-                    double counted)
-{
+                    double counted) {
     double wanted[NU];
     if (!s->commanded) copy(NU, U_CENTER, s->command);
     if (s->manual) {
@@ -1277,8 +1218,7 @@ static void command(koopman_state *s, int fault, double outside, double elapsed,
 }
 
 /* Bring the set-point to the present time; it begins from a state (NX), in its units. */
-static void advance(koopman_state *s, const double *x, double seconds)
-{
+static void advance(koopman_state *s, const double *x, double seconds) {
     EACH(i, NC) {
         int k = CONTROLLED[i];
         double *active = s->setpoint + i, *ramped = s->ramped + i, reach = INFINITY;
@@ -1293,8 +1233,7 @@ static void advance(koopman_state *s, const double *x, double seconds)
 }
 
 /* Take requests of the operator; returns 1 where the set-point is refused. */
-static int requests(koopman_state *s, const koopman_inputs *inputs)
-{
+static int requests(koopman_state *s, const koopman_inputs *inputs) {
     int refused = 0;
     if (!inputs->manual != !s->manual) {
         s->manual = !s->manual;
@@ -1313,8 +1252,7 @@ static int requests(koopman_state *s, const koopman_inputs *inputs)
     return refused;
 }
 
-void koopman_init(koopman_state *s, const double *applied)
-{
+void koopman_init(koopman_state *s, const double *applied) {
     *s = (koopman_state){0};
     s->measured_at = s->commanded_at = s->accepted_at = NEVER;
     s->law = -1;
@@ -1327,8 +1265,7 @@ void koopman_init(koopman_state *s, const double *applied)
     enqueue(s, NEVER, applied);
 }
 
-void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_outputs *outputs)
-{
+void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_outputs *outputs) {
     int fault = KOOPMAN_OK, received = inputs->received;
     if (inputs->elapsed_ns > 0) s->now += inputs->elapsed_ns;
     outputs->setpoint_refused = requests(s, inputs);
