@@ -6,6 +6,7 @@
 from collections.abc import Mapping
 import os
 from pathlib import Path
+import shutil
 import subprocess
 
 import numpy as np
@@ -23,15 +24,18 @@ class ExportedLoop:
     The compiled code as a process: a row of measurements in, a row of commands out.
 
     :param setpoints: of the controlled states, from `step_time` in s on.
-    :raises OSError: without a C compiler.
+    :raises ValueError: without a C compiler.
     """
 
     def __init__(self, controller: Controller, sample_period: float, folder: Path,
                  setpoints: Mapping[str, float], step_time: float) -> None:
+        compiler = os.environ.get('CC', 'cc')
+        if shutil.which(compiler) is None:
+            raise ValueError(f'the C compiler {compiler} is not installed: install gcc, or set CC')
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in {**c_code(controller, sample_period), 'example.c': example()}.items():
             (folder / name).write_text(text)
-        subprocess.run([os.environ.get('CC', 'cc'), '-std=c99', '-O2', 'controller.c', 'example.c',
+        subprocess.run([compiler, '-std=c99', '-O2', 'controller.c', 'example.c',
                         '-lm', '-o', 'example'], cwd=folder, check=True)
         self._controller, self._step_time = controller, step_time
         self._setpoint = np.array([setpoints[name] for name in controller.controlled.names])

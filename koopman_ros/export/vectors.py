@@ -20,6 +20,8 @@ from koopman_ros.export.c_code import CODES
 
 # Of the model that stands for the plant, in steps of so much of a sample or of its time constant.
 _STEP = 0.2
+# Faults, or none, that last longer than others.
+_LONG = ('', 'silent', 'stuck', 'pushed')
 
 
 @dataclass(frozen=True)
@@ -108,14 +110,15 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
         if left == 0:
             fault = str(rng.choice(['', 'silent', 'nan', 'jump', 'stuck', 'manual', 'stiff',
                                     'repeated', 'pushed'], p=[0.6, *[0.05] * 8]))
-            left = int(rng.integers(1, 80 if fault in ('', 'stuck', 'pushed') else 20))
+            left = int(rng.integers(1, 30 if fault in _LONG else 10))
             if rng.random() < 0.2:
                 # a plant that has left its model does not come back by itself
                 x = np.zeros(model.n_x)
             w = rng.normal(size=model.n_x) * (0.5 if fault == 'pushed' else 0.02) * np.max(
                 np.abs(model.B), initial=0.0)
         left -= 1
-        elapsed_ns = 0 if fault == 'repeated' and left % 3 == 1 else round(
+        repeated = (fault == 'repeated' and left % 3 == 1) or (manual and fault != 'manual')
+        elapsed_ns = 0 if repeated else round(
             interval * NANOSECONDS * float(rng.choice([1.0, 1.0, 1.02, 1.3])))
         now_ns += elapsed_ns
         acting = np.full(model.n_u, 0.3) if fault == 'stiff' else inputs.to_deviation(command)
