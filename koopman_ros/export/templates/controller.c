@@ -956,9 +956,9 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
 /* Take into account that the last command was not followed, where applied inputs are measured. */
 static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
-    copy(NU, s->command, last);
     EACH(i, finite(NU, applied) ? NU : 0)
-        last[i] = smaller(larger(last[i], applied[i] - TOLERANCE[i]), applied[i] + TOLERANCE[i]);
+        last[i] = smaller(larger(s->command[i], applied[i] - TOLERANCE[i]),
+                          applied[i] + TOLERANCE[i]);
 }
 
 /* Check a measurement and take it into account: the state (NX) it stands for, in its units, and
