@@ -69,7 +69,7 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(COMPILE)
 	@touch $@
 
-demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C; EXPORT=1: beside its exported C code)
+demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C; EXPORT=1: with its exported C code)
 	$(BIN)/python -m koopman_ros.demo $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel) $(if $(EXPORT),--export)
 
 demo-retrain: $(VENV)/retrain.stamp  ## retrain the model of a plant that changes -> out/demo-retrain

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The exported C code of a demo's controller, which answers the same measurements beside it."""
+"""The exported C code of a demo's controller, which answers the same measurements."""
 
 from collections.abc import Mapping
 import os

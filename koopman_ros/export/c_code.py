@@ -45,7 +45,7 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
     Return ``controller.h`` and ``controller.c`` of a loop.
 
     :param interval: shortest time between two calls in s, for which inputs under way are kept.
-    :raises ExportError: for a law, an estimator or a model that the C code has not.
+    :raises ExportError: for a law, an estimator or a model that the C code does not support.
     """
     _check(controller)
     sizes, tables = _sizes(controller, interval), _tables(controller)
@@ -73,7 +73,7 @@ def example() -> str:
 
 
 def _check(controller: Controller) -> None:
-    """Raise an error for what the C code has not."""
+    """Raise an error for a part that the C code does not support."""
     for name in controller.levels:
         if name not in _LAWS:
             raise ExportError(

@@ -16,7 +16,7 @@ _FLAGS = ('-std=c99', '-O2', '-mcpu=cortex-m4', '-mthumb', '-mfpu=fpv4-sp-d16', 
 
 @dataclass(frozen=True)
 class CortexM4:
-    """What the code needs, and its answers to some calls."""
+    """Memory and instructions of the code, and its answers to some calls."""
 
     code: int  #: bytes of code and constants, without the C library
     state: int  #: bytes of a ``koopman_state``

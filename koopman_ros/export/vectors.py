@@ -18,7 +18,7 @@ from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.export.c_code import CODES
 
-# Of the model that stands for the plant, in steps of so much of a sample or of its time constant.
+# Largest integration step of the simulated plant, as a share of the fastest time constant.
 _STEP = 0.2
 # Faults, or none, that last longer than others.
 _LONG = ('', 'silent', 'stuck', 'pushed')
@@ -56,7 +56,7 @@ def columns(controller: Controller) -> list[str]:
 
 def answered(controller: Controller, state: State, call: Call, now_ns: int
              ) -> tuple[State, Array, StepReport]:
-    """Return what the controller makes of a call at a time in ns."""
+    """Return the controller's answer to a call at a time in ns."""
     state = controller.set_mode(state, Mode.MANUAL if call.manual else Mode.AUTOMATIC)
     if call.manual and np.isfinite(call.manual_input).all():
         state, _ = controller.request_manual_input(state, call.manual_input)
