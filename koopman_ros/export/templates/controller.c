@@ -302,26 +302,26 @@ static void rate_under(int linear, const double *x, const double *u, const doubl
     add(NX * NX, 1.0, bend, J);
 }
 
-/* D with (B(x) - B(x_ref)) u = D (x - x_ref), and slope = D + the mean of the drift's derivative
- * from x_ref to x, both (NX, NX) */
+/* D with (B(x) - B(x_ref)) u = D (x - x_ref), and where slope is not NULL, slope = D + the mean of
+ * the drift's derivative from x_ref to x, both (NX, NX) */
 static void averaged(const double *x, const double *x_ref, const double *u, double *slope,
                      double *D) {
     double M[N_PSI * NX], H[N_PSI * NX], at[NX], f[NX], B[NX * NU], J[NX * NX];
     fill(NX * NX, 0.0, D);
-    fill(NX * NX, 0.0, slope);
+    if (slope) fill(NX * NX, 0.0, slope);
     EACH(node, 5) {
         between(x_ref, x, node, at);
         input_matrix(0, at, u, B, J);
         add(NX * NX, SHARES[node], J, D);
-        if (READ_OUT) continue;
+        if (READ_OUT || !slope) continue;
         drift(0, at, f, J);
         add(NX * NX, SHARES[node], J, slope);
     }
-    if (READ_OUT) {
+    if (READ_OUT && slope) {
         secants(x, x_ref, x, M, H);
         mul(NX, N_PSI, NX, DRIFT, M, slope);
     }
-    add(NX * NX, 1.0, D, slope);
+    if (slope) add(NX * NX, 1.0, D, slope);
 }
 
 /* --- The sampled Riccati equation --- */
@@ -519,7 +519,7 @@ static int law(int linear, const double *x, const target_t *target, double h, do
     int status = KOOPMAN_NOT_STABILISABLE, n = NX;
     input_matrix(linear, x, NULL, B, NULL);
     if (linear) copy(NX * NX, SLOPE, slope);
-    else averaged(x, target->x, target->u, slope, D);
+    else averaged(x, target->x, target->u, READ_OUT ? slope : NULL, D);
     if (CLOSED && !linear) {
         /* re-centred: e = N(x) - N(x_ref), e' = (A + H C) e + N' B v */
         double psi[N_PSI], psi_ref[N_PSI], by_x[N_PSI * NX], psi_M[N_PSI * NX], psi_H[N_PSI * NX];
@@ -549,6 +549,7 @@ static int law(int linear, const double *x, const target_t *target, double h, do
         }
     }
     if (status != KOOPMAN_OK) {
+        if (!linear && !READ_OUT) averaged(x, target->x, target->u, slope, D);
         n = NX;
         diagonal(NX, 1.0, M);
         EACH(i, NX) e[i] = x[i] - target->x[i];
