@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records bench faults docs panel-pictures config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -69,8 +69,8 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(COMPILE)
 	@touch $@
 
-demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C; DISTURBANCE=1: a step of the feed temperature with and without its measurement -> out/demo-disturbance)
-	$(BIN)/python -m koopman_ros.demo$(if $(DISTURBANCE),.disturbance) $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel)
+demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C; EXPORT=1: with its exported C code; DISTURBANCE=1: a step of the feed temperature with and without its measurement -> out/demo-disturbance)
+	$(BIN)/python -m koopman_ros.demo$(if $(DISTURBANCE),.disturbance) $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel) $(if $(EXPORT),--export)
 
 demo-retrain: $(VENV)/retrain.stamp  ## retrain the model of a plant that changes -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
@@ -119,6 +119,9 @@ studies-unstable: $(VENV)/bench.stamp  ## training on an unstable reactor under 
 studies-saddle: SEEDS = 10
 studies-saddle: $(VENV)/saddle.stamp  ## control of the unstable reactor, temperature measured only, SEEDS=10, 30 min
 	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
+
+studies-export: $(VENV)/run.stamp  ## compare exported C code with the controller: bundled models and 50 random ones, 10,000 samples each, 1 h
+	$(BIN)/python -m studies.exported_loops
 
 studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## comparison with do-mpc and LQG on three partly measured plants, SEEDS=10, 5 min -> out/studies-partial

@@ -21,7 +21,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # A control step takes a fraction of a millisecond, and twenty where several threads share it on
 # busy cores; and the last bit of a command depends on the number of threads.
 ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL')}
-_ONE_THREAD_PROGRAMS = ('koopman_ros.learn_files', *(
+_ONE_THREAD_PROGRAMS = ('koopman_ros.learn_files', 'koopman_ros.export.command_line', *(
     f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player', 'replay')))
 
 
@@ -151,6 +151,7 @@ player = partial(run_program, 'koopman_ros.nodes.player', 0)
 replay = partial(run_program, 'koopman_ros.nodes.replay', 130)
 panel = partial(run_program, 'koopman_ros.nodes.panel', 0)
 learn = partial(run_program, 'koopman_ros.learn_files', 130)
+export_c = partial(run_program, 'koopman_ros.export.command_line', 130)
 command_line = partial(run_program, 'koopman_ros.ros.command_line', 130)
 
 if __name__ == '__main__':

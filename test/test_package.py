@@ -38,14 +38,15 @@ ALLOWED = {
     'event_log': {'records', 'control', 'model', 'parameters'},
     'parameters': {'control', 'estimation', 'evaluation', 'execution', 'model', 'plants'},
     'execution': set(),
+    'export': {'control', 'estimation', 'model', 'parameters'},
     'panel': {'records', 'execution', 'model', 'parameters', 'event_log'},
     'ros': {'control', 'evaluation', 'event_log', 'execution', 'model', 'parameters', 'plants',
             'records'},
     'nodes': {'control', 'evaluation', 'event_log', 'execution', 'model', 'panel', 'parameters',
               'plants', 'records', 'ros'},
     'testing': {'ros'},
-    'demo': {'control', 'evaluation', 'learning', 'model', 'parameters', 'plants', 'records',
-             'ros', 'testing'},
+    'demo': {'control', 'evaluation', 'export', 'learning', 'model', 'parameters', 'plants',
+             'records', 'ros', 'testing'},
 }
 
 

@@ -324,7 +324,7 @@ def test_operation_quotes_what_diagnostics_say() -> None:
 
 
 # Programs of others, which do nothing here.
-FOREIGN = ('sudo', 'git', 'rosdep', 'colcon', 'pip', 'dask')
+FOREIGN = ('gcc', 'sudo', 'git', 'rosdep', 'colcon', 'pip', 'dask')
 ANY = 'any'  # node that has the parameters of all
 # In place of a program: notes name and arguments.
 STUB = f"""#!/bin/sh
@@ -540,7 +540,7 @@ def _words() -> set[str]:
                                   for path in ROOT.glob(f'{part}/**/*'))]
     wirings = map(preset_wiring, ('reactor', 'two_tanks'))
     of_topics = ' '.join(topic for wiring in wirings if wiring for topic in wiring.topics)
-    return {word for path in paths if path.suffix in ('', '.py', '.yaml') and path.is_file()
+    return {word for path in paths if path.suffix in ('', '.py', '.yaml', '.h') and path.is_file()
             for word in re.findall(r'\w+', f'{path.stem} {path.read_text()}')
             } | set(re.findall(r'\w+', of_topics))
 

@@ -32,6 +32,8 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
                                  '%(default)s)')
         parser.add_argument('--panel', action='store_true',
                             help='run with the panel until Ctrl-C; the address is printed')
+        parser.add_argument('--export', action='store_true',
+                            help='run the exported C code next to the controller')
         parser.add_argument('--port', type=int, default=8080,
                             help='port of the panel; 0: any free one (default: %(default)s)')
     parser.add_argument('--speed', type=float, default=speed,

@@ -22,7 +22,8 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
 from koopman_ros.core.units import conversion, display_unit, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
-from koopman_ros.demo.loop import run_loop, running_loop, Scenario
+from koopman_ros.demo.exported import ExportedLoop
+from koopman_ros.demo.loop import Row, run_loop, running_loop, Scenario
 from koopman_ros.demo.results import DemoRun, read_run
 from koopman_ros.evaluation.optimal_cost import (
     cost_along,
@@ -33,7 +34,7 @@ from koopman_ros.evaluation.optimal_cost import (
 )
 from koopman_ros.model import load
 from koopman_ros.model.coordinates import Coordinates
-from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.signal_topics import bundled_plants, plant_defaults, Signals
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
@@ -68,8 +69,12 @@ class _Parameters:
     states: Mapping[str, _StateParameters] = per_signal(_StateParameters)
 
 
-def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
-    """Run the loop of a plant, compare it, and write and return its figures."""
+def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, object]:
+    """
+    Run the loop of a plant, compare it, and write and return its figures.
+
+    :param export: whether the exported C code answers the same measurements.
+    """
     begin = time.monotonic()
     wiring = preset_wiring(name)
     if wiring is None or 'duration' not in (own := plant_defaults(name, 'demo')):
@@ -98,10 +103,20 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
                        for signal in setpoints)
     table = LiveTable(f'{system.name}: {change} after {plan.step_time:g} s', signals,
                       plan.duration)
-    run_loop(scenario, bag, logs, table.show)
-
     model = load(model_path(str(plant_defaults(name, 'controller')['model'])))
-    tuning = table_of(model, {'system': name}).snapshot({}).tuning
+    settings = table_of(model, {'system': name}).snapshot(scenario.controller)
+    tuning, code = settings.tuning, None
+    if export:
+        code = ExportedLoop(built(settings, model), plant.sample_period, output / 'controller',
+                            setpoints, plan.step_time)
+
+    def on_row(row: Row) -> None:
+        table.show(row)
+        if code is not None:
+            code.answer(row)
+
+    run_loop(scenario, bag, logs, on_row)
+    differences = {} if code is None else {'exported_difference': code.close()}
     run = read_run(wiring, bag)
     first = round(plan.step_time / plant.sample_period)
     states, inputs = (np.stack(list(of.values()), axis=1)[first:]
@@ -114,7 +129,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     cost = cost_along(task, states, inputs[:-1])
     title = (f'{system.name}: {change}. Cost over the optimum without rate limit: learned '
              f'{cost / best.cost:.4f}, linear {linear.cost / best.cost:.4f}')
-    _draw(picture, title, run, courses, signals, scenario, model.states, tuning)
+    _draw(picture, title, run, courses, signals, scenario, model.states, tuning, code)
     counts = summary(bag).counts
     result: dict[str, object] = {
         'unit': {signal: signals.states[signal] for signal in setpoints},
@@ -131,14 +146,15 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
         'cost': cost, 'optimal_cost': best.cost, 'linear_cost': linear.cost,
         'measurements': len(run.seconds), 'commands': len(run.command_seconds),
         'bag_messages': sum(counts.values()),
-        'wall_seconds': round(time.monotonic() - begin, 3),
+        'wall_seconds': round(time.monotonic() - begin, 3), **differences,
     }
     write_figures(output / 'summary.json', result)
     return result
 
 
 def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTrajectory],
-          signals: Signals, scenario: Scenario, box: Coordinates, tuning: Tuning) -> None:
+          signals: Signals, scenario: Scenario, box: Coordinates, tuning: Tuning,
+          code: ExportedLoop | None) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
     count = len(signals.states) + len(signals.inputs)
     learned: dict[str, Any] = {
@@ -175,6 +191,9 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
             draw_limits(panel, (low, high), 'limits')
             panel.step(run.command_seconds, shown(run.commanded[signal], unit), where='post',
                        **learned)
+            if code is not None:
+                panel.step(code.seconds, shown(np.array(code.commands)[:, j], unit), where='post',
+                           color='tab:orange', linestyle=':', label='exported C code')
             for name, course in courses.items():
                 values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=high),
                                  low, high)
@@ -205,5 +224,5 @@ def main(args: list[str] | None = None) -> int:
     options = read_options(args, __doc__, 'out/demo', 60.0, plant=PLANT)
     demo: Callable[[Path, float], Mapping[str, object]] = (
         partial(run_with_panel, options.plant, options.port) if options.panel
-        else partial(run_plant, options.plant))
+        else partial(run_plant, options.plant, options.export))
     return run_demo(demo, options, 'closed_loop.png, closed_loop.mcap and summary.json')

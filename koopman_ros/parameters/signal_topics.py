@@ -354,6 +354,11 @@ def plant_defaults(system: str, node: str) -> dict[str, Any]:
     path = config_directory() / _PRESETS / f'{system}.yaml'
     if not system.isidentifier() or not path.is_file():
         return {}
+    return file_parameters(path, node)
+
+
+def file_parameters(path: Path, node: str) -> dict[str, Any]:
+    """Return the parameters of a node, by name, from a ROS parameter file."""
     content = _content(path)
     values: dict[str, Any] = {}
     for section in ('/**', node):

@@ -7,6 +7,7 @@ import contextlib
 import json
 from pathlib import Path
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,9 +32,11 @@ from koopman_ros.testing import Harness, NodeProcess, reserved_output
 def test_demo_leaves_bag_picture_and_summary(
         tmp_path: Path, plant: str, signal: str, final: float, settling: tuple[float, float],
         cost: float, measurements: int) -> None:
+    exports = plant == 'reactor' and shutil.which('cc') is not None
     done = subprocess.run(
         [sys.executable, '-m', 'koopman_ros.demo', '--plant', plant, '--speed', '0',
-         '--output', tmp_path], capture_output=True, text=True, timeout=240, check=False)
+         '--output', tmp_path, *['--export'] * exports],
+        capture_output=True, text=True, timeout=240, check=False)
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads((tmp_path / 'summary.json').read_text())
     assert result['final_error'][signal] < final
@@ -42,6 +45,8 @@ def test_demo_leaves_bag_picture_and_summary(
     assert 1.0 - 1e-6 < result['cost'] / result['optimal_cost'] < cost
     assert result['cost'] < result['linear_cost']
     assert result['measurements'] == result['commands'] == measurements
+    if exports:
+        assert result['exported_difference']['coolant_temperature'] < 1e-9
     assert summary(tmp_path / 'closed_loop.mcap').message_count == result['bag_messages']
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
     assert f'{signal} set-point [' in done.stdout
@@ -72,7 +77,9 @@ def test_demo_says_in_one_line_why_it_cannot_run(
     (tmp_path / 'taken').write_text('a file, not a folder')
     for options, words in ((['--output', str(tmp_path / 'taken')], str(tmp_path / 'taken')),
                            (['--plant', 'volcano', '--output', str(tmp_path)],
-                            "no demo for the plant 'volcano': choose one of fed_reactor,")):
+                            "no demo for the plant 'volcano': choose one of fed_reactor,"),
+                           (['--plant', 'pendulum', '--export', '--output', str(tmp_path)],
+                            'the law mpc cannot be exported')):
         assert setpoint_demo.main(options) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith('demo: ')

@@ -1,0 +1,8 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Export of a control loop as C code."""
+
+from koopman_ros.export.c_code import c_code, example, ExportError
+
+__all__ = ['ExportError', 'c_code', 'example']

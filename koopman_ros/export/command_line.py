@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Export a control loop as C code, for where there is no Python.
+
+Writes controller.c, controller.h, example.c, test_vectors.csv and README.md.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping
+import csv
+from importlib.resources import files
+import io
+from pathlib import Path
+import sys
+from typing import Any
+
+from koopman_ros import __version__
+from koopman_ros.control import Controller
+from koopman_ros.export import cortex_m4
+from koopman_ros.export.c_code import c_code, example, ExportError, signals
+from koopman_ros.export.vectors import columns, vectors
+from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.parameters.model_checks import load_suitable, LoadedModel
+from koopman_ros.parameters.signal_topics import file_parameters
+
+_VECTORS = 200
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Export, and return the exit code."""
+    parser = argparse.ArgumentParser(
+        'export_c', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add: Callable[..., Any] = parser.add_argument
+    add('--version', action='version', version=__version__)
+    add('model', help='name of a bundled model, or path of a .safetensors file')
+    add('--law', default='sdre', choices=('sdre', 'linear'), help='best law; better ones of '
+        'fallback_order are left out (default: sdre)')
+    add('--parameters', type=Path, metavar='FILE', help='parameter file of the controller node; '
+        'by default its defaults for the model')
+    add('--sample_period', type=float, required=True, metavar='S',
+        help='shortest time between two calls, in s')
+    add('--output', type=Path, default=Path('controller'), metavar='FOLDER',
+        help='folder for the files (default: controller)')
+    options = parser.parse_args(arguments)
+    try:
+        if not options.sample_period > 0.0:
+            raise ExportError(f'sample_period = {options.sample_period:g} s must be above 0 s')
+        loaded, controller = loop(options.model, options.law, options.parameters)
+        write(loaded, controller, options.sample_period, options.output)
+    except (OSError, ValueError) as error:
+        print(f'export_c: {" ".join(str(error).split())}', file=sys.stderr)
+        return 1
+    print(f'{options.output}: {", ".join(sorted(path.name for path in options.output.iterdir()))}')
+    return 0
+
+
+def loop(model: str, law: str, parameters: Path | None = None
+         ) -> tuple[LoadedModel, Controller]:
+    """
+    Return a model and its controller as the controller node would build it, from a law on.
+
+    :raises ValueError: for a model or parameters that the node refuses.
+    """
+    given = {'system': ''} if parameters is None else file_parameters(parameters, 'controller')
+    loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
+    table = table_of(loaded.model, given)
+    if unknown := sorted(set(given) - set(table.rows)):
+        raise ExportError(f'{parameters}: {unknown[0]} is no parameter of this loop: correct or '
+                          'remove it')
+    # a file may say 1 for 1.0
+    values = {name: float(value) if isinstance(table.rows[name].default, float) else value
+              for name, value in given.items()}
+    order = table.snapshot(values).tuning.fallback_order
+    if law not in order:
+        raise ExportError(f'fallback_order = {list(order)} does not contain {law}: add it, or '
+                          f'choose another --law')
+    settings = table.snapshot({**values, 'fallback_order': order[order.index(law):]})
+    if reason := table.check(settings):
+        raise ExportError(reason)
+    return loaded, built(settings, loaded.model)
+
+
+def write(loaded: LoadedModel, controller: Controller, sample_period: float, output: Path) -> None:
+    """Write the files of a loop into a folder."""
+    code = c_code(controller, sample_period)
+    output.mkdir(parents=True, exist_ok=True)
+    rows = [[*call.row(controller), *answer]
+            for call, answer in vectors(controller, _VECTORS, sample_period)]
+    table = io.StringIO()
+    csv.writer(table, lineterminator='\n').writerows([columns(controller), *rows])
+    code |= {'test_vectors.csv': table.getvalue(), 'example.c': example()}
+    for name, text in code.items():
+        (output / name).write_text(text)
+    readme = (files(__package__) / 'templates' / 'README.md').read_text()
+    for name, text in _facts(loaded, controller, sample_period, output,
+                             table.getvalue()).items():
+        readme = readme.replace(f'@{name}@', text)
+    (output / 'README.md').write_text(readme)
+
+
+def _facts(loaded: LoadedModel, controller: Controller, sample_period: float, output: Path,
+           calls: str) -> Mapping[str, str]:
+    origin = loaded.model.provenance
+    if cortex_m4.installed():
+        needs = cortex_m4.run(output, calls)
+        cortex = (f'On an ARM Cortex-M4F ({cortex_m4.COMPILER} -O2, QEMU): {needs.code} bytes of '
+                  f'code and constants, {needs.state} bytes of state, {needs.stack} bytes of '
+                  f'stack and {needs.instructions} instructions a step at most over the test '
+                  'vectors.')
+    else:
+        cortex = (f'Not measured on an ARM Cortex-M4F: install {cortex_m4.COMPILER} and '
+                  f'{cortex_m4.EMULATOR}, and export again.')
+    return {'TITLE': f'Control loop of {origin.plant}', 'VERSION': __version__,
+            'MODEL': loaded.name, 'DIGEST': loaded.digest, 'ACCEPTANCE': origin.acceptance,
+            'SIGNALS': '\n'.join(
+                f'| {role} | {", ".join(f"{name} [{unit}]" for name, unit in of)} |'
+                for role, of in signals(controller).items()),
+            'LEVELS': ', '.join(controller.levels), 'PERIOD': f'{sample_period:g}',
+            'CORTEX': cortex}

@@ -1,0 +1,213 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Compare the C code of loops with the Python controller: all bundled models, and random ones.
+
+Each loop runs over a sequence with faults; the random models and tunings are of every kind that
+can be exported.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+import itertools
+import math
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+
+from koopman_ros.control import Controller
+from koopman_ros.core.paths import config_directory
+from koopman_ros.core.signals import Outputs
+from koopman_ros.export import c_code, example
+from koopman_ros.export.command_line import loop
+from koopman_ros.export.vectors import vectors
+from koopman_ros.model import (
+    Coordinates,
+    LiftedModel,
+    NetworkObservables,
+    PolynomialObservables,
+)
+from koopman_ros.model.input_matrix import InputTerms
+from koopman_ros.model.lifted_model import Provenance
+from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
+from koopman_ros.tuning import InputLimits, SensorLimits, Tuning
+
+INTERVAL = 0.5  # s, of the random loops
+FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wconversion', '-Werror', '-O1')
+SANITIZERS = ('-fsanitize=address,undefined', '-fno-sanitize-recover')
+# The floor below which an error of a command counts as one of it, in half-ranges of the input.
+_FLOOR = 1e-3
+# Seconds between samples of the bundled models, where not 1 s, and the plants of those that are
+# not named like one.
+_INTERVALS = {'pendulum': 0.02, 'two_state_example': 0.1, 'two_tanks': 0.5}
+_PLANTS = {'reactor_linear': 'reactor', 'reactor_nz3': 'reactor', 'reactor_nz4': 'reactor',
+           'two_state_saddle': 'two_state'}
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far the answers of the C code agree with those of the Python controller."""
+
+    error: float  #: largest error of a command, relative
+    different: tuple[int, ...]  #: samples with another level, status or cause
+    seen: frozenset[tuple[str, ...]]  #: the levels, statuses and causes
+    seconds: float  #: of a step in C
+
+
+def compared(controller: Controller, samples: int, interval: float, seed: int = 0,
+             compiler: str = 'gcc', flags: Sequence[str] = ()) -> Agreement:
+    """Compile the code of a loop, run both over a sequence, and compare the answers."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for name, text in {**c_code(controller, interval), 'example.c': example()}.items():
+            (folder / name).write_text(text)
+        program = folder / 'example'
+        subprocess.run([compiler, *FLAGS, *flags, folder / 'controller.c', folder / 'example.c',
+                        '-lm', '-o', program], check=True)
+        rows = list(vectors(controller, samples, interval, seed))
+        calls = ''.join(f'{",".join(call.row(controller))}\n' for call, _ in rows)
+        begin = time.perf_counter()
+        answers = subprocess.run([program], input=calls, capture_output=True, text=True,
+                                 check=True).stdout.splitlines()
+        seconds = (time.perf_counter() - begin) / samples
+    wanted, n = [answer for _, answer in rows], controller.model.n_u
+    return Agreement(*disagreement(controller, wanted, answers),
+                     frozenset(tuple(answer[n:]) for answer in wanted), seconds)
+
+
+def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answers: Sequence[str]
+                 ) -> tuple[float, tuple[int, ...]]:
+    """Return the largest relative error of a command, and the samples with other codes."""
+    n = controller.model.n_u
+    found = [answer.split(',') for answer in answers]
+    expected, got = (np.array([row[:n] for row in rows], dtype=float)
+                     for rows in (wanted, found))
+    error = np.abs(got - expected) / np.maximum(
+        np.abs(expected), _FLOOR * controller.model.inputs.scale)
+    pairs = enumerate(zip(wanted, found, strict=True))
+    return float(np.max(error)), tuple(k for k, (one, other) in pairs if one[n:] != other[n:])
+
+
+def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
+    """Yield name, loop and seconds between samples of each bundled model."""
+    for path in sorted((config_directory() / 'models').glob('*.safetensors')):
+        name = path.stem
+        parameters = config_directory() / 'plants' / f'{_PLANTS.get(name, name)}.yaml'
+        yield name, loop(name, 'sdre', parameters)[1], _INTERVALS.get(name, 1.0)
+
+
+def random_loops(first: int = 0) -> Iterator[tuple[int, Controller]]:
+    """Yield loops with their numbers, without those whose outputs do not suffice."""
+    for seed in itertools.count(first):
+        try:
+            yield seed, random_loop(seed)
+        except ValueError as error:
+            if 'do not determine' not in str(error):
+                raise
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare all; the exit code is 1 where one differs."""
+    parser = argparse.ArgumentParser('exported_loops', description=__doc__)
+    parser.add_argument('--samples', type=int, default=10_000)
+    parser.add_argument('--random', type=int, default=50, help='number of random models')
+    options = parser.parse_args(arguments)
+    wrong, worst = 0, 0.0
+    loops = itertools.chain(bundled_loops(), (
+        (f'random {seed}', controller, INTERVAL)
+        for seed, controller in itertools.islice(random_loops(), options.random)))
+    for k, (name, controller, interval) in enumerate(loops):
+        found = compared(controller, options.samples, interval, k)
+        bad = not found.error <= 1e-9 or bool(found.different)
+        wrong, worst = wrong + bad, max(worst, found.error)
+        print(f'{name}: relative error {found.error:.1e}, {len(found.different)} other codes, '
+              f'{1e6 * found.seconds:.0f} us a step in C{" <- differs" if bad else ""}',
+              flush=True)
+    print(f'{wrong} loops differ; largest relative error {worst:.1e}')
+    return int(wrong > 0)
+
+
+def random_loop(seed: int) -> Controller:
+    """Return the loop of a number, with a time constant of about 20 s."""
+    rng = np.random.default_rng(seed)
+    model = _model(rng)
+    n, m, names = model.n_x, model.n_u, model.states.names
+
+    def some(*values: Any) -> Any:
+        return values[rng.integers(len(values))]
+
+    partly = n > 1 and m < n and rng.random() < 0.5
+    C = np.eye(n)[:max(1, n - 1)] if partly else np.eye(n)
+    outputs = Outputs(names[:len(C)], model.states.units[:len(C)], C)
+    half = 0.5 * (model.states.upper - model.states.lower)
+    controlled = names[:m] if m < n else some(names, names[:1])
+    inputs = model.inputs
+    return Controller(model, Tuning.for_model(
+        model, controlled=controlled,
+        limits=InputLimits(inputs.lower, inputs.upper, some(np.full(m, np.inf), inputs.scale)),
+        dead_time=some(np.full(m, -1.0), np.full(m, 1.7), rng.uniform(0.0, 3.0, m)),
+        sensor=SensorLimits(
+            np.full(len(C), -1e9), np.full(len(C), 1e9), some(np.full(len(C), np.inf), half[
+                :len(C)]), some(np.full(len(C), np.inf), 0.1 * half[:len(C)]), 3.0),
+        setpoint_ramp=some(np.full(len(controlled), np.inf), 0.05 * np.ones(len(controlled))),
+        setpoint_filter_time=some(0.0, 5.0),
+        estimator='extended_kalman_filter' if partly else some(
+            '', 'measured_state', 'extended_kalman_filter'),
+        observer_bandwidth=some(0.0, 0.3),
+        max_disturbance=some(np.full(m, np.inf), 0.3 * inputs.scale),
+        tracking_tolerance=0.01 * inputs.scale, measurement_noise=np.zeros(len(C)),
+        disturbance_noise=np.zeros(m), initial_error=np.zeros(n),
+        fallback_order=some(('sdre', 'linear'), ('sdre',), ('linear',)),
+        hold_timeout=some(2.0, 20.0), recovery_time=2.0, bumpless_transfer_time=some(0.0, 4.0),
+        safe_value=some(inputs.center, inputs.lower)), outputs)
+
+
+def _model(rng: np.random.Generator) -> LiftedModel:
+    n, m = int(rng.integers(1, 4)), int(rng.integers(1, 3))
+    identity, h = bool(rng.random() < 0.6), 6
+    if rng.random() < 0.3:
+        lift: Any = PolynomialObservables.total_degree(n, int(rng.integers(2, 4)))
+    else:
+        free = int(rng.integers(0, 4)) if identity else n + int(rng.integers(0, 2))
+        V = 0.3 * rng.normal(size=(free, h)) / math.sqrt(h)
+        W = rng.normal(size=(h, n))
+        if not identity:
+            V[:n] += np.linalg.pinv(W)
+        lift = NetworkObservables(W, 0.3 * rng.normal(size=h), V, identity)
+    features = lift.features.n_z
+    A = -np.diag(rng.uniform(0.5, 3.0, lift.n_z)) + 0.2 * rng.normal(size=(lift.n_z, lift.n_z))
+    readout = None
+    if rng.random() < 0.4:
+        readout = 0.1 * rng.normal(size=(n, features))
+        readout[:, :n] -= np.diag(rng.uniform(0.5, 3.0, n))
+    B = np.eye(n, m) + 0.3 * rng.normal(size=(n, m))
+    states = Coordinates(tuple('xyz'[:n]), ('m',) * n, rng.normal(size=n), rng.uniform(
+        0.5, 2.0, n), np.zeros(n), np.ones(n))
+    states = replace(states, lower=states.center - states.scale, upper=states.center + (
+        states.scale))
+    inputs = Coordinates(tuple('uv'[:m]), ('V',) * m, rng.normal(size=m), rng.uniform(
+        0.5, 2.0, m), np.full(m, -10.0), np.full(m, 10.0))
+    inputs = replace(inputs, lower=inputs.center - 2.0 * inputs.scale,
+                     upper=inputs.center + 2.0 * inputs.scale)
+    some = rng.uniform(-1.0, 1.0, (30, n))
+    return LiftedModel(
+        lift, 3.0 * A, 3.0 * B, states, inputs, 'min', Provenance('random'),
+        training_states=TrainingStates(some, 0.3) if rng.random() < 0.5 else None,
+        readout=None if readout is None else 3.0 * readout,
+        input_terms=InputTerms(0.2 * rng.normal(size=(PolynomialObservables.total_degree(
+            n, 2).n_z, n, m))) if rng.random() < 0.3 else None,
+        pre_feedback=0.2 * rng.normal(size=(m, n)) if rng.random() < 0.3 else None,
+        verified_loops=VerifiedLoops(some, rng.uniform(-1.0, 1.0, (30, n)), rng.random(30) < 0.3)
+        if rng.random() < 0.3 else None,
+        dead_time=rng.choice([0.0, 1.0], m))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+from dataclasses import replace
+from pathlib import Path
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from koopman_ros.control import Controller
+from koopman_ros.export import c_code, cortex_m4, ExportError
+from koopman_ros.export.command_line import main
+from koopman_ros.model import PolynomialObservables
+from studies.exported_loops import (
+    bundled_loops,
+    compared,
+    disagreement,
+    FLAGS,
+    INTERVAL,
+    random_loop,
+    SANITIZERS,
+)
+
+PLANTS = Path(__file__).parents[2] / 'config' / 'plants'
+BUNDLED = {name: (controller, interval) for name, controller, interval in bundled_loops()}
+
+
+def needs(*programs: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(not all(map(shutil.which, programs)), reason=f'needs {programs}')
+
+
+@pytest.mark.parametrize(('name', 'compiler', 'flags'), [
+    pytest.param(name, compiler, flags, marks=needs(compiler)) for name, compiler, flags in (
+        ('reactor_nz4', 'clang', ()), ('fed_reactor', 'gcc', ()), ('quadruple_tank', 'gcc', ()),
+        ('two_state_example', 'gcc', SANITIZERS), ('two_state_saddle', 'gcc', ()))])
+def test_code_of_bundled_models_gives_the_commands_and_codes_of_the_controller(
+        name: str, compiler: str, flags: tuple[str, ...]) -> None:
+    controller, interval = BUNDLED[name]
+    found = compared(controller, 100, interval, compiler=compiler, flags=flags)
+    assert found.error <= 1e-9
+    assert found.different == ()
+
+
+@needs('gcc')
+def test_code_of_any_kind_of_loop_gives_the_commands_and_codes_of_the_controller() -> None:
+    seen: set[tuple[str, ...]] = set()
+    for seed in (5, 12, 14, 20):
+        found = compared(random_loop(seed), 100, INTERVAL, flags=('-O0', *SANITIZERS))
+        assert found.error <= 1e-9
+        assert found.different == ()
+        seen |= found.seen
+    assert len({status for _, status, _ in seen}) >= 8
+
+
+@needs(cortex_m4.COMPILER, cortex_m4.EMULATOR)
+def test_a_cortex_m4_gives_the_same_commands(tmp_path: Path) -> None:
+    assert main(['reactor_nz4', '--parameters', str(PLANTS / 'reactor.yaml'), '--sample_period',
+                 '1', '--output', str(tmp_path)]) == 0
+    rows = (tmp_path / 'test_vectors.csv').read_text().splitlines()[1:41]
+    found = cortex_m4.run(tmp_path, '\n'.join(rows))
+    controller, _ = BUNDLED['reactor_nz4']
+    error, different = disagreement(controller, [row.split(',')[-4:] for row in rows],
+                                    found.answers.splitlines())
+    assert error <= 1e-9
+    assert not different
+    assert found.stack < 16384
+    assert re.search(r'\d+ bytes of stack and \d+ instructions', (
+        tmp_path / 'README.md').read_text())
+
+
+@needs('gcc')
+def test_the_program_writes_an_example_that_repeats_its_test_vectors(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cortex_m4, 'installed', lambda: False)
+    (tmp_path / 'loop.yaml').write_text(
+        'controller: {ros__parameters: {system: two_tanks, level_1.weight: 2, '
+        'fallback_order: [mpc, sdre, linear]}}')
+    assert main(['two_tanks', '--parameters', str(tmp_path / 'loop.yaml'), '--sample_period',
+                 '0.5', '--output', str(tmp_path)]) == 0
+    subprocess.run(['gcc', *FLAGS, tmp_path / 'controller.c', tmp_path / 'example.c', '-lm', '-o',
+                    tmp_path / 'example'], check=True)
+    table = (tmp_path / 'test_vectors.csv').read_text()
+    answers = subprocess.run([tmp_path / 'example'], input=table, check=True,
+                             capture_output=True, text=True).stdout.splitlines()
+    wanted = [row.split(',')[-5:] for row in table.splitlines()[1:]]
+    assert len(wanted) == 200
+    error, different = disagreement(BUNDLED['two_tanks'][0], wanted, answers)
+    assert error <= 1e-9
+    assert not different
+    assert '@' not in (tmp_path / 'README.md').read_text()
+
+
+@pytest.mark.parametrize(('parameters', 'options', 'words'), [
+    ('{tempperature.weight: 2.0}', [], 'tempperature.weight'),
+    ('{temperature.weight: -2.0}', [], 'temperature.weight = -2.0'),
+    ('{estimator: unscented_kalman_filter}', [], 'extended_kalman_filter'),
+    ('{fallback_order: [sdre, pi]}', [], 'law pi'),
+    ('{fallback_order: [linear]}', [], 'does not contain sdre'),
+    ('{}', ['--sample_period', '0'], 'above 0 s')])
+def test_the_program_refuses_what_it_cannot_export(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str], parameters: str, options: list[str],
+        words: str) -> None:
+    (tmp_path / 'loop.yaml').write_text(f'controller: {{ros__parameters: {parameters}}}')
+    assert main(['reactor_nz4', '--parameters', str(tmp_path / 'loop.yaml'), '--output',
+                 str(tmp_path / 'out'), '--sample_period', '1', *options]) == 1
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
+    controller, _ = BUNDLED['reactor_nz4']
+    with pytest.raises(ExportError, match='acados'):
+        c_code(Controller(controller.model, replace(
+            controller.tuning, fallback_order=('mpc', 'sdre'))), 1.0)
+    powers = PolynomialObservables(np.array([[1], [11]]))
+    model = replace(controller.model, observables=powers, A=-np.eye(2))
+    with pytest.raises(ExportError, match='degree 11'):
+        c_code(Controller(model, controller.tuning), 1.0)
