@@ -31,6 +31,7 @@ from koopman_ros.export.vectors import vectors
 from koopman_ros.model import (
     Coordinates,
     LiftedModel,
+    load,
     NetworkObservables,
     PolynomialObservables,
 )
@@ -96,8 +97,10 @@ def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answer
 
 
 def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
-    """Yield name, loop and seconds between samples of each bundled model."""
+    """Yield name, loop and seconds between samples of each bundled model that can be exported."""
     for path in sorted((config_directory() / 'models').glob('*.safetensors')):
+        if len(load(path).disturbances):
+            continue
         name = path.stem
         parameters = config_directory() / 'plants' / f'{_PLANTS.get(name, name)}.yaml'
         yield name, loop(name, 'sdre', parameters)[1], _INTERVALS.get(name, 1.0)
@@ -155,7 +158,8 @@ def random_loop(seed: int) -> Controller:
         dead_time=some(np.full(m, -1.0), np.full(m, 1.7), rng.uniform(0.0, 3.0, m)),
         sensor=SensorLimits(
             np.full(len(C), -1e9), np.full(len(C), 1e9), some(np.full(len(C), np.inf), half[
-                :len(C)]), some(np.full(len(C), np.inf), 0.1 * half[:len(C)]), 3.0),
+                :len(C)]), some(np.full(len(C), np.inf), 0.1 * half[:len(C)]),
+            stuck_sensor_timeout=3.0),
         setpoint_ramp=some(np.full(len(controlled), np.inf), 0.05 * np.ones(len(controlled))),
         setpoint_filter_time=some(0.0, 5.0),
         estimator='extended_kalman_filter' if partly else some(

@@ -6,14 +6,17 @@ from pathlib import Path
 import re
 import shutil
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
 
 from koopman_ros.control import Controller
+from koopman_ros.core.paths import model_path
 from koopman_ros.export import c_code, cortex_m4, ExportError
 from koopman_ros.export.command_line import main
-from koopman_ros.model import PolynomialObservables
+from koopman_ros.model import load, PolynomialObservables
+from koopman_ros.parameters.controller import built, table_of
 from studies.exported_loops import (
     bundled_loops,
     compared,
@@ -119,3 +122,14 @@ def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
     model = replace(controller.model, observables=powers, A=-np.eye(2))
     with pytest.raises(ExportError, match='degree 11'):
         c_code(Controller(model, controller.tuning), 1.0)
+
+
+@pytest.mark.parametrize(('model', 'given', 'words'), [
+    ('reactor_feed', {}, 'measured disturbances'),
+    ('reactor_nz4', {'safe_latch': True}, 'safe_latch'),
+    ('reactor_nz4', {'temperature.report_on_change': 10.0}, 'report_on_change')])
+def test_what_a_loop_in_c_does_not_know_is_refused(
+        model: str, given: dict[str, Any], words: str) -> None:
+    learned = load(model_path(model))
+    with pytest.raises(ExportError, match=words):
+        c_code(built(table_of(learned).snapshot(given), learned), 1.0)

@@ -857,7 +857,7 @@ static void acting(const koopman_state *s, int64_t time, double *u) {
 
 /* The end of the time from begin on, up to end, in which the same input (NU) acts. */
 static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double *u) {
-    EACH(k, s->queued) EACH(i, NU) {
+    for (int k = 1; k < s->queued; k++) EACH(i, NU) {
         int64_t edge = s->applied_at[k] + DEAD_TIME[i];
         if (edge > begin && edge < end) end = edge;
     }
