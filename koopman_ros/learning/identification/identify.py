@@ -147,6 +147,7 @@ class Identified:
     #: (n_u,) by which the inputs of the segments are later than those of the record, in time
     #: units; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
+    steps: tuple[str, ...] = ()  #: of the search for the structure, in words
 
     __repr__ = short_repr
 
@@ -180,8 +181,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     :raises Stopped: when `watch` requested it.
     """
     n_x, n_u = len(plant.state_names), len(plant.input_names)
-    degrees = degrees or tuple(degree for degree in DEGREES if degree == 1
-                               or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
+    degrees = degrees or usual_degrees(n_x)
     parts = segments_of(episodes, n_x + n_u)
     box = box_of(plant, parts)
     warnings = check_inputs(plant, episodes)
@@ -232,6 +232,12 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
                       (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures))
+
+
+def usual_degrees(n_x: int) -> tuple[int, ...]:
+    """Return the degrees of a drift with few enough coefficients for a number of states."""
+    return tuple(degree for degree in DEGREES if degree == 1
+                 or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
 
 
 @dataclass(frozen=True)
