@@ -364,9 +364,10 @@ def _network(shared: _Shared, item: tuple[int, int], tell: Tell
     linear, (units, seed) = shared.linear, item
     drift = linear.model.drift
     assert isinstance(drift, DriftModel)
-    found = _simulated(
-        NetworkDrift.beside(drift, units, seed, ridge=_RIDGE, learn_input_matrix=shared.learn_input_matrix),
-        linear.gain, *shared.record.simulated(linear.start, shared.samples), monitor)
+    network = NetworkDrift.beside(
+        drift, units, seed, ridge=_RIDGE, learn_input_matrix=shared.learn_input_matrix)
+    found = _simulated(network, linear.gain,
+                       *shared.record.simulated(linear.start, shared.samples), monitor)
     # far from the data a network is constant, and the rest must not diverge there
     if drift.growth_rate < 0.0 and not found.model.bounded:
         return None
