@@ -37,6 +37,7 @@ from koopman_ros.learning.identification import (
     IdentificationMethod,
     Identified,
     identify,
+    identify_structure,
     identify_unmeasured,
     methods_of,
     Stopped,
@@ -140,6 +141,7 @@ class Retrained:
             'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
             'drift': self.found.drift.form,
+            'structure_search': list(self.found.steps),
             'drift_degree': (
                 self.found.drift.degree if isinstance(self.found.drift, DriftModel) else None),
             'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
@@ -375,7 +377,10 @@ def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
     if task.physical_model:
         return estimate_parameters(plant, episodes, plant_class(task.physical_model),
                                    task.constants, seed=seed, watch=watch)
-    if task.unmeasured_states:
+    if task.unmeasured_states < 0 and not task.model:
+        return identify_structure(plant, episodes, methods=methods, seed=seed, watch=watch,
+                                  backend=backend)
+    if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
                                    watch=watch, backend=backend)
     return identify(plant, episodes, methods=methods, seed=seed, watch=watch, backend=backend)
@@ -394,9 +399,9 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
         try:
             learned = compare_classes(
                 found, bare.plant, thresholds, model_class=task.model_class,
-                n_z=task.coordinates, seed=task.seed, starts=task.starts,
-                watch=progress.learning, judging=progress.judging, device=task.device,
-                backend=backend, begin=begin)
+                n_z=task.coordinates or 2 + len(found.drift.box.states), seed=task.seed,
+                starts=task.starts, watch=progress.learning, judging=progress.judging,
+                device=task.device, backend=backend, begin=begin)
         except TrainingFailed as error:
             reasons: tuple[str, ...] = (str(error),)
         progress('decide', _JUDGED, 'judging')

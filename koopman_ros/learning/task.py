@@ -38,7 +38,7 @@ class TrainingTask:
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
     #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
     model_class: str = IDENTITY_LIFT
-    coordinates: int = 3  #: n_z of the identity lift
+    coordinates: int = 0  #: n_z of the identity lift; 0: two more than states
     seed: int = 0  #: of the split and of the training, and of the reduction of a long record
     #: samples that are learned from and judged by; a longer record is reduced to them, see
     #: :func:`read_record`
@@ -52,7 +52,8 @@ class TrainingTask:
     #: dead time of inputs by name, in s; of those not named it is found from the record
     dead_time: Mapping[str, float] = field(default_factory=dict)
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
-    #: not compared with the present one, which has other states
+    #: not compared with the present one, which has other states. -1: as many as free runs of the
+    #: record need, see :func:`identify_structure`; none where there is a present lift
     unmeasured_states: int = 0
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
     #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.
@@ -96,7 +97,7 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     :param current: the present lift, where there is one.
     :raises ValueError: for a task whose parts do not fit each other or the present lift.
     """
-    if task.physical_model and (task.unmeasured_states or task.input_gain):
+    if task.physical_model and (task.unmeasured_states > 0 or task.input_gain):
         raise ValueError(f'physical_model = {task.physical_model!r} defines the states and the '
                          'effect of the inputs: set unmeasured_states to 0 and give no input_gain')
     if task.constants and not task.physical_model:

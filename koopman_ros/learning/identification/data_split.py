@@ -103,7 +103,7 @@ class SplitRecord:
                  for i, part in enumerate(self.parts) if i in share and i in self._settled],
                 self.length(drift, _GROWTH))
             for share in ((*self.fit, *self.choose), self.held_out))
-        linear = output_error(
+        linear = drift if isinstance(drift, DriftModel) and drift.degree == 1 else output_error(
             _linear(drift, known), Segments.of(known, self.step), monitor=monitor,
             learn_input_matrix=self.plant.B is None)
         return Identified(drift, method, linear, tuple(scores), noise_level(known, drift),

@@ -138,12 +138,12 @@ class _Choice:
             self.steps.append(one.text)
             return True
         best = _plainest(before)
-        less, deviation = _excess(*_blocks([best, one]))
+        more, deviation = _excess(*_blocks([one, best]))
         self.steps.append(
-            f'{one.text}; mean square {100.0 * abs(less):.3g} % '
-            f'{"less" if less > 0.0 else "more"} than with the best before (standard error '
+            f'{one.text}; mean square {100.0 * abs(more):.3g} % '
+            f'{"more" if more > 0.0 else "less"} than with the best before (standard error '
             f'{100.0 * deviation:.2g} %)')
-        return less > _SIGMAS * deviation
+        return more < -_SIGMAS * deviation
 
     def explained(self, square: float) -> bool:
         """Return whether a candidate errs by no more than this mean square."""
