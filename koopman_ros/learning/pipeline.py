@@ -29,7 +29,7 @@ from koopman_ros.learning.acceptance import (
 )
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import compare_classes
-from koopman_ros.learning.free_run import FreeRun, simulate
+from koopman_ros.learning.free_run import FREE_RUN, FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
@@ -256,17 +256,18 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     learned = learned.with_model(replace(learned.model, dead_time=dead_time))
-    runs = {name: simulate(learned, one) for name, one in (
-        ('record', recorded), ('test', test)) if one is not None}
+    runs = {'record': simulate(learned, recorded)}
+    if test is not None:
+        runs['test'] = simulate(learned, test, usual=runs['record'].rmse)
     decision = replace(decision, reasons=(
-        *decision.reasons, *_failed_test(runs, found, test)), warnings=(
+        *decision.reasons, *_failed_test(runs, found, recorded, test)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     progress('decide', 0.9, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
-                             episodes, learned.chosen.name)
+                             episodes, learned.chosen.name, runs['record'])
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
@@ -308,12 +309,14 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
         late, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
 
 
-def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | None
-                 ) -> tuple[str, ...]:
+def _failed_test(runs: Mapping[str, FreeRun], found: Identified, recorded: Record,
+                 test: Record | None) -> tuple[str, ...]:
     """Say that the free run over the test record errs more than the best linear model's."""
     if test is None:
         return ()
-    own, linear = runs['test'], simulate(found.linear, test)
+    own = runs['test']
+    best = replace(found, drift=found.linear)
+    linear = simulate(best, test, usual=simulate(best, recorded).rmse)
     scale = found.drift.box.states.only(own.names).scale
     if not np.sum((own.rmse / scale) ** 2) > np.sum((linear.rmse / scale) ** 2):
         return ()
@@ -417,7 +420,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
 
 
 def _with_provenance(model: LiftedModel, found: Identified, decision: AcceptanceResult,
-                     covered: float, episodes: list[Episode], model_class: str) -> LiftedModel:
+                     covered: float, episodes: list[Episode], model_class: str, run: FreeRun
+                     ) -> LiftedModel:
     sha = hashlib.sha256()
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
@@ -428,6 +432,8 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
         labels = [label] if len(values) == 1 else [
             f'{label}_{name}' for name in model.states.names]
         metrics |= dict(zip(labels, map(float, values), strict=True))
+    metrics |= {f'{FREE_RUN}_{name}': float(error)
+                for name, error in zip(run.names, run.rmse, strict=True)}
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, verified_loops=decision.law_check.tried, provenance=replace(
