@@ -24,6 +24,11 @@ from koopman_ros.learning.identification.drift import (
     prediction_error,
     Segments,
 )
+from koopman_ros.learning.identification.episode_offsets import (
+    MOST_EPISODES,
+    with_episode_inputs,
+    without_episode_inputs,
+)
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
@@ -82,6 +87,7 @@ class _StructureCandidate:
     start: _Polynomial  #: where its search began, in the same coordinates
     hidden: int
     errors: Array  #: (N, n_y) of simulations by models that were not fitted there, in deviations
+    offsets: bool = False  #: whether each episode has a constant disturbance
 
     @property
     def gain(self) -> Array:
@@ -108,7 +114,8 @@ class _StructureCandidate:
         drift = self.model.drift
         form = 'linear drift' if isinstance(drift, DriftModel) and drift.degree == 1 else (
             drift.form)
-        return f'{form} with {_not_measured(self.hidden)}: ' + ', '.join(
+        offsets = ' and an offset of each episode' if self.offsets else ''
+        return f'{form} with {_not_measured(self.hidden)}{offsets}: ' + ', '.join(
             f'{error:.4g} {unit}' for error, unit in zip(
                 self.score.rmse, drift.box.states.units, strict=False))
 
@@ -200,10 +207,11 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     turn, see :meth:`Refined.left_out`. First linear models of rising order are simulated, from
     realisations of stable models of the outputs, otherwise from filters; the search ends with the
     order that lowers the mean squared error by no more than two standard errors, over blocks of
-    the record. Then polynomials of higher degree and small networks are added to the linear drift
-    of the best order. The smallest model is taken that errs by no more than two standard errors
-    above the least. At last the gain of its filter is fitted. Unmeasured states are those of the
-    filter: dimensionless, from -1 to 1, because no record gives their names and units.
+    the record. A constant disturbance of each of several episodes is kept by the same rule. Then
+    polynomials of higher degree and small networks are added to the linear drift of the best
+    order. The smallest model is taken that errs by no more than two standard errors above the
+    least. At last the gain of its filter is fitted. Unmeasured states are those of the filter:
+    dimensionless, from -1 to 1, because no record gives their names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
@@ -225,7 +233,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     least = 1 if measured is None else 0
     networks = {f'network of {units} units, start {start + 1}': (units, _STARTS * seed + start)
                 for units in _UNITS for start in range(_STARTS)}
-    total = hidden + 1 - least + highest_degree + len(networks) + 2
+    total = hidden + 1 - least + highest_degree + len(networks) + 3
     end, choice = time.time() + budget, _Choice()
     begun = itertools.count()
 
@@ -241,21 +249,29 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             choice.steps.append(f'left out after {budget:.0f} s: {text}')
         return monitor
 
-    search, linear, n_y = _Search(record), None, len(plant.state_names)
+    first, linear, n_y = _Search(record), None, len(plant.state_names)
     for count in range(least, hidden + 1):
         monitor = stage(f'drift of degree 1 with {_not_measured(count)}')
         if linear is not None and monitor():
             break
-        found = search.linear(count, monitor)
+        found = first.linear(count, monitor)
         if found is not None and choice.gains(found):
             linear = found
         elif found is not None:
             break
     if linear is None:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
+    search = first
+    if plant.B is None and 1 < len(episodes) <= MOST_EPISODES:
+        monitor = stage('constant offset of each episode')
+        more = _Search(SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True))
+        more.samples = first.samples
+        offsets = more.simulated(more.extended(linear), linear.hidden, monitor)
+        if choice.gains(offsets and replace(offsets, offsets=True)):
+            search, linear = more, choice.candidates[-1]
     kept = None
     if measured is not None and isinstance(measured.drift, DriftModel):
-        kept = search.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))), 0,
+        kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))), 0,
                                 stage(measured.drift.form))
         choice.gains(kept)
     count = linear.hidden
@@ -268,9 +284,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         monitor = stage(f'drift of degree {degree} with {_not_measured(count)}')
         if not monitor():
             last = search.filtered(raised(last), monitor)
-            choice.gains(last and search.simulated(last, count, monitor))
+            found = last and search.simulated(last, count, monitor)
+            choice.gains(found and replace(found, offsets=linear.offsets))
     if not choice.explained(explained):
-        _add_networks(choice, _Shared(record, linear, search.samples, search.learn_B, end),
+        _add_networks(choice, _Shared(search.record, linear, search.samples, search.learn_B, end),
                       networks, lambda text: stage(f'{text} with {_not_measured(count)}'),
                       backend or Serial())
     able = choice.candidates
@@ -282,6 +299,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             return replace(measured, scores=tuple(one.score for one in choice.candidates),
                            steps=choice.ended(best))
         try:
+            record = search.record if best.offsets else first.record
             predictor = _with_gain(record, best, stage('gain of the filter'))
             break
         except ValueError:
@@ -289,8 +307,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             able = [one for one in able if one is not best]
             if not able:
                 raise
-    return replace(record.identified(
-        predictor, best.label, [one.score for one in choice.candidates], stage('linear model')),
+    found = record.identified(
+        predictor, best.label, [one.score for one in choice.candidates], stage('linear model'))
+    return replace(
+        without_episode_inputs(found, len(plant.input_names)) if best.offsets else found,
         warnings=warnings, steps=choice.ended(best))
 
 
@@ -372,7 +392,7 @@ def _network(shared: _Shared, item: tuple[int, int], tell: Tell
     if drift.growth_rate < 0.0 and not found.model.bounded:
         return None
     candidate = _candidate(found, linear.start, linear.hidden)
-    return None if candidate is None else (found.cost, candidate)
+    return candidate and (found.cost, replace(candidate, offsets=linear.offsets))
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
@@ -482,6 +502,14 @@ class _Search:
                 if self.samples == samples:
                     break
         return _candidate(refined, start, hidden)
+
+    def extended(self, linear: _StructureCandidate) -> _Polynomial:
+        """Return a linear model with further inputs of the record, which do nothing yet."""
+        drift = linear.model.drift
+        assert isinstance(drift, DriftModel)
+        inputs = self._shape(0).box.inputs
+        B = np.hstack((drift.B, np.zeros((len(drift.B), len(inputs) - drift.B.shape[1]))))
+        return Predictor(replace(drift, B=B, box=replace(drift.box, inputs=inputs)), linear.gain)
 
     def filtered(self, start: _Polynomial, monitor: Callable[..., bool]) -> _Polynomial | None:
         """Return a filter that foresees the record better; None where there is none."""

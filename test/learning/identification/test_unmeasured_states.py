@@ -73,6 +73,28 @@ def test_modes_and_gain_of_a_linear_plant():
     assert found.noise[0] == pytest.approx(NOISE, rel=0.15)
 
 
+def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
+    pushes = np.array([0.5, -0.2])
+    days = [record(lambda x, u, push=push: oscillator(x, u) + np.array([push, 0.0]),
+                   samples=400, seed=seed)
+            for seed, push in enumerate(pushes)]
+    found = identify_unmeasured(PLANT, days, 1, highest_degree=1)
+    drift = found.drift
+    assert drift.box.inputs.names == ('flow',)
+    # as it moves the steady state, whatever the coordinates
+    slope = drift.slope(drift.box.states.center)
+    moved = -np.linalg.solve(slope, found.offsets.T)[0]
+    assert moved == pytest.approx(-np.linalg.solve(A, [1.0, 0.0])[0] * (
+        pushes - np.mean(pushes)), rel=0.05)
+    assert np.sort_complex(np.linalg.eigvals(slope)) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(A)), rel=0.03)
+    assert any('offset of each episode' in step for step in found.steps)
+    same = identify_unmeasured(PLANT, [day.part(0, 400) for day in (
+        record(oscillator, samples=400), record(oscillator, samples=400, seed=1))], 1,
+        highest_degree=1)
+    assert not len(same.offsets)
+
+
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
     found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
                                 highest_degree=2)
