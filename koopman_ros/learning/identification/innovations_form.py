@@ -41,7 +41,7 @@ class Predictor(Generic[_Drift]):
     def run(self, episodes: Sequence[Episode], step: float) -> FilterRun:
         """Filter episodes of measurements (N, n_y), from the starts that suit the first ones."""
         data = Segments.of(episodes, step)
-        run = self._filter(data, self._starts(data))
+        run = self._filter(data, self.starts(data))
         if not np.all(np.isfinite(run[1])):
             raise ValueError('the estimate of the unmeasured states diverges')
         return _run(data, run)
@@ -70,7 +70,7 @@ class Predictor(Generic[_Drift]):
         states = self.drift.box.states
         return states.only(states.names[:self.gain.shape[1]]).to_deviation(data.x)
 
-    def _starts(self, data: Segments) -> Array:
+    def starts(self, data: Segments) -> Array:
         """Return initial states (M, n_x) that predict the first measurements, in deviations."""
         taken = np.cumsum(data.sampled, axis=0).max(axis=1)
         rows = min(int(np.sum(taken <= SETTLING)), len(data.steps))

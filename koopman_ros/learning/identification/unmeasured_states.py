@@ -57,7 +57,7 @@ from koopman_ros.model import Box, Coordinates
 
 HIGHEST_DEGREE = 3
 MOST_UNMEASURED = 3  # states that are tried where their number is not given
-BUDGET = 600.0  # s of a search
+BUDGET = 600.0  # s of processor time of a search
 UNIT = '1'  # of a state that is not measured: any other scale would do as well
 # Gains of filters to begin with, of outputs, of their rates and of what moves these, over powers
 # of the interval between samples (alpha, beta and gamma of tracking filters).
@@ -68,9 +68,10 @@ _SIGMAS = 2.0
 _MOST = 2.0  # times the least squared error that a smaller model may have
 
 _UNITS = (3, 8)  # hidden units of the networks that are tried
-_STARTS = 4  # of each network, of which the one that fits best is judged
+_STARTS = 4  # of each network, the best of which is fitted to the end
 _RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
 _ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
+_SCREENING = 50  # iterations of a network from each start, of which the best goes on
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 _LOST = 10.0  # half-ranges from the measurement
@@ -86,7 +87,9 @@ class _StructureCandidate:
     model: Refinable
     start: _Polynomial  #: where its search began, in the same coordinates
     hidden: int
-    errors: Array  #: (N, n_y) of simulations by models that were not fitted there, in deviations
+    #: (N, n_y) in deviations: the larger ones of simulations by models that were not fitted there,
+    #: and of those from starts that are fitted to the first samples
+    errors: Array
     offsets: bool = False  #: whether each episode has a constant disturbance
 
     @property
@@ -204,14 +207,15 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
     Models are compared by simulations of the record at samples that are left out of the fit in
-    turn, see :meth:`Refined.left_out`. First linear models of rising order are simulated, from
-    realisations of stable models of the outputs, otherwise from filters; the search ends with the
-    order that lowers the mean squared error by no more than two standard errors, over blocks of
-    the record. A constant disturbance of each of several episodes is kept by the same rule. Then
-    polynomials of higher degree and small networks are added to the linear drift of the best
-    order. The smallest model is taken that errs by no more than two standard errors above the
-    least. At last the gain of its filter is fitted. Unmeasured states are those of the filter:
-    dimensionless, from -1 to 1, because no record gives their names and units.
+    turn, see :meth:`Refined.left_out`, and from starts that are fitted to its first samples,
+    whichever err more. First linear models of rising order are simulated, from realisations of
+    stable models of the outputs, otherwise from filters; the search ends with the order that
+    lowers the mean squared error by no more than two standard errors, over blocks of the record. A
+    constant disturbance of each of several episodes is kept by the same rule. Then polynomials of
+    higher degree and small networks are added to the linear drift of the best order. The smallest
+    model is taken that errs by no more than two standard errors above the least. At last the gain
+    of its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to
+    1, because no record gives their names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
@@ -219,7 +223,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         one.
     :param highest_degree: of polynomials f.
     :param seed: of the split, and of networks.
-    :param budget: time in s, after which the best so far is taken and the rest left out.
+    :param budget: processor time in s, after which the best so far is taken and the rest left out.
     :param backend: where networks are fitted; this process by default.
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
@@ -233,17 +237,17 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     least = 1 if measured is None else 0
     networks = {f'network of {units} units, start {start + 1}': (units, _STARTS * seed + start)
                 for units in _UNITS for start in range(_STARTS)}
-    total = hidden + 1 - least + highest_degree + len(networks) + 3
-    end, choice = time.time() + budget, _Choice()
+    total = hidden + 1 - least + highest_degree + len(networks) + len(_UNITS) + 3
+    end, choice = time.process_time() + budget, _Choice()
     begun = itertools.count()
 
-    def stage(text: str) -> Callable[..., bool]:
+    def stage(text: str, limit: float = end) -> Callable[..., bool]:
         number = min(next(begun), total - 1)
 
         def monitor(*_: object) -> bool:
             if watch(number, total, text):
                 raise Stopped
-            return time.time() > end
+            return time.process_time() > limit
 
         if monitor():
             choice.steps.append(f'left out after {budget:.0f} s: {text}')
@@ -287,8 +291,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             found = last and search.simulated(last, count, monitor)
             choice.gains(found and replace(found, offsets=linear.offsets))
     if not choice.explained(explained):
-        _add_networks(choice, _Shared(search.record, linear, search.samples, search.learn_B, end),
-                      networks, lambda text: stage(f'{text} with {_not_measured(count)}'),
+        shared = _Shared(linear, search.record.simulated(linear.start, search.samples),
+                         search.learn_B, (end - time.process_time()) / len(networks))
+        _add_networks(choice, shared, networks,
+                      lambda text: stage(f'{text} with {_not_measured(count)}'),
                       backend or Serial())
     able = choice.candidates
     while True:
@@ -300,18 +306,18 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                            steps=choice.ended(best))
         try:
             record = search.record if best.offsets else first.record
-            predictor = _with_gain(record, best, stage('gain of the filter'))
+            predictor = _with_gain(record, best, stage('gain of the filter', np.inf))
             break
         except ValueError:
             # its filter diverges
             able = [one for one in able if one is not best]
             if not able:
                 raise
-    found = record.identified(
-        predictor, best.label, [one.score for one in choice.candidates], stage('linear model'))
-    return replace(
-        without_episode_inputs(found, len(plant.input_names)) if best.offsets else found,
-        warnings=warnings, steps=choice.ended(best))
+    result = record.identified(predictor, best.label, [one.score for one in choice.candidates],
+                               stage('linear model', np.inf))
+    if best.offsets:
+        result = without_episode_inputs(result, len(plant.input_names))
+    return replace(result, warnings=warnings, steps=choice.ended(best))
 
 
 def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
@@ -347,16 +353,19 @@ def _excess(own: Array, other: Array) -> tuple[float, float]:
 class _Shared:
     """The common data of all networks."""
 
-    record: SplitRecord
     linear: _StructureCandidate  #: beside which they are
-    samples: int  #: longest piece that is simulated
+    data: tuple[Segments, Array]  #: pieces that are simulated, and where they start
     learn_input_matrix: bool
-    end: float  #: of the search
+    budget: float  #: of each, in s of processor time
+
+    def allowed(self, network: NetworkDrift) -> bool:
+        """Return whether a network diverges far from the data only where the plant does."""
+        return network.bounded or self.linear.model.drift.growth_rate >= 0.0
 
 
 def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[int, int]],
                   stage: Callable[[str], Callable[..., bool]], backend: Backend) -> None:
-    """Add the network of each size that fits best of several starts."""
+    """Add networks of rising size, as long as they gain; of several starts the best."""
     monitors = dict[str, Callable[..., bool]]()
 
     def watch(name: str, _: object) -> bool:
@@ -367,50 +376,57 @@ def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[in
     for units in _UNITS:
         own = {name: item for name, item in items.items() if item[0] == units}
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
-            fitted = [found for _, found in results if found is not None]
-        if fitted and not choice.gains(min(fitted, key=lambda pair: pair[0])[1]):
+            begun = [found for _, found in results if found is not None]
+        if not begun:
+            continue
+        linear, monitor = shared.linear, stage(f'network of {units} units')
+        found = _simulated(min(begun, key=lambda pair: pair[0])[1], linear.gain, *shared.data,
+                           monitor)
+        candidate = _candidate(found, linear.start, shared.data[0], linear.hidden) if (
+            shared.allowed(found.model)) else None
+        if candidate and not choice.gains(replace(candidate, offsets=linear.offsets)):
             break
 
 
 def _network(shared: _Shared, item: tuple[int, int], tell: Tell
-             ) -> tuple[float, _StructureCandidate] | None:
-    """Return the cost of a network and the candidate; None where it may diverge."""
+             ) -> tuple[float, NetworkDrift] | None:
+    """Return the cost of a network after a few iterations; None where it may diverge."""
+    end = time.process_time() + shared.budget
+
     def monitor(*_: object) -> bool:
         tell(None)
-        return time.time() > shared.end
+        return time.process_time() > end
 
-    if monitor():
-        return None
-    linear, (units, seed) = shared.linear, item
-    drift = linear.model.drift
+    monitor()
+    (units, seed), drift = item, shared.linear.model.drift
     assert isinstance(drift, DriftModel)
-    network = NetworkDrift.beside(
-        drift, units, seed, ridge=_RIDGE, learn_input_matrix=shared.learn_input_matrix)
-    found = _simulated(network, linear.gain,
-                       *shared.record.simulated(linear.start, shared.samples), monitor)
-    # far from the data a network is constant, and the rest must not diverge there
-    if drift.growth_rate < 0.0 and not found.model.bounded:
-        return None
-    candidate = _candidate(found, linear.start, linear.hidden)
-    return candidate and (found.cost, replace(candidate, offsets=linear.offsets))
+    found = _simulated(
+        NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
+                            learn_input_matrix=shared.learn_input_matrix),
+        shared.linear.gain, *shared.data, monitor, iterations=_SCREENING)
+    return (found.cost, found.model) if shared.allowed(found.model) else None
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
-               monitor: Callable[..., bool]) -> Refined[_Model]:
+               monitor: Callable[..., bool], iterations: int = _ITERATIONS) -> Refined[_Model]:
     """Return a model whose simulations err least."""
     penalty = model.penalty if isinstance(model, NetworkDrift) else None
     return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
-                            tolerance=_TOLERANCE, penalty=penalty, iterations=_ITERATIONS,
+                            tolerance=_TOLERANCE, penalty=penalty, iterations=iterations,
                             monitor=monitor)
 
 
-def _candidate(refined: Refined[Any], start: Predictor[DriftModel], hidden: int
+def _candidate(refined: Refined[Any], start: Predictor[DriftModel], data: Segments, hidden: int
                ) -> _StructureCandidate | None:
     """Return the candidate of a model, or none where its simulations diverge."""
     if not np.isfinite(refined.cost):
         return None
     with np.errstate(all='ignore'):
         errors = refined.left_out(SETTLING)
+        # a state that the first samples do not tell is of no use
+        free = Predictor(refined.model.drift, 0.0 * start.gain)
+        others = free.along(data, free.starts(data)).innovations
+        errors = np.where(np.abs(errors) > np.abs(others), errors, others)
     return _StructureCandidate(refined.model, start, hidden, errors) if np.all(
         np.abs(errors) < _LOST) else None
 
@@ -480,8 +496,18 @@ class _Search:
             start = begin(hidden, monitor)
             found = start and self.simulated(start, hidden, monitor)
             if found is not None:
-                return found
+                return self._standardised(found) if hidden else found
         return None
+
+    def _standardised(self, found: _StructureCandidate) -> _StructureCandidate:
+        """Return a linear model whose hidden states are between -1 and 1 in the record."""
+        assert isinstance(found.model, PolynomialCoefficients)
+        try:
+            start = Predictor(found.model.drift, found.gain)
+            start = standardised(start, self.record.estimates(start))
+        except (ValueError, np.linalg.LinAlgError):
+            return found
+        return replace(found, model=replace(found.model, drift=start.drift), start=start)
 
     def simulated(self, start: _Polynomial, hidden: int, monitor: Callable[..., bool]
                   ) -> _StructureCandidate | None:
@@ -501,7 +527,7 @@ class _Search:
                 self.samples = self.record.memory(refined.model.drift)
                 if self.samples == samples:
                     break
-        return _candidate(refined, start, hidden)
+        return _candidate(refined, start, data, hidden)
 
     def extended(self, linear: _StructureCandidate) -> _Polynomial:
         """Return a linear model with further inputs of the record, which do nothing yet."""
