@@ -37,7 +37,7 @@ _OPTIONS = (
     'identification_methods', 'restarts', 'training_seed', 'training_samples', 'warm_start_model',
     'acceptance_margin', 'max_condition_number', 'synchronisation_tolerance', 'executor', 'device')
 # Not those of a node: of a plant that is not known yet any class may be the best, and states may
-# be missing. A trainer mostly replaces a model whose states its controller already has.
+# be missing. The controller of a trainer is set up for the states of its model.
 _DEFAULTS = {'model_class': BEST, 'model_output': '', 'unmeasured_states': -1}
 
 

@@ -55,7 +55,7 @@ from koopman_ros.learning.record import (
 )
 from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, save
-from koopman_ros.model_classes import BEST, CLASSES
+from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
 
@@ -216,6 +216,9 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     progress, thresholds = _Progress(on_progress), _checked(task)
     current, sibling = (load(path) if path else None
                         for path in (task.model, task.warm_start_model))
+    if task.model_class == SAME:
+        task = replace(task, model_class=BEST if current is None else (
+            current.provenance.model_class or IDENTITY_LIFT))
     plant, states, inputs = resolve_signals(task, current)
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
@@ -326,9 +329,9 @@ def _failed_test(runs: Mapping[str, FreeRun], found: Identified, recorded: Recor
 
 def _checked(task: TrainingTask) -> Thresholds:
     """Return the thresholds of a task; ValueError for fields that do not fit."""
-    if task.model_class not in (*CLASSES, BEST):
+    if task.model_class not in (*CLASSES, BEST, SAME):
         raise ValueError(f'model_class = {task.model_class!r} must be one of '
-                         f'{", ".join((*CLASSES, BEST))}')
+                         f'{", ".join((*CLASSES, BEST, SAME))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     if task.warm_start_model == FIRST:

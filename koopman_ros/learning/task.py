@@ -17,7 +17,7 @@ from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.model import Coordinates, LiftedModel
-from koopman_ros.model_classes import IDENTITY_LIFT
+from koopman_ros.model_classes import SAME
 from koopman_ros.records import RecordedInput, RecordedState
 
 #: As a task's sibling, in a fleet: the first plant of its kind whose lift is accepted.
@@ -36,8 +36,9 @@ class TrainingTask:
     inputs: tuple[RecordedInput, ...]  #: likewise
     plant: str = ''  #: name of the plant in a first lift
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
-    #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
-    model_class: str = IDENTITY_LIFT
+    #: class to learn, a name of `compare`, ``'best'`` for the one that its rule takes, or ``'same'``
+    #: for that of the present lift, the best where there is none
+    model_class: str = SAME
     coordinates: int = 0  #: n_z of the identity lift; 0: two more than states
     seed: int = 0  #: of the split and of the training, and of the reduction of a long record
     #: samples that are learned from and judged by; a longer record is reduced to them, see

@@ -29,7 +29,7 @@ from koopman_ros.core.units import display_unit
 from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
-from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
+from koopman_ros.model_classes import BEST, CLASSES, SAME
 from koopman_ros.parameters.equations import named_ranges, refused
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
@@ -120,8 +120,8 @@ class TrainerParameters:
         'retrained.safetensors', 'File for an accepted model; the file that it replaces is kept '
                                  'as .previous.safetensors.')
     model_class: str = parameter(
-        IDENTITY_LIFT, 'Class of the new model; best: train all of them and select one by '
-        'comparison.', choices=(*CLASSES, BEST))
+        SAME, 'Class of the new model; best: train all of them and select one by comparison; same: '
+        'that of model, or best if model is empty.', choices=(*CLASSES, BEST, SAME))
     lifted_dimension: int = parameter(
         0, 'Number of lifted coordinates n_z of a new identity lift; 0: two more than states.', '',
         0, 8, smallest=2)
