@@ -36,8 +36,8 @@ class TrainingTask:
     inputs: tuple[RecordedInput, ...]  #: likewise
     plant: str = ''  #: name of the plant in a first lift
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
-    #: class to learn, a name of `compare`, ``'best'`` for the one that its rule takes, or ``'same'``
-    #: for that of the present lift, the best where there is none
+    #: class to learn, a name of `compare`, ``'best'`` for the one that its rule takes, or
+    #: ``'same'`` for that of the present lift, the best where there is none
     model_class: str = SAME
     coordinates: int = 0  #: n_z of the identity lift; 0: two more than states
     seed: int = 0  #: of the split and of the training, and of the reduction of a long record

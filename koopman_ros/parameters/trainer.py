@@ -120,8 +120,8 @@ class TrainerParameters:
         'retrained.safetensors', 'File for an accepted model; the file that it replaces is kept '
                                  'as .previous.safetensors.')
     model_class: str = parameter(
-        SAME, 'Class of the new model; best: train all of them and select one by comparison; same: '
-        'that of model, or best if model is empty.', choices=(*CLASSES, BEST, SAME))
+        SAME, 'Class of the new model; best: train all of them and select one by comparison; '
+        'same: that of model, or best if model is empty.', choices=(*CLASSES, BEST, SAME))
     lifted_dimension: int = parameter(
         0, 'Number of lifted coordinates n_z of a new identity lift; 0: two more than states.', '',
         0, 8, smallest=2)
