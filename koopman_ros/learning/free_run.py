@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import os
 from pathlib import Path
@@ -131,7 +131,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     :param record: with all inputs and at least one state of the model, in any units.
     :param init: samples to which the start is fitted; at most half of an episode.
     :param usual: (n_y,) root mean square error of the model's free run over a record that it was
-        learned from, in its units; by default that in a model's file. The first samples contradict
+        learned from, in its units; by default that of the model itself. The first samples contradict
         the model where they err by more than 1.5 times that. Without it there is no disturbance.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
@@ -182,9 +182,14 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
 
 
 def _usual(model: AnyModel, names: Sequence[str]) -> Array | None:
-    """Return the error (n_y,) of a model's free run of its record, where its file has that."""
-    metrics = model.provenance.metrics if isinstance(model, LiftedModel) else {}
-    found = np.array([metrics.get(f'{FREE_RUN}_{name}', np.nan) for name in names])
+    """Return the error (n_y,) of a model's free run of its record, where it is known."""
+    errors: Mapping[str, float] = {}
+    if isinstance(model, LiftedModel):
+        errors = {name: model.provenance.metrics.get(f'{FREE_RUN}_{name}', np.nan)
+                  for name in names}
+    elif isinstance(model, Identified):
+        errors = dict(zip(model.drift.box.states.names, model.free_run.tolist(), strict=False))
+    found = np.array([errors.get(name, np.nan) for name in names])
     return None if np.any(np.isnan(found)) else found
 
 

@@ -148,6 +148,9 @@ class Identified:
     #: units; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
     steps: tuple[str, ...] = ()  #: of the search for the structure, in words
+    #: (n_y,) root mean square errors of free runs of the record, in state units, where they were
+    #: compared
+    free_run: Array = field(default_factory=lambda: np.zeros(0))
     #: (E, n_x) constant disturbances of the rates in the episodes of the record, whose mean is 0,
     #: in state units per time unit; no row where they are not needed. The drift has none.
     offsets: Array = field(default_factory=lambda: np.zeros((0, 0)))

@@ -32,7 +32,7 @@ def realised(episodes: Sequence[Episode], period: float, n_x: int
     :return: None where no stable model is found.
     """
     n_y = episodes[0].x.shape[1]
-    order = -(-n_x // n_y)
+    order = min(n_x, 1 - (-n_x // n_y))
     data = [Sampled.of(episode, period, 0) for episode in episodes if len(episode) > 10 * order]
     found = LinearModels(data, order, n_y).state_space() if data else None
     if found is None:

@@ -303,7 +303,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             # the estimate without unmeasured states, as it is
             assert measured is not None
             return replace(measured, scores=tuple(one.score for one in choice.candidates),
-                           steps=choice.ended(best))
+                           steps=choice.ended(best), free_run=best.score.rmse)
         try:
             record = search.record if best.offsets else first.record
             predictor = _with_gain(record, best, stage('gain of the filter', np.inf))
@@ -317,7 +317,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                                stage('linear model', np.inf))
     if best.offsets:
         result = without_episode_inputs(result, len(plant.input_names))
-    return replace(result, warnings=warnings, steps=choice.ended(best))
+    return replace(result, warnings=warnings, steps=choice.ended(best), free_run=best.score.rmse)
 
 
 def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:

@@ -12,6 +12,7 @@ from scipy.optimize import fsolve
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import (
+    identify_structure,
     identify_unmeasured,
     Stopped,
     unmeasured_states,
@@ -71,6 +72,20 @@ def test_modes_and_gain_of_a_linear_plant():
     assert found.method.startswith('output error')
     assert min(score.rmse[0] for score in found.scores) == pytest.approx(NOISE, rel=0.3)
     assert found.noise[0] == pytest.approx(NOISE, rel=0.15)
+
+
+@pytest.mark.parametrize(('rate', 'hidden'), [
+    (oscillator, 1), (lambda x, u: np.array([u - 0.4 * x[0] - 0.1 * x[0] ** 3, -x[1]]), 0)])
+def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate, hidden):
+    found = identify_structure(PLANT, [record(rate, samples=500)])
+    assert found.hidden == hidden
+    assert bool(found.steps) == bool(hidden)
+
+
+def test_the_best_so_far_is_taken_when_the_time_is_over():
+    found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
+    assert found.hidden == 1
+    assert any('left out after 0 s: drift of degree 1 with 2' in step for step in found.steps)
 
 
 def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
