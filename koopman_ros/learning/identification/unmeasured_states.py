@@ -425,7 +425,7 @@ def _candidate(refined: Refined[Any], start: Predictor[DriftModel], data: Segmen
         errors = refined.left_out(SETTLING)
         # a state that the first samples do not tell is of no use
         free = Predictor(refined.model.drift, 0.0 * start.gain)
-        others = free.along(data, free.starts(data)).innovations
+        others = free.along(data, free.starts(data, refined.starts)).innovations
         errors = np.where(np.abs(errors) > np.abs(others), errors, others)
     return _StructureCandidate(refined.model, start, hidden, errors) if np.all(
         np.abs(errors) < _LOST) else None
@@ -492,11 +492,15 @@ class _Search:
 
     def linear(self, hidden: int, monitor: Callable[..., bool]) -> _StructureCandidate | None:
         """Return the linear model of an order; None where simulations diverge."""
+        samples = self.samples
         for begin in (self._realised, self._from_filters):
             start = begin(hidden, monitor)
             found = start and self.simulated(start, hidden, monitor)
-            if found is not None:
+            # an unstable plant in a closed loop has no realisation of its own
+            if found is not None and (begin == self._from_filters
+                                      or found.model.drift.growth_rate < 0.0):
                 return self._standardised(found) if hidden else found
+            self.samples = samples
         return None
 
     def _standardised(self, found: _StructureCandidate) -> _StructureCandidate:
