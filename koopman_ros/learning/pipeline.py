@@ -237,8 +237,9 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     dead_time = _dead_time(task, plant, episodes, progress)
     episodes = [late for episode in episodes
                 if (late := episode.delayed(dead_time / seconds)) is not None]
-    found = replace(_estimate(task, plant, episodes, methods, progress, backend),
-                    dead_time=dead_time / seconds)
+    found = _estimate(task, plant, episodes, methods, progress, backend)
+    found = replace(found, dead_time=found.dead_time + dead_time / seconds)
+    dead_time = seconds * found.dead_time
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(record.episodes), record.account, task.bags)
     if found.hidden:
@@ -385,10 +386,10 @@ def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
                                    task.constants, seed=seed, watch=watch)
     if task.unmeasured_states < 0 and not task.model:
         return identify_structure(plant, episodes, methods=methods, seed=seed, watch=watch,
-                                  backend=backend)
+                                  backend=backend, dead_times=not task.dead_time)
     if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
-                                   watch=watch, backend=backend)
+                                   watch=watch, backend=backend, dead_times=not task.dead_time)
     return identify(plant, episodes, methods=methods, seed=seed, watch=watch, backend=backend)
 
 

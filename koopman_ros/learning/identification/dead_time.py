@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 from koopman_ros.core.datasets import Array, Episode
 
 _ORDERS = (1, 2, 3)  # of the linear models
-_LONGEST = 60  # samples of dead time that are tried, where the record is long enough
-_SHARE = 8  # of an episode, which the longest dead time may take
+LONGEST = 60  # samples of dead time that are tried, where the record is long enough
+SHARE = 8  # of an episode, which the longest dead time may take
 _ROUNDS = 3  # over all inputs
 _ITERATIONS = 8  # of Steiglitz and McBride from nothing; from a neighbour's filter below
 _FEW = 3
@@ -62,7 +62,7 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     """
     period = float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
     n_y, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
-    longest = min(_LONGEST, max(len(episode) for episode in episodes) // _SHARE)
+    longest = min(LONGEST, max(len(episode) for episode in episodes) // SHARE)
     data = [Sampled.of(episode, period, longest) for episode in episodes
             if len(episode) > 2 * longest + 10 * _ORDERS[-1]]
     none = (0,) * n_u

@@ -37,22 +37,24 @@ def realised(episodes: Sequence[Episode], period: float, n_x: int
     found = LinearModels(data, order, n_y).state_space() if data else None
     if found is None:
         return None
+    A, B, C = found
     try:
-        A, B, C = _truncated(*found, n_x)
+        rest = C @ np.linalg.solve(np.eye(len(A)) - A, B[:, -1])  # outputs without input
+        A, B, C = _truncated(A, B[:, :-1], C, n_x)
         T = np.vstack((C, null_space(C).T))
         A, B = _continuous(np.linalg.solve(T.T, (T @ A).T).T, T @ B, period)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    return (A, B[:, :-1], B[:, -1]) if np.all(np.isfinite(A)) and np.all(np.isfinite(B)) else None
+    c = -A[:, :n_y] @ rest
+    return (A, B, c) if np.all(np.isfinite(A)) and np.all(np.isfinite(B)) else None
 
 
 def _truncated(A: Array, B: Array, C: Array, n_x: int) -> tuple[Array, Array, Array]:
     """Return the states that inputs move and outputs show most."""
     if len(A) == n_x:
         return A, B, C
-    steered = B[:, :-1]
     left, right = (np.linalg.cholesky(W + _SLIGHT * np.trace(W) * np.eye(len(W))) for W in (
-        solve_discrete_lyapunov(A, steered @ steered.T), solve_discrete_lyapunov(A.T, C.T @ C)))
+        solve_discrete_lyapunov(A, B @ B.T), solve_discrete_lyapunov(A.T, C.T @ C)))
     U, sizes, V = np.linalg.svd(right.T @ left)
     root = np.sqrt(sizes[:n_x])
     out, back = left @ V[:n_x].T / root, (U[:, :n_x] / root).T @ right.T

@@ -18,6 +18,12 @@ from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.base import IdentificationMethod
 from koopman_ros.learning.identification.data_split import SplitRecord
+from koopman_ros.learning.identification.dead_time import (
+    LinearModels,
+    LONGEST,
+    Sampled,
+    SHARE,
+)
 from koopman_ros.learning.identification.drift import (
     Drift,
     DriftModel,
@@ -87,10 +93,11 @@ class _StructureCandidate:
     model: Refinable
     start: _Polynomial  #: where its search began, in the same coordinates
     hidden: int
-    #: (N, n_y) in deviations: the larger ones of simulations by models that were not fitted there,
-    #: and of those from starts that are fitted to the first samples
+    #: (N, n_y) in deviations, of simulations by models that were not fitted there, or from starts
+    #: that are fitted to the first samples where those err more
     errors: Array
     offsets: bool = False  #: whether each episode has a constant disturbance
+    late: tuple[int, ...] = ()  #: dead times (n_u,) of the inputs in samples, where there are any
 
     @property
     def gain(self) -> Array:
@@ -117,8 +124,10 @@ class _StructureCandidate:
         drift = self.model.drift
         form = 'linear drift' if isinstance(drift, DriftModel) and drift.degree == 1 else (
             drift.form)
-        offsets = ' and an offset of each episode' if self.offsets else ''
-        return f'{form} with {_not_measured(self.hidden)}{offsets}: ' + ', '.join(
+        more = ', an offset of each episode' * self.offsets
+        if self.late:
+            more += f', dead times of {", ".join(map(str, self.late))} samples'
+        return f'{form} with {_not_measured(self.hidden)}{more}: ' + ', '.join(
             f'{error:.4g} {unit}' for error, unit in zip(
                 self.score.rmse, drift.box.states.units, strict=False))
 
@@ -166,9 +175,9 @@ class _Choice:
 
 
 def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
-                       methods: Mapping[str, IdentificationMethod] | None = None, seed: int = 0,
-                       watch: Watch = lambda *_: False, backend: Backend | None = None
-                       ) -> Identified:
+                       methods: Mapping[str, IdentificationMethod] | None = None,
+                       dead_times: bool = True, seed: int = 0, watch: Watch = lambda *_: False,
+                       backend: Backend | None = None) -> Identified:
     """
     Estimate a drift with as many states as free runs of the record need.
 
@@ -176,7 +185,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     record err by little more than noise, or by less than 1 % of the motion. Otherwise it competes
     with those of :func:`identify_unmeasured`.
 
-    :param methods: see :func:`identify`, like the other arguments.
+    :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
     """
     measured = identify(plant, episodes, methods=methods, seed=seed, backend=backend,
                         watch=lambda done, total, text: watch(done, 4 * total, text))
@@ -184,7 +193,8 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
             measured, plant, episodes):
         return measured
     return identify_unmeasured(
-        plant, episodes, MOST_UNMEASURED, measured=measured, seed=seed, backend=backend,
+        plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,
+        backend=backend,
         watch=lambda done, total, text: watch(total + 3 * done, 4 * total, text))
 
 
@@ -201,8 +211,9 @@ def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Epi
 
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
                         measured: Identified | None = None, highest_degree: int = HIGHEST_DEGREE,
-                        seed: int = 0, budget: float = BUDGET, watch: Watch = lambda *_: False,
-                        backend: Backend | None = None) -> Identified:
+                        dead_times: bool = True, seed: int = 0, budget: float = BUDGET,
+                        watch: Watch = lambda *_: False, backend: Backend | None = None
+                        ) -> Identified:
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
@@ -222,6 +233,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     :param measured: an estimate without such states, which competes; without it there is at least
         one.
     :param highest_degree: of polynomials f.
+    :param dead_times: whether a linear drift of the best order is tried with dead times, too.
     :param seed: of the split, and of networks.
     :param budget: processor time in s, after which the best so far is taken and the rest left out.
     :param backend: where networks are fitted; this process by default.
@@ -237,7 +249,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     least = 1 if measured is None else 0
     networks = {f'network of {units} units, start {start + 1}': (units, _STARTS * seed + start)
                 for units in _UNITS for start in range(_STARTS)}
-    total = hidden + 1 - least + highest_degree + len(networks) + len(_UNITS) + 3
+    total = hidden + 1 - least + highest_degree + len(networks) + len(_UNITS) + 5
     end, choice = time.process_time() + budget, _Choice()
     begun = itertools.count()
 
@@ -265,7 +277,18 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             break
     if linear is None:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
-    search = first
+    search, records = first, {(False, ()): record}
+    tried = list[_StructureCandidate]()
+    monitor = stage('dead time')
+    for late in _dead_times(record, linear, monitor) if dead_times else ():
+        if monitor():
+            break
+        moved = _Search(SplitRecord(plant, [_moved(one, record.period * np.array(late))
+                                            for one in episodes], seed, hidden=True))
+        moved.samples, records[False, late] = first.samples, moved.record
+        if (found := moved.linear(linear.hidden, monitor)) is not None:
+            tried.append(replace(found, late=late))
+    choice.gains(min(tried, key=lambda one: one.score.cost, default=None))
     if plant.B is None and 1 < len(episodes) <= MOST_EPISODES:
         monitor = stage('constant offset of each episode')
         more = _Search(SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True))
@@ -273,6 +296,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         offsets = more.simulated(more.extended(linear), linear.hidden, monitor)
         if choice.gains(offsets and replace(offsets, offsets=True)):
             search, linear = more, choice.candidates[-1]
+        records[True, ()] = more.record
     kept = None
     if measured is not None and isinstance(measured.drift, DriftModel):
         kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))), 0,
@@ -305,7 +329,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             return replace(measured, scores=tuple(one.score for one in choice.candidates),
                            steps=choice.ended(best), free_run=best.score.rmse)
         try:
-            record = search.record if best.offsets else first.record
+            record = records[best.offsets, best.late]
             predictor = _with_gain(record, best, stage('gain of the filter', np.inf))
             break
         except ValueError:
@@ -317,7 +341,34 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                                stage('linear model', np.inf))
     if best.offsets:
         result = without_episode_inputs(result, len(plant.input_names))
-    return replace(result, warnings=warnings, steps=choice.ended(best), free_run=best.score.rmse)
+    return replace(result, warnings=warnings, steps=choice.ended(best), free_run=best.score.rmse,
+                   dead_time=record.period * np.array(best.late or np.zeros(
+                       len(plant.input_names))))
+
+
+def _dead_times(record: SplitRecord, linear: _StructureCandidate, monitor: Callable[..., bool]
+                ) -> list[tuple[int, ...]]:
+    """Return those, in samples, with which single outputs err least, and their neighbours."""
+    n_y, episodes = linear.errors.shape[1], record.episodes
+    longest = min(LONGEST, max(map(len, episodes)) // SHARE)
+    data = [Sampled.of(one, record.period, longest) for one in episodes
+            if len(one) > 2 * longest]
+    if not data:
+        return []
+    n_u = episodes[0].u.shape[1]
+    best = LinearModels(data, -(-len(linear.gain) // n_y), n_y).best((longest,) * n_u, monitor)
+    beside = [tuple(np.add(best, sign * row).tolist()) for row in np.eye(n_u, dtype=int)
+              for sign in (1, -1)]
+    return [late for late in (best, *beside) if any(late) and min(late) >= 0]
+
+
+def _moved(episode: Episode, dead_time: Array) -> Episode:
+    """Return an episode of the same length whose inputs act later, the first one before it."""
+    begin = episode.input_time[0] - np.max(dead_time)
+    late = replace(episode, input_time=np.append(begin, episode.input_time),
+                   u=np.vstack((episode.u[:1], episode.u))).delayed(dead_time)
+    assert late is not None
+    return late
 
 
 def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
@@ -362,10 +413,16 @@ class _Shared:
         """Return whether a network diverges far from the data only where the plant does."""
         return network.bounded or self.linear.model.drift.growth_rate >= 0.0
 
+    def candidate(self, network: Refined[NetworkDrift]) -> _StructureCandidate | None:
+        """Return the candidate of a network."""
+        linear = self.linear
+        found = _candidate(network, linear.start, self.data[0], linear.hidden)
+        return found and replace(found, offsets=linear.offsets)
+
 
 def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[int, int]],
                   stage: Callable[[str], Callable[..., bool]], backend: Backend) -> None:
-    """Add networks of rising size, as long as they gain; of several starts the best."""
+    """Add the best network of each size, of several starts."""
     monitors = dict[str, Callable[..., bool]]()
 
     def watch(name: str, _: object) -> bool:
@@ -377,20 +434,17 @@ def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[in
         own = {name: item for name, item in items.items() if item[0] == units}
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
             begun = [found for _, found in results if found is not None]
-        if not begun:
-            continue
         linear, monitor = shared.linear, stage(f'network of {units} units')
-        found = _simulated(min(begun, key=lambda pair: pair[0])[1], linear.gain, *shared.data,
-                           monitor)
-        candidate = _candidate(found, linear.start, shared.data[0], linear.hidden) if (
-            shared.allowed(found.model)) else None
-        if candidate and not choice.gains(replace(candidate, offsets=linear.offsets)):
-            break
+        for one in sorted(begun, key=lambda one: one.cost):
+            found = _simulated(one.model, linear.gain, shared.data[0], one.starts, monitor)
+            if shared.allowed(found.model) or monitor():
+                choice.gains(shared.candidate(found if shared.allowed(found.model) else one))
+                break
 
 
 def _network(shared: _Shared, item: tuple[int, int], tell: Tell
-             ) -> tuple[float, NetworkDrift] | None:
-    """Return the cost of a network after a few iterations; None where it may diverge."""
+             ) -> Refined[NetworkDrift] | None:
+    """Return a network after a few iterations; None where it may diverge."""
     end = time.process_time() + shared.budget
 
     def monitor(*_: object) -> bool:
@@ -404,7 +458,7 @@ def _network(shared: _Shared, item: tuple[int, int], tell: Tell
         NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
                             learn_input_matrix=shared.learn_input_matrix),
         shared.linear.gain, *shared.data, monitor, iterations=_SCREENING)
-    return (found.cost, found.model) if shared.allowed(found.model) else None
+    return found if shared.allowed(found.model) else None
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
@@ -426,7 +480,8 @@ def _candidate(refined: Refined[Any], start: Predictor[DriftModel], data: Segmen
         # a state that the first samples do not tell is of no use
         free = Predictor(refined.model.drift, 0.0 * start.gain)
         others = free.along(data, free.starts(data, refined.starts)).innovations
-        errors = np.where(np.abs(errors) > np.abs(others), errors, others)
+        errors = np.where(np.mean(errors ** 2, axis=0) > np.mean(others ** 2, axis=0),
+                          errors, others)
     return _StructureCandidate(refined.model, start, hidden, errors) if np.all(
         np.abs(errors) < _LOST) else None
 
