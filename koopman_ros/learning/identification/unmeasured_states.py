@@ -74,10 +74,9 @@ _SIGMAS = 2.0
 _MOST = 2.0  # times the least squared error that a smaller model may have
 
 _UNITS = (3, 8)  # hidden units of the networks that are tried
-_STARTS = 4  # of each network, the best of which is fitted to the end
+_STARTS = 4  # of each network, of which the best is taken
 _RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
 _ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
-_SCREENING = 50  # iterations of a network from each start, of which the best goes on
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 _LOST = 10.0  # half-ranges from the measurement
@@ -249,7 +248,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     least = 1 if measured is None else 0
     networks = {f'network of {units} units, start {start + 1}': (units, _STARTS * seed + start)
                 for units in _UNITS for start in range(_STARTS)}
-    total = hidden + 1 - least + highest_degree + len(networks) + len(_UNITS) + 5
+    total = hidden + 1 - least + highest_degree + len(networks) + 5
     end, choice = time.process_time() + budget, _Choice()
     begun = itertools.count()
 
@@ -433,18 +432,13 @@ def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[in
     for units in _UNITS:
         own = {name: item for name, item in items.items() if item[0] == units}
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
-            begun = [found for _, found in results if found is not None]
-        linear, monitor = shared.linear, stage(f'network of {units} units')
-        for one in sorted(begun, key=lambda one: one.cost):
-            found = _simulated(one.model, linear.gain, shared.data[0], one.starts, monitor)
-            if shared.allowed(found.model) or monitor():
-                choice.gains(shared.candidate(found if shared.allowed(found.model) else one))
-                break
+            fitted = [shared.candidate(found) for _, found in results if found is not None]
+        choice.gains(min(filter(None, fitted), key=lambda one: one.score.cost, default=None))
 
 
 def _network(shared: _Shared, item: tuple[int, int], tell: Tell
              ) -> Refined[NetworkDrift] | None:
-    """Return a network after a few iterations; None where it may diverge."""
+    """Return a network that fits the record; None where it may diverge."""
     end = time.process_time() + shared.budget
 
     def monitor(*_: object) -> bool:
@@ -457,16 +451,16 @@ def _network(shared: _Shared, item: tuple[int, int], tell: Tell
     found = _simulated(
         NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
                             learn_input_matrix=shared.learn_input_matrix),
-        shared.linear.gain, *shared.data, monitor, iterations=_SCREENING)
+        shared.linear.gain, *shared.data, monitor)
     return found if shared.allowed(found.model) else None
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
-               monitor: Callable[..., bool], iterations: int = _ITERATIONS) -> Refined[_Model]:
+               monitor: Callable[..., bool]) -> Refined[_Model]:
     """Return a model whose simulations err least."""
     penalty = model.penalty if isinstance(model, NetworkDrift) else None
     return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
-                            tolerance=_TOLERANCE, penalty=penalty, iterations=iterations,
+                            tolerance=_TOLERANCE, penalty=penalty, iterations=_ITERATIONS,
                             monitor=monitor)
 
 
