@@ -303,7 +303,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         choice.gains(kept)
     count = linear.hidden
     monitor = stage(f'filter with {_not_measured(count)}')
-    last = search.filtered(linear.start, monitor)
+    last = begin = search.from_filters(count, monitor)
     explained = 0.0 if last is None else _EXPLAINED * float(np.mean(search.deviation ** 2))
     for degree in usual_degrees(n_y + count)[1:highest_degree] if count or not measured else ():
         if last is None or choice.explained(explained):
@@ -314,6 +314,9 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             found = last and search.simulated(last, count, monitor)
             choice.gains(found and replace(found, offsets=linear.offsets))
     if not choice.explained(explained):
+        # in coordinates of a filter, whose hidden states have the range of those in the record
+        base = begin and search.simulated(begin, count, monitor)
+        linear = linear if base is None else replace(base, offsets=linear.offsets)
         shared = _Shared(linear, search.record.simulated(linear.start, search.samples),
                          search.learn_B, (end - time.process_time()) / len(networks))
         _add_networks(choice, shared, networks,
@@ -432,8 +435,9 @@ def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[in
     for units in _UNITS:
         own = {name: item for name, item in items.items() if item[0] == units}
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
-            fitted = [shared.candidate(found) for _, found in results if found is not None]
-        choice.gains(min(filter(None, fitted), key=lambda one: one.score.cost, default=None))
+            fitted = [found for _, found in results if found is not None]
+        best = min(fitted, key=lambda one: one.cost, default=None)
+        choice.gains(best and shared.candidate(best))
 
 
 def _network(shared: _Shared, item: tuple[int, int], tell: Tell
@@ -542,11 +546,11 @@ class _Search:
     def linear(self, hidden: int, monitor: Callable[..., bool]) -> _StructureCandidate | None:
         """Return the linear model of an order; None where simulations diverge."""
         samples = self.samples
-        for begin in (self._realised, self._from_filters):
+        for begin in (self._realised, self.from_filters):
             start = begin(hidden, monitor)
             found = start and self.simulated(start, hidden, monitor)
             # an unstable plant in a closed loop has no realisation of its own
-            if found is not None and (begin == self._from_filters
+            if found is not None and (begin == self.from_filters
                                       or found.model.drift.growth_rate < 0.0):
                 return self._standardised(found) if hidden else found
             self.samples = samples
@@ -618,9 +622,12 @@ class _Search:
         except (ValueError, np.linalg.LinAlgError):
             return None
 
-    def _from_filters(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
-        """Return the best filter with a linear drift, which is stable where the plant is not."""
-        tried = [self._refined(self._start(hidden, gains), monitor) for gains in _GAINS]
+    def from_filters(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
+        """Return the best filter of a linear drift; it is stable where the plant is not."""
+        try:
+            tried = [self._refined(self._start(hidden, gains), monitor) for gains in _GAINS]
+        except ValueError:
+            return None
         return self.filtered(min(tried, key=lambda pair: pair[1])[0], monitor)
 
     def _refined(self, start: _Polynomial, monitor: Callable[..., bool]
