@@ -36,8 +36,9 @@ _OPTIONS = (
     'input_matrix', 'input_matrix_degree', 'physical_model', 'estimated_constants',
     'identification_methods', 'restarts', 'training_seed', 'training_samples', 'warm_start_model',
     'acceptance_margin', 'max_condition_number', 'synchronisation_tolerance', 'executor', 'device')
-# Not those of a node: any class may be the best for a plant that is not known yet.
-_DEFAULTS = {'model_class': BEST, 'model_output': ''}
+# Not those of a node: of a plant that is not known yet any class may be the best, and states may
+# be missing. The controller of a trainer is set up for the states of its model.
+_DEFAULTS = {'model_class': BEST, 'model_output': '', 'unmeasured_states': -1}
 
 
 def main(arguments: list[str] | None = None) -> int:

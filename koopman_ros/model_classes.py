@@ -9,3 +9,5 @@ IDENTITY_LIFT, FREE_LIFT = 'identity lift', 'free lift'
 CLASSES = (LINEAR, POLYNOMIAL, NEURAL_DRIFT, IDENTITY_LIFT, FREE_LIFT)
 #: stands for the one that the rule of the choice takes
 BEST = 'best'
+#: stands for that of the current model, or for the best of a first one
+SAME = 'same'

@@ -105,9 +105,11 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
     assert learned('--model_output', 'first.safetensors') == 0
     with quick_retraining(8, degrees=(1, 2)):
-        assert learn.main(['other.csv', '--model', 'first.safetensors', '--model_class', 'linear',
+        assert learn.main(['other.csv', '--model', 'first.safetensors', '--model_class', 'same',
                            '--training_seed', '1']) == 2
-    assert 'is not 10 % below that of the current model' in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert 'the new model (linear) is rejected' in said
+    assert 'is not 10 % below that of the current model' in said
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [

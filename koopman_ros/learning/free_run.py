@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import os
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, OptimizeResult
 
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
@@ -29,9 +29,14 @@ from koopman_ros.records import Record
 #: whatever has a drift
 AnyModel: TypeAlias = LiftedModel | Trained | ClassComparison | Drift | Identified
 
+FREE_RUN = 'free_run'  #: metric of a model: error of its free run of its record, by state
+
 _GUESSES = (0.6, -0.6)  # starts of unmeasured states that are tried beside 0, in half-ranges
 _EVALUATIONS = 30  # of the search from each of them
 _LOST = 1e3  # error of a start that diverges, in half-ranges
+# The first samples of another day err by more than so many times the usual error. A steady state
+# that is a half-range elsewhere then counts as much as such an error of a sample.
+_OTHER_DAY = 1.5
 _PICTURED = 3  # episodes of a picture
 
 
@@ -47,6 +52,9 @@ class FreeRun:
     #: not finite after a divergence
     paths: tuple[Array, ...]
     init: int  #: first samples of each episode, to which the start is fitted
+    #: (M, n_x) constant disturbances of the rates of the states, in the order of the model and its
+    #: units per time unit of the record
+    disturbances: Array
     rmse: Array  #: (n_y,) root mean square error after those; infinite after a divergence
     #: (n_y,) share of the motion that is explained, 1 - ||y - y_model|| / ||y - mean(y)||, in %
     fit: Array
@@ -109,17 +117,23 @@ class FreeRun:
             ))
 
 
-def simulate(model: AnyModel, record: Record, init: int = 50, *,
+def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | None = None,
              picture: str | os.PathLike[str] = '') -> FreeRun:
     """
     Simulate a whole record by its inputs alone, and compare with the measurements.
 
     The start of each episode, unmeasured states included, is fitted to its first samples; after
-    these the simulation sees no measurement.
+    these the simulation sees no measurement. Where the first samples contradict the model, as on a
+    day with another ambient temperature, a constant disturbance of the rates of the measured
+    states is fitted, too; a controller's disturbance observer does the same.
 
     :param model: a model, or anything that training or identification returns.
     :param record: with all inputs and at least one state of the model, in any units.
     :param init: samples to which the start is fitted; at most half of an episode.
+    :param usual: (n_y,) root mean square error of the model's free run over a record that it was
+        learned from, in its units; by default that of the model itself. The first samples
+        contradict the model where they err by more than 1.5 times that. Without it there is no
+        disturbance.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """
@@ -142,10 +156,13 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *,
     indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
     step = longest_step(episodes)
     inits = [max(1, min(init, len(one) // 2)) for one in episodes]
-    starts = np.array([_start(rate, states, measured, one, index, count, step)
-                       for one, index, count in zip(episodes, indexed, inits, strict=True)])
+    if usual is None:
+        usual = _usual(model, some.names)
+    found = [_start(rate, states, measured, one, index, count, step, usual)
+             for one, index, count in zip(episodes, indexed, inits, strict=True)]
+    starts, disturbances = (np.array(some) for some in zip(*found, strict=True))
     segments = Segments.of(indexed, step)
-    run = segments.path(rate, starts)
+    run = segments.path(lambda x, u: rate(x, u) + disturbances, starts)
     paths = tuple(run[np.flatnonzero(segments.x[:, k, 0])[:len(one)], k][:, order]
                   for k, one in enumerate(episodes))
     errors, values = (np.concatenate(parts) for parts in (
@@ -157,12 +174,24 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *,
         squares = np.where(missing, 0.0, errors ** 2).sum(axis=0)
     squares = np.where(np.isfinite(squares), squares, np.inf)
     spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2, axis=0)
-    found = FreeRun(some.names, some.units, record.plant, episodes, paths, init,
-                    np.sqrt(squares / np.sum(~missing, axis=0)),
-                    100.0 * (1.0 - np.sqrt(squares / spread)))
+    free_run = FreeRun(some.names, some.units, record.plant, episodes, paths, init, disturbances,
+                       np.sqrt(squares / np.sum(~missing, axis=0)),
+                       100.0 * (1.0 - np.sqrt(squares / spread)))
     if picture:
-        found.draw(picture)
-    return found
+        free_run.draw(picture)
+    return free_run
+
+
+def _usual(model: AnyModel, names: Sequence[str]) -> Array | None:
+    """Return the error (n_y,) of a model's free run of its record, where it is known."""
+    errors: Mapping[str, float] = {}
+    if isinstance(model, LiftedModel):
+        errors = {name: model.provenance.metrics.get(f'{FREE_RUN}_{name}', np.nan)
+                  for name in names}
+    elif isinstance(model, Identified):
+        errors = dict(zip(model.drift.box.states.names, model.free_run.tolist(), strict=False))
+    found = np.array([errors.get(name, np.nan) for name in names])
+    return None if np.any(np.isnan(found)) else found
 
 
 def _drift(model: AnyModel, plant: PlantDescription
@@ -184,31 +213,59 @@ def _drift(model: AnyModel, plant: PlantDescription
 
 
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,
-           indexed: Episode, count: int, step: float) -> Array:
-    """Return the start (n_x,) of an episode that suits its first samples best."""
+           indexed: Episode, count: int, step: float, usual: Array | None
+           ) -> tuple[Array, Array]:
+    """Return the start (n_x,) that suits the first samples best, and a disturbance (n_x,)."""
     segments = Segments.of([indexed.part(0, count)] if count > 1 else [indexed.part(0, 2)], step)
     rows = np.flatnonzero(segments.x[:, 0, 0])[:count]
     y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])
     there, n_x = ~np.isnan(y), len(states)
-    home = np.zeros(n_x)
+    home, memory = np.zeros(n_x), 1.0
     for i, column, seen in zip(measured, y.T, there.T, strict=True):
         if seen.any():
             home[i] = column[seen][0]
 
-    def errors(xi: Array) -> Array:
-        """Return the errors (S, m) from starts (S, n_x), side by side, in half-ranges."""
-        path = segments.repeated(len(xi)).path(rate, states.to_physical(xi))
-        found = states.to_deviation(path[rows])[..., measured] - y[:, None]
-        return np.clip(np.nan_to_num(np.swapaxes(found, 0, 1)[:, there], nan=_LOST),
-                       -_LOST, _LOST)
+    def disturbance(p: Array) -> Array:
+        """Return that (S, n_x) of parameters (S, n_x or n_x + n_y), in state units."""
+        found = np.zeros((len(p), n_x))
+        found[:, measured] = (p[:, n_x:] if p.shape[1] > n_x else 0.0) / memory
+        return found * states.scale
 
-    def slopes(xi: Array) -> Array:
-        here, *others = errors(xi + 1e-4 * np.vstack([np.zeros(n_x), np.eye(n_x)]))
-        return np.transpose(np.subtract(others, here)) / 1e-4
+    def errors(p: Array) -> Array:
+        """Return the errors (S, m) from starts (S, n_x), side by side, in half-ranges."""
+        added = disturbance(p)
+        path = segments.repeated(len(p)).path(
+            lambda x, u: rate(x, u) + added, states.to_physical(p[:, :n_x]))
+        found = states.to_deviation(path[rows])[..., measured] - y[:, None]
+        return np.hstack((np.clip(np.nan_to_num(
+            np.swapaxes(found, 0, 1)[:, there], nan=_LOST), -_LOST, _LOST), p[:, n_x:]))
+
+    def fitted(start: Array) -> OptimizeResult:
+        def slopes(p: Array) -> Array:
+            here, *others = errors(p + 1e-4 * np.vstack([np.zeros(len(p)), np.eye(len(p))]))
+            return np.transpose(np.subtract(others, here)) / 1e-4
+
+        return least_squares(lambda p: errors(p[None])[0], start, slopes, max_nfev=_EVALUATIONS)
 
     hidden = [i for i in range(n_x) if i not in measured]
     shifts = [np.zeros(n_x), *(guess * row for row in np.eye(n_x)[hidden]
                                for guess in _GUESSES)]
-    found = [least_squares(lambda xi: errors(xi[None])[0], home + shift, slopes,
-                           max_nfev=_EVALUATIONS) for shift in shifts]
-    return states.to_physical(min(found, key=lambda one: float(one.cost)).x)
+    best = min((fitted(home + shift) for shift in shifts), key=lambda one: float(one.cost)).x
+    if usual is not None:
+        squares = np.zeros(there.shape)
+        squares[there] = errors(best[None])[0] ** 2
+        scale = usual / states.scale[measured]
+        if np.sqrt(np.mean(np.mean(squares, axis=0) / scale ** 2)) > _OTHER_DAY:
+            memory = _memory(rate, states, states.to_physical(best), episode)
+            best = fitted(np.append(best, np.zeros(len(measured)))).x
+    return states.to_physical(best[:n_x]), disturbance(best[None])[0]
+
+
+def _memory(rate: Rate, states: Coordinates, x: Array, episode: Episode) -> float:
+    """Return the slowest time constant at a state (n_x,), at most the time of the episode."""
+    n_x, u = len(states), episode.u[:1]
+    at = x + 1e-4 * states.scale * np.vstack([np.zeros(n_x), np.eye(n_x)])
+    here, *others = rate(at, np.repeat(u, 1 + n_x, axis=0)) / states.scale
+    slowest = np.min(np.abs(np.linalg.eigvals(np.transpose(np.subtract(others, here)) / 1e-4)))
+    duration = float(episode.time[-1] - episode.time[0])
+    return 1.0 / max(float(slowest), 1.0 / duration)

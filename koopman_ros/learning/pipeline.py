@@ -30,7 +30,7 @@ from koopman_ros.learning.acceptance import (
 )
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import alternative_models, compare_classes
-from koopman_ros.learning.free_run import FreeRun, simulate
+from koopman_ros.learning.free_run import FREE_RUN, FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
@@ -38,6 +38,7 @@ from koopman_ros.learning.identification import (
     IdentificationMethod,
     Identified,
     identify,
+    identify_structure,
     identify_unmeasured,
     methods_of,
     Stopped,
@@ -55,7 +56,7 @@ from koopman_ros.learning.record import (
 )
 from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, save
-from koopman_ros.model_classes import BEST, CLASSES
+from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
 
@@ -145,6 +146,7 @@ class Retrained:
             'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
             'drift': self.found.drift.form,
+            'structure_search': list(self.found.steps),
             'drift_degree': (
                 self.found.drift.degree if isinstance(self.found.drift, DriftModel) else None),
             'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
@@ -220,6 +222,9 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     progress, thresholds = _Progress(on_progress), _checked(task)
     current, sibling = (load(path).joined if path else None
                         for path in (task.model, task.warm_start_model))
+    if task.model_class == SAME:
+        task = replace(task, model_class=BEST if current is None else (
+            current.provenance.model_class or IDENTITY_LIFT))
     plant, states, inputs = resolve_signals(task, current)
     methods = methods_of(task.methods, task.method_parameters)
     # a folder that cannot be written should fail now, not after the training
@@ -239,8 +244,10 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     dead_time = _dead_time(task, plant, episodes, progress)
     episodes = [late for episode in episodes
                 if (late := episode.delayed(dead_time / seconds)) is not None]
-    found = replace(_estimate(task, plant, episodes, methods, progress, backend),
-                    dead_time=dead_time / seconds, disturbances=plant.disturbance_names)
+    found = _estimate(task, plant, episodes, methods, progress, backend)
+    found = replace(found, dead_time=found.dead_time + dead_time / seconds,
+                    disturbances=plant.disturbance_names)
+    dead_time = seconds * found.dead_time
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(record.episodes), record.account, task.bags)
     if found.hidden:
@@ -261,17 +268,18 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     learned = learned.with_model(replace(learned.model, dead_time=dead_time))
-    runs = {name: simulate(learned, one) for name, one in (
-        ('record', recorded), ('test', test)) if one is not None}
+    runs = {'record': simulate(learned, recorded)}
+    if test is not None:
+        runs['test'] = simulate(learned, test, usual=runs['record'].rmse)
     decision = replace(decision, reasons=(
-        *decision.reasons, *_failed_test(runs, found, test)), warnings=(
+        *decision.reasons, *_failed_test(runs, found, recorded, test)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     progress('decide', _WRITING, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
-                             episodes, learned.chosen.name
+                             episodes, learned.chosen.name, runs['record']
                              ).with_disturbances(task.disturbances)
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
@@ -341,12 +349,14 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
         episodes, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
 
 
-def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | None
-                 ) -> tuple[str, ...]:
+def _failed_test(runs: Mapping[str, FreeRun], found: Identified, recorded: Record,
+                 test: Record | None) -> tuple[str, ...]:
     """Say that the free run over the test record errs more than the best linear model's."""
     if test is None:
         return ()
-    own, linear = runs['test'], simulate(found.linear, test)
+    own = runs['test']
+    best = replace(found, drift=found.linear)
+    linear = simulate(best, test, usual=simulate(best, recorded).rmse)
     scale = found.drift.box.states.only(own.names).scale
     if not np.sum((own.rmse / scale) ** 2) > np.sum((linear.rmse / scale) ** 2):
         return ()
@@ -356,9 +366,9 @@ def _failed_test(runs: Mapping[str, FreeRun], found: Identified, test: Record | 
 
 def _checked(task: TrainingTask) -> Thresholds:
     """Return the thresholds of a task; ValueError for fields that do not fit."""
-    if task.model_class not in (*CLASSES, BEST):
+    if task.model_class not in (*CLASSES, BEST, SAME):
         raise ValueError(f'model_class = {task.model_class!r} must be one of '
-                         f'{", ".join((*CLASSES, BEST))}')
+                         f'{", ".join((*CLASSES, BEST, SAME))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     if task.warm_start_model == FIRST:
@@ -414,9 +424,12 @@ def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
     if task.physical_model:
         return estimate_parameters(plant, episodes, plant_class(task.physical_model),
                                    task.constants, seed=seed, watch=watch)
-    if task.unmeasured_states:
+    if task.unmeasured_states < 0 and not task.model:
+        return identify_structure(plant, episodes, methods=methods, seed=seed, watch=watch,
+                                  backend=backend, dead_times=not task.dead_time)
+    if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
-                                   watch=watch, backend=backend)
+                                   watch=watch, backend=backend, dead_times=not task.dead_time)
     return identify(plant, episodes, methods=methods, seed=seed, watch=watch, backend=backend)
 
 
@@ -433,9 +446,9 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
         try:
             learned = compare_classes(
                 found, bare.plant, thresholds, model_class=task.model_class,
-                n_z=task.coordinates, seed=task.seed, starts=task.starts,
-                watch=progress.learning, judging=progress.judging, device=task.device,
-                backend=backend, begin=begin)
+                n_z=task.coordinates or 2 + len(found.drift.box.states), seed=task.seed,
+                starts=task.starts, watch=progress.learning, judging=progress.judging,
+                device=task.device, backend=backend, begin=begin)
         except TrainingFailed as error:
             reasons: tuple[str, ...] = (str(error),)
         progress('decide', _JUDGED, 'judging')
@@ -452,7 +465,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
 
 
 def _with_provenance(model: LiftedModel, found: Identified, decision: AcceptanceResult,
-                     covered: float, episodes: list[Episode], model_class: str) -> LiftedModel:
+                     covered: float, episodes: list[Episode], model_class: str, run: FreeRun
+                     ) -> LiftedModel:
     sha = hashlib.sha256()
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
@@ -463,6 +477,8 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
         labels = [label] if len(values) == 1 else [
             f'{label}_{name}' for name in model.states.names]
         metrics |= dict(zip(labels, map(float, values), strict=True))
+    metrics |= {f'{FREE_RUN}_{name}': float(error)
+                for name, error in zip(run.names, run.rmse, strict=True)}
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, verified_loops=decision.law_check.tried, provenance=replace(

@@ -17,7 +17,7 @@ from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.model import Coordinates, LiftedModel
-from koopman_ros.model_classes import IDENTITY_LIFT
+from koopman_ros.model_classes import SAME
 from koopman_ros.records import RecordedInput, RecordedState
 
 #: As a task's sibling, in a fleet: the first plant of its kind whose lift is accepted.
@@ -36,9 +36,10 @@ class TrainingTask:
     inputs: tuple[RecordedInput, ...]  #: likewise
     plant: str = ''  #: name of the plant in a first lift
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
-    #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
-    model_class: str = IDENTITY_LIFT
-    coordinates: int = 3  #: n_z of the identity lift
+    #: class to learn, a name of `compare`, ``'best'`` for the one that its rule takes, or
+    #: ``'same'`` for that of the present lift, the best where there is none
+    model_class: str = SAME
+    coordinates: int = 0  #: n_z of the identity lift; 0: two more than states
     seed: int = 0  #: of the split and of the training, and of the reduction of a long record
     #: samples that are learned from and judged by; a longer record is reduced to them, see
     #: :func:`read_record`
@@ -54,7 +55,8 @@ class TrainingTask:
     #: those of the inputs that are measured and not manipulated; they have no dead time
     disturbances: tuple[str, ...] = ()
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
-    #: not compared with the present one, which has other states
+    #: not compared with the present one, which has other states. -1: as many as free runs of the
+    #: record need, see :func:`identify_structure`; none where there is a present lift
     unmeasured_states: int = 0
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
     #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.
@@ -99,7 +101,7 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     :param current: the present lift, where there is one.
     :raises ValueError: for a task whose parts do not fit each other or the present lift.
     """
-    if task.physical_model and (task.unmeasured_states or task.input_gain):
+    if task.physical_model and (task.unmeasured_states > 0 or task.input_gain):
         raise ValueError(f'physical_model = {task.physical_model!r} defines the states and the '
                          'effect of the inputs: set unmeasured_states to 0 and give no input_gain')
     if task.constants and not task.physical_model:

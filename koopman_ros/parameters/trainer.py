@@ -29,7 +29,7 @@ from koopman_ros.core.units import display_unit
 from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
-from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
+from koopman_ros.model_classes import BEST, CLASSES, SAME
 from koopman_ros.parameters.equations import named_ranges, refused
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
@@ -125,10 +125,11 @@ class TrainerParameters:
         'retrained.safetensors', 'File for an accepted model; the file that it replaces is kept '
                                  'as .previous.safetensors.')
     model_class: str = parameter(
-        IDENTITY_LIFT, 'Class of the new model; best: train all of them and select one by '
-        'comparison.', choices=(*CLASSES, BEST))
+        SAME, 'Class of the new model; best: train all of them and select one by comparison; '
+        'same: that of model, or best if model is empty.', choices=(*CLASSES, BEST, SAME))
     lifted_dimension: int = parameter(
-        3, 'Number of lifted coordinates n_z of a new identity lift.', '', 2, 8)
+        0, 'Number of lifted coordinates n_z of a new identity lift; 0: two more than states.', '',
+        0, 8, smallest=2)
     restarts: int = parameter(
         3, 'Random restarts per coordinate; the best is kept.', '', 1, 100)
     training_seed: int = parameter(
@@ -163,7 +164,8 @@ class TrainerParameters:
     methods: Mapping[str, Any] = plugin_parameters()
     unmeasured_states: int = parameter(
         0, 'Largest number of unmeasured states to estimate with the model; 0: all states are '
-        'measured.', '', 0, 4)
+        'measured; -1: as many as a simulation of the record needs, up to 3, if model and '
+        'physical_model are empty and B is constant.', '', -1, 4)
     physical_model: str = parameter(
         '', 'Plant whose equations are fitted in place of a black-box drift: a plant of the '
         'library, an entry point of the group koopman_ros.plants, or package.module:Class; empty: '
@@ -379,10 +381,10 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.input_matrix != (0.0,) and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 if input_matrix '
                 'is given')
-    if values.unmeasured_states and values.input_matrix_degree:
+    if values.unmeasured_states > 0 and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 if '
                 'unmeasured_states is above 0, because B would depend on them')
-    if values.physical_model and values.unmeasured_states:
+    if values.physical_model and values.unmeasured_states > 0:
         return (f'unmeasured_states is {values.unmeasured_states}, must be 0 if physical_model is '
                 'set, which defines the states')
     if values.physical_model and values.input_matrix != (0.0,):

@@ -21,7 +21,8 @@ def tasks_of_reactors(tmp_path_factory):
         name: write_bag(folder / f'{name}.mcap', driven(reactor(share), 12.0))
         for name, share in (('first', 1.0), ('second', 0.9))}}
     return {name: TrainingTask((str(bag),), str(folder / f'{name}.safetensors'), '', STATES,
-                               INPUTS, coordinates=2, starts=1, warm_start_model='first')
+                               INPUTS, coordinates=2, starts=1, warm_start_model='first',
+                               model_class='identity lift')
             for name, bag in bags.items()}
 
 

@@ -3,6 +3,7 @@
 
 """Free runs of models on records, against the exact solution of an oscillator."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +25,13 @@ STATES = Coordinates.spanning(('position', 'speed'), ('m', 'm/s'), -2.0 * np.one
 INPUTS = Coordinates.spanning(('force',), ('N',), -np.ones(1), np.ones(1))
 
 
-def table(seed=0, x=(1.0, -0.5)):
-    """Return a run of the oscillator under random steps, solved exactly."""
+def table(seed=0, x=(1.0, -0.5), push=0.0):
+    """Return a run of the oscillator under random steps and a push, solved exactly."""
     step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), PERIOD)
     u = np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, N // 10), 10)
     path = [np.array(x)]
     for value in u[:-1]:
-        path.append(step @ path[-1] + gain[:, 0] * value)
+        path.append(step @ path[-1] + gain[:, 0] * (value + push))
     return {'time': PERIOD * np.arange(N), 'force': u,
             **dict(zip(STATES.names, np.transpose(path), strict=True))}
 
@@ -97,9 +98,23 @@ def test_a_model_that_diverges_says_so(tmp_path):
 def test_a_model_is_refused_whose_free_run_is_worse_than_that_of_the_linear_model(slope, words):
     test = read(table(), 'position [m]', 'force [N]')
     found = Identified(drift(), '', drift(A * [[1.0, 1.0], [1.1, 1.0]]), (), np.ones(2), (), (), 1)
-    reasons = _failed_test({'test': simulate(lifted(slope=slope), test, init=5)}, found, test)
+    reasons = _failed_test({'test': simulate(lifted(slope=slope), test, init=5)}, found, test,
+                           test)
     assert len(reasons) == bool(words)
     assert words in ''.join(reasons)
+
+
+@pytest.mark.parametrize(('push', 'usual', 'found'), [
+    (0.5, 0.01, 0.5), (0.5, 1.0, 0.0), (0.5, None, 0.0), (0.0, 0.01, 0.0)])
+def test_a_constant_disturbance_is_found_where_the_first_samples_contradict(push, usual, found):
+    model = lifted()
+    if usual:
+        # as a trained model says it
+        model = replace(model, provenance=replace(model.provenance, metrics={
+            f'free_run_{name}': usual for name in STATES.names}))
+    run = simulate(model, read(table(push=push), ['position [m]', 'speed [m/s]'], 'force [N]'))
+    assert run.disturbances == pytest.approx(np.array([[0.0, found]]), abs=0.05)
+    assert np.all(run.fit > 90.0) == (push == found)
 
 
 @pytest.mark.parametrize(('signals', 'options', 'words'), [

@@ -54,7 +54,7 @@ def few_methods():
 
 def small(bag, output, present=SHIPPED, **others):
     return TrainingTask((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2,
-                        starts=1, **others)
+                        starts=1, **{'model_class': 'identity lift', **others})
 
 
 @pytest.fixture(scope='module')

@@ -88,7 +88,7 @@ def retrained(bag, tmp_path_factory):
     with quick_retraining(32):
         return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
                                     str(folder / 'present.safetensors'), STATES, INPUTS,
-                                    coordinates=4, starts=1))
+                                    coordinates=4, starts=1, model_class='identity lift'))
 
 
 def test_lift_of_two_states_and_two_inputs_is_accepted(retrained):

@@ -20,7 +20,7 @@ from support.nodes import children, complaint, ended, run_here, value
 from support.recorded_runs import driven, reactor, write_bag
 
 STATUS = 'trainer: training'
-QUICK = {'lifted_dimension': 2, 'restarts': 1}
+QUICK = {'model_class': 'identity lift', 'lifted_dimension': 2, 'restarts': 1}
 
 
 def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def task(bags: Sequence[Path], output: Path) -> TrainingTask:
     return TrainingTask(tuple(map(str, bags)), str(output), '',
                         (RecordedState('temperature', 'K', state),),
                         (RecordedInput('coolant_temperature', 'K', coolant),),
-                        plant='reactor at 1 Hz')
+                        plant='reactor at 1 Hz', model_class='identity lift')
 
 
 def source(bags: Sequence[Path]) -> RecordSource:

@@ -40,7 +40,10 @@ from koopman_ros.learning.identification.total_variation import (
     total_variation,
     TotalVariation,
 )
-from koopman_ros.learning.identification.unmeasured_states import identify_unmeasured
+from koopman_ros.learning.identification.unmeasured_states import (
+    identify_structure,
+    identify_unmeasured,
+)
 from koopman_ros.learning.identification.weak_form import weak_form, WeakForm
 
 __all__ = [
@@ -64,6 +67,7 @@ __all__ = [
     'find_dead_times',
     'fitted_starts',
     'identify',
+    'identify_structure',
     'identify_unmeasured',
     'longest_step',
     'methods_of',

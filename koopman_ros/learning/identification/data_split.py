@@ -37,7 +37,7 @@ class SplitRecord:
     def __init__(self, plant: PlantDescription, episodes: Sequence[Episode], seed: int, *,
                  hidden: bool
                  ) -> None:
-        self.plant, self._episodes = plant, episodes
+        self.plant, self.episodes = plant, list(episodes)
         signals = len(plant.state_names) + len(plant.input_names)
         self.parts = segments_of(episodes, signals)
         # which samples of all episodes each of them holds
@@ -81,7 +81,7 @@ class SplitRecord:
         With them the predicted states (M, n_x) of their first samples, in deviations.
         """
         rows = [int(piece.x[0, 0]) for piece in cut(self._numbered, samples)]
-        return (Segments.of(cut(self._episodes, samples), self.step),
+        return (Segments.of(cut(self.episodes, samples), self.step),
                 self._run(predictor).foreseen[rows])
 
     def innovations(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None
@@ -103,7 +103,7 @@ class SplitRecord:
                  for i, part in enumerate(self.parts) if i in share and i in self._settled],
                 self.length(drift, _GROWTH))
             for share in ((*self.fit, *self.choose), self.held_out))
-        linear = output_error(
+        linear = drift if isinstance(drift, DriftModel) and drift.degree == 1 else output_error(
             _linear(drift, known), Segments.of(known, self.step), monitor=monitor,
             learn_input_matrix=self.plant.B is None)
         return Identified(drift, method, linear, tuple(scores), noise_level(known, drift),
@@ -112,7 +112,7 @@ class SplitRecord:
     def _run(self, predictor: Predictor[Drift]) -> FilterRun:
         """Filter all episodes; the result of the last predictor is kept."""
         if self._last is None or self._last[0] is not predictor:
-            self._last = predictor, predictor.run(self._episodes, self.step)
+            self._last = predictor, predictor.run(self.episodes, self.step)
         return self._last[1]
 
     def _rows_of(self, parts: Sequence[int] | None) -> NDArray[np.int64]:
@@ -133,7 +133,7 @@ class SplitRecord:
         shortest = max(len(part) for part in self.parts)
         if fastest * self.period * shortest > _GROWTH:
             return self.length(drift, _GROWTH)
-        longest = max(len(episode) for episode in self._episodes)
+        longest = max(len(episode) for episode in self.episodes)
         return int(min(longest, max(shortest, _MEMORIES / max(-fastest * self.period, 1e-9))))
 
     @staticmethod

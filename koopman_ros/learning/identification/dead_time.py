@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 from koopman_ros.core.datasets import Array, Episode
 
 _ORDERS = (1, 2, 3)  # of the linear models
-_LONGEST = 60  # samples of dead time that are tried, where the record is long enough
-_SHARE = 8  # of an episode, which the longest dead time may take
+LONGEST = 60  # samples of dead time that are tried, where the record is long enough
+SHARE = 8  # of an episode, which the longest dead time may take
 _ROUNDS = 3  # over all inputs
 _ITERATIONS = 8  # of Steiglitz and McBride from nothing; from a neighbour's filter below
 _FEW = 3
@@ -62,14 +62,14 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     """
     period = float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
     n_y, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
-    longest = min(_LONGEST, max(len(episode) for episode in episodes) // _SHARE)
-    data = [_Sampled.of(episode, period, longest) for episode in episodes
+    longest = min(LONGEST, max(len(episode) for episode in episodes) // SHARE)
+    data = [Sampled.of(episode, period, longest) for episode in episodes
             if len(episode) > 2 * longest + 10 * _ORDERS[-1]]
     none = (0,) * n_u
     highest = tuple(0 if fixed else longest for fixed in known or (False,) * n_u)
     tried: list[_LinearModel] = []
     for order in _ORDERS if data and any(highest) else ():
-        search = _DeadTimeSearch(data, order, n_y)
+        search = LinearModels(data, order, n_y)
         delays = search.best(highest, watch)
         # a larger model needs no longer dead time, but for chance
         highest = tuple(min(most, d + 2) for most, d in zip(highest, delays, strict=True))
@@ -119,14 +119,15 @@ def _clearly_less(errors: Array, others: Array) -> bool:
 
 
 @dataclass(frozen=True)
-class _Sampled:
+class Sampled:
     """An episode at equal intervals; the inputs begin earlier than the measurements."""
 
     y: Array  #: (N, n_y)
     u: Array  #: (longest + N, n_u) means from one sample to the next
 
     @classmethod
-    def of(cls, episode: Episode, period: float, longest: int) -> _Sampled:
+    def of(cls, episode: Episode, period: float, longest: int) -> Sampled:
+        """Return an episode every period, the measurements from sample `longest` on."""
         count = int((episode.time[-1] - episode.time[0]) / period * (1.0 + 1e-9)) + 1
         time = np.minimum(episode.time[0] + period * np.arange(count), episode.time[-1])
         y = np.column_stack([np.interp(time, episode.time, column)
@@ -141,10 +142,10 @@ class _Sampled:
                                 for j, d in enumerate(delays) for k in range(1, 1 + order)])
 
 
-class _DeadTimeSearch:
-    """Linear models of an order with any dead times."""
+class LinearModels:
+    """Linear models of an order with any dead times, each output by itself."""
 
-    def __init__(self, data: Sequence[_Sampled], order: int, n_y: int) -> None:
+    def __init__(self, data: Sequence[Sampled], order: int, n_y: int) -> None:
         self._data, self._order, self._n_y = data, order, n_y
         self._variance = np.var(np.concatenate([one.y for one in data]), axis=0) + 1e-300
         self._filters: dict[int, Array] = {}  # the last denominator of each output
@@ -175,6 +176,28 @@ class _DeadTimeSearch:
             self._found[delays] = None if any(own is None for own in errors) else _LinearModel(
                 self._order, delays, np.column_stack([own for own in errors if own is not None]))
         return self._found[delays]
+
+    def state_space(self) -> tuple[Array, Array, Array] | None:
+        """
+        Return A, B and C of the models without dead time, of all outputs side by side.
+
+        The last column of B is the effect of a constant 1. None where a model is not stable.
+        """
+        none = (0,) * (self._data[0].u.shape[1])
+        if self.model(none) is None:
+            return None
+        A, B = [], []
+        for i in range(self._n_y):
+            denominator = self._filters[i]
+            regressors, y = self._equations(i, none, denominator, simulated=True)
+            found = lstsq(regressors, y, lapack_driver='gelsy')[0]
+            own = np.eye(self._order, k=1)
+            own[:, 0] = -denominator[1:]
+            A.append(own)
+            B.append(np.column_stack((
+                found[:len(none) * self._order].reshape(len(none), -1).T,
+                found[len(none) * self._order] * np.eye(self._order, 1))))
+        return block_diag(*A), np.vstack(B), block_diag(*[np.eye(1, self._order)] * self._n_y)
 
     def _errors(self, i: int, delays: tuple[int, ...]) -> Array | None:
         known = self._filters.get(i)

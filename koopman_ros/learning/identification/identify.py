@@ -150,6 +150,13 @@ class Identified:
     #: units; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
     disturbances: tuple[str, ...] = ()  #: inputs that are measured disturbances
+    steps: tuple[str, ...] = ()  #: of the search for the structure, in words
+    #: (n_y,) root mean square errors of free runs of the record, in state units, where they were
+    #: compared
+    free_run: Array = field(default_factory=lambda: np.zeros(0))
+    #: (E, n_x) constant disturbances of the rates in the episodes of the record, whose mean is 0,
+    #: in state units per time unit; no row where they are not needed. The drift has none.
+    offsets: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     __repr__ = short_repr
 
@@ -183,8 +190,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     :raises Stopped: when `watch` requested it.
     """
     n_x, n_u = len(plant.state_names), len(plant.input_names)
-    degrees = degrees or tuple(degree for degree in DEGREES if degree == 1
-                               or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
+    degrees = degrees or usual_degrees(n_x)
     parts = segments_of(episodes, n_x + n_u)
     box = box_of(plant, parts)
     warnings = check_inputs(plant, episodes)
@@ -237,6 +243,12 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
                       (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
                       alternatives=tuple(best[d][0] for d in good if d != degree),
                       disturbances=plant.disturbance_names)
+
+
+def usual_degrees(n_x: int) -> tuple[int, ...]:
+    """Return the degrees of a drift with few enough coefficients for a number of states."""
+    return tuple(degree for degree in DEGREES if degree == 1
+                 or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
 
 
 @dataclass(frozen=True)

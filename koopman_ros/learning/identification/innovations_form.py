@@ -41,7 +41,7 @@ class Predictor(Generic[_Drift]):
     def run(self, episodes: Sequence[Episode], step: float) -> FilterRun:
         """Filter episodes of measurements (N, n_y), from the starts that suit the first ones."""
         data = Segments.of(episodes, step)
-        run = self._filter(data, self._starts(data))
+        run = self._filter(data, self.starts(data))
         if not np.all(np.isfinite(run[1])):
             raise ValueError('the estimate of the unmeasured states diverges')
         return _run(data, run)
@@ -70,8 +70,12 @@ class Predictor(Generic[_Drift]):
         states = self.drift.box.states
         return states.only(states.names[:self.gain.shape[1]]).to_deviation(data.x)
 
-    def _starts(self, data: Segments) -> Array:
-        """Return initial states (M, n_x) that predict the first measurements, in deviations."""
+    def starts(self, data: Segments, guess: Array | None = None) -> Array:
+        """
+        Return initial states (M, n_x) that predict the first measurements, in deviations.
+
+        :param guess: (M, n_x) states to begin with, among others.
+        """
         taken = np.cumsum(data.sampled, axis=0).max(axis=1)
         rows = min(int(np.sum(taken <= SETTLING)), len(data.steps))
         first = Segments(data.steps[:rows], data.u[:rows], data.x[:rows + 1],
@@ -96,7 +100,8 @@ class Predictor(Generic[_Drift]):
                     np.take_along_axis(squares, chosen, axis=0)[0])
 
         shifts = np.concatenate((np.zeros((1, n_x)), hidden, -hidden))
-        best, least = best_of(home + shifts[:, None])
+        tried = home + shifts[:, None]
+        best, least = best_of(tried if guess is None else np.concatenate((guess[None], tried)))
         steps = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
         for _ in range(_SEARCHES):
             here, *beside = errors(best + steps[:, None])

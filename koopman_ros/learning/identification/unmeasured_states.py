@@ -5,26 +5,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
+import itertools
+import time
 from typing import Any, TypeVar
 
 import numpy as np
 
-from koopman_ros.core.datasets import Array, Episode, PlantDescription
+from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.alternatives import in_coordinates_of
+from koopman_ros.learning.identification.base import IdentificationMethod
 from koopman_ros.learning.identification.data_split import SplitRecord
-from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
+from koopman_ros.learning.identification.dead_time import (
+    LinearModels,
+    LONGEST,
+    Sampled,
+    SHARE,
+)
+from koopman_ros.learning.identification.drift import (
+    Drift,
+    DriftModel,
+    prediction_error,
+    Segments,
+)
+from koopman_ros.learning.identification.episode_offsets import (
+    MOST_EPISODES,
+    with_episode_inputs,
+    without_episode_inputs,
+)
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
+    identify,
     NEARLY,
     OUTPUT_ERROR,
     Score,
-    stage_by_stage,
     Stopped,
+    usual_degrees,
     Watch,
 )
 from koopman_ros.learning.identification.innovations_form import (
@@ -40,9 +60,12 @@ from koopman_ros.learning.identification.output_error import (
     Refinable,
     Refined,
 )
+from koopman_ros.learning.identification.realisation import realised
 from koopman_ros.model import Box, Coordinates
 
 HIGHEST_DEGREE = 3
+MOST_UNMEASURED = 3  # states that are tried where their number is not given
+BUDGET = 600.0  # s of processor time of a search
 UNIT = '1'  # of a state that is not measured: any other scale would do as well
 # Gains of filters to begin with, of outputs, of their rates and of what moves these, over powers
 # of the interval between samples (alpha, beta and gamma of tracking filters).
@@ -53,10 +76,11 @@ _SIGMAS = 2.0
 _MOST = 2.0  # times the least squared error that a smaller model may have
 
 _UNITS = (3, 8)  # hidden units of the networks that are tried
-_STARTS = 4  # of each network, of which the one that fits best is judged
+_STARTS = 4  # of each network, of which the best is taken
 _RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
 _ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
+_SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 _LOST = 10.0  # half-ranges from the measurement
 
 _Polynomial = Predictor[DriftModel]
@@ -65,12 +89,21 @@ _Model = TypeVar('_Model', bound=Refinable)
 
 @dataclass(frozen=True)
 class _StructureCandidate:
-    """A model with the gain of a filter, and how far its simulations are from measurements."""
+    """A model, and how far its simulations are from measurements."""
 
     model: Refinable
-    gain: Array  #: (n_x, n_y) of the filter, in deviations
+    start: _Polynomial  #: where its search began, in the same coordinates
     hidden: int
-    errors: Array  #: (N, n_y) of simulations by models that were not fitted there, in deviations
+    #: (N, n_y) in deviations, of simulations by models that were not fitted there, or from starts
+    #: that are fitted to the first samples where those err more
+    errors: Array
+    offsets: bool = False  #: whether each episode has a constant disturbance
+    late: tuple[int, ...] = ()  #: dead times (n_u,) of the inputs in samples, where there are any
+
+    @property
+    def gain(self) -> Array:
+        """Gain (n_x, n_y) of the filter with which it began, in deviations."""
+        return self.start.gain
 
     @property
     def label(self) -> str:
@@ -86,32 +119,125 @@ class _StructureCandidate:
         return Score(self.label, drift.degree if isinstance(drift, DriftModel) else None,
                      scale * np.sqrt(squares), float(np.mean(squares)))
 
+    @property
+    def text(self) -> str:
+        """Structure and error."""
+        drift = self.model.drift
+        form = 'linear drift' if isinstance(drift, DriftModel) and drift.degree == 1 else (
+            drift.form)
+        more = ', an offset of each episode' * self.offsets
+        if self.late:
+            more += f', dead times of {", ".join(map(str, self.late))} samples'
+        return f'{form} with {_not_measured(self.hidden)}{more}: ' + ', '.join(
+            f'{error:.4g} {unit}' for error, unit in zip(
+                self.score.rmse, drift.box.states.units, strict=False))
+
 
 def _not_measured(count: int) -> str:
     return f'{count} {"state" if count == 1 else "states"} not measured'
 
 
+class _Choice:
+    """
+    The candidates so far, each compared with the best before it.
+
+    :ivar steps: of the search, in words.
+    """
+
+    def __init__(self) -> None:
+        self.candidates: list[_StructureCandidate] = []
+        self.steps: list[str] = []
+
+    def gains(self, one: _StructureCandidate | None) -> bool:
+        """Add a candidate; return whether it errs less than those before, not by chance."""
+        if one is None:
+            return False
+        before = self.candidates
+        self.candidates = [*before, one]
+        if not before:
+            self.steps.append(one.text)
+            return True
+        best = _plainest(before)
+        more, deviation = _excess(*_blocks([one, best]))
+        self.steps.append(
+            f'{one.text}; mean square {100.0 * abs(more):.3g} % '
+            f'{"more" if more > 0.0 else "less"} than with the best before (standard error '
+            f'{100.0 * deviation:.2g} %)')
+        return more < -_SIGMAS * deviation
+
+    def explained(self, square: float) -> bool:
+        """Return whether a candidate errs by no more than this mean square."""
+        return any(np.mean(one.errors ** 2) <= square for one in self.candidates)
+
+
+    def ended(self, best: _StructureCandidate) -> tuple[str, ...]:
+        """Return the steps with the result."""
+        return (*self.steps, f'selected: {best.text}')
+
+
+def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
+                       methods: Mapping[str, IdentificationMethod] | None = None,
+                       dead_times: bool = True, seed: int = 0, watch: Watch = lambda *_: False,
+                       backend: Backend | None = None) -> Identified:
+    """
+    Estimate a drift with as many states as free runs of the record need.
+
+    An estimate of measured states by :func:`identify` is kept if its simulations of the whole
+    record err by little more than noise, or by less than 1 % of the motion. Otherwise it competes
+    with those of :func:`identify_unmeasured`.
+
+    :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
+    """
+    measured = identify(plant, episodes, methods=methods, seed=seed, backend=backend,
+                        watch=lambda done, total, text: watch(done, 4 * total, text))
+    if callable(plant.B) or plant.input_matrix_degree or _explains(
+            measured, plant, episodes):
+        return measured
+    return identify_unmeasured(
+        plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,
+        backend=backend,
+        watch=lambda done, total, text: watch(total + 3 * done, 4 * total, text))
+
+
+def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Episode]) -> bool:
+    """Return whether simulations of the record err by noise alone."""
+    drift = found.drift
+    record = SplitRecord(plant, episodes, 0, hidden=False)
+    data = Segments.of(cut(episodes, record.memory(drift)), record.step)
+    squares = prediction_error(drift.rate, data, drift.box.states.scale) ** 2
+    spread = np.nanvar(np.concatenate([episode.x for episode in episodes]), axis=0)
+    return bool(np.all(squares <= np.fmax(
+        _EXPLAINED * found.noise ** 2, _SLIGHT ** 2 * spread)))
+
+
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
-                        highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
+                        measured: Identified | None = None, highest_degree: int = HIGHEST_DEGREE,
+                        dead_times: bool = True, seed: int = 0, budget: float = BUDGET,
                         watch: Watch = lambda *_: False, backend: Backend | None = None
                         ) -> Identified:
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
-    First a filter predicts the next measurement, see :func:`innovations_form`: linear models, from
-    filters that know nothing of the plant, then polynomials of higher degree. From each of them
-    simulations of the record are refined (output error), also with a small network added to a
-    linear drift. Of all numbers of states that are not measured and all drifts the smallest model
-    is taken whose simulations err about as little as the best, at samples that were left out of
-    the fit, see :meth:`Refined.left_out`. It is fitted to the whole record. At last the gain of
-    its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to 1,
-    because no record gives their names and units.
+    Models are compared by simulations of the record at samples that are left out of the fit in
+    turn, see :meth:`Refined.left_out`, and from starts that are fitted to its first samples,
+    whichever err more. First linear models of rising order are simulated, from realisations of
+    stable models of the outputs, otherwise from filters; the search ends with the order that
+    lowers the mean squared error by no more than two standard errors, over blocks of the record. A
+    constant disturbance of each of several episodes is kept by the same rule. Then polynomials of
+    higher degree and small networks are added to the linear drift of the best order. The smallest
+    model is taken that errs by no more than two standard errors above the least. At last the gain
+    of its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to
+    1, because no record gives their names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
+    :param measured: an estimate without such states, which competes; without it there is at least
+        one.
     :param highest_degree: of polynomials f.
+    :param dead_times: whether a linear drift of the best order is tried with dead times, too.
     :param seed: of the split, and of networks.
-    :param backend: where each number of states is tried; this process by default.
+    :param budget: processor time in s, after which the best so far is taken and the rest left out.
+    :param backend: where networks are fitted; this process by default.
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
         nothing fits.
@@ -121,48 +247,134 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         raise ValueError('B must not depend on unmeasured states: set input_matrix_degree to 0')
     record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
-    kinds = highest_degree + len(_UNITS)
-    total = hidden * kinds + 2
-    words = {_not_measured(count): count for count in range(1, hidden + 1)}
-    candidates: list[_StructureCandidate] = []
-    under_way = dict.fromkeys(words, 0)  # kinds of drift that were tried
+    least = 1 if measured is None else 0
+    networks = {f'network of {units} units, start {start + 1}': (units, _STARTS * seed + start)
+                for units in _UNITS for start in range(_STARTS)}
+    total = hidden + 1 - least + highest_degree + len(networks) + 5
+    end, choice = time.process_time() + budget, _Choice()
+    begun = itertools.count()
 
-    def progress(name: str, kind: int | None) -> bool:
-        if kind is not None:
-            under_way[name] = kind - 1
-        text = 'drift' if not kind else (
-            f'drift of degree {kind} with {name}' if kind <= highest_degree else
-            f'network of {_UNITS[kind - highest_degree - 1]} units with {name}')
-        if watch(sum(under_way.values()), total, text):
-            raise Stopped
-        return False
+    def stage(text: str, limit: float = end) -> Callable[..., bool]:
+        number = min(next(begun), total - 1)
 
-    first = _Search(record)
-    linear = first.linear(1, lambda *_: progress(next(iter(words)), 1))
-    shared = _Shared(record, highest_degree, seed, linear, first.deviation,
-                     _piece_length(record, linear, first.learn_B))
-    with contextlib.closing((backend or Serial()).run(
-            _tried, words, shared=shared, watch=progress)) as results:
-        for name, found in results:
-            under_way[name] = kinds
-            candidates += found
-    stage = stage_by_stage(watch, total, hidden * kinds)
-    if not candidates:
+        def monitor(*_: object) -> bool:
+            if watch(number, total, text):
+                raise Stopped
+            return time.process_time() > limit
+
+        if monitor():
+            choice.steps.append(f'left out after {budget:.0f} s: {text}')
+        return monitor
+
+    first, linear, n_y = _Search(record), None, len(plant.state_names)
+    for count in range(least, hidden + 1):
+        monitor = stage(f'drift of degree 1 with {_not_measured(count)}')
+        if linear is not None and monitor():
+            break
+        found = first.linear(count, monitor)
+        if found is not None and choice.gains(found):
+            linear = found
+        elif found is not None:
+            break
+    if linear is None:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
-    monitor, able = stage('gain of the filter'), candidates
+    search, records = first, {(False, ()): record}
+    tried = list[_StructureCandidate]()
+    monitor = stage('dead time')
+    for late in _dead_times(record, linear, monitor) if dead_times else ():
+        if monitor():
+            break
+        moved = _Search(SplitRecord(plant, [_moved(one, record.period * np.array(late))
+                                            for one in episodes], seed, hidden=True))
+        moved.samples, records[False, late] = first.samples, moved.record
+        if (found := moved.linear(linear.hidden, monitor)) is not None:
+            tried.append(replace(found, late=late))
+    choice.gains(min(tried, key=lambda one: one.score.cost, default=None))
+    if plant.B is None and 1 < len(episodes) <= MOST_EPISODES:
+        monitor = stage('constant offset of each episode')
+        more = _Search(SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True))
+        more.samples = first.samples
+        offsets = more.simulated(more.extended(linear), linear.hidden, monitor)
+        if choice.gains(offsets and replace(offsets, offsets=True)):
+            search, linear = more, choice.candidates[-1]
+        records[True, ()] = more.record
+    kept = None
+    if measured is not None and isinstance(measured.drift, DriftModel):
+        kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))), 0,
+                                stage(measured.drift.form))
+        choice.gains(kept)
+    count = linear.hidden
+    monitor = stage(f'filter with {_not_measured(count)}')
+    last = begin = search.from_filters(count, monitor)
+    explained = 0.0 if last is None else _EXPLAINED * float(np.mean(search.deviation ** 2))
+    for degree in usual_degrees(n_y + count)[1:highest_degree] if count or not measured else ():
+        if last is None or choice.explained(explained):
+            break
+        monitor = stage(f'drift of degree {degree} with {_not_measured(count)}')
+        if not monitor():
+            last = search.filtered(raised(last), monitor)
+            found = last and search.simulated(last, count, monitor)
+            choice.gains(found and replace(found, offsets=linear.offsets))
+    if not choice.explained(explained):
+        # in coordinates of a filter, whose hidden states have the range of those in the record
+        base = begin and search.simulated(begin, count, monitor)
+        linear = linear if base is None else replace(base, offsets=linear.offsets)
+        shared = _Shared(linear, search.record.simulated(linear.start, search.samples),
+                         search.learn_B, (end - time.process_time()) / len(networks))
+        _add_networks(choice, shared, networks,
+                      lambda text: stage(f'{text} with {_not_measured(count)}'),
+                      backend or Serial())
+    able = choice.candidates
     while True:
         best = _plainest(able)
+        if best is kept:
+            # the estimate without unmeasured states, as it is
+            assert measured is not None
+            return replace(measured, scores=tuple(one.score for one in choice.candidates),
+                           steps=choice.ended(best), free_run=best.score.rmse)
         try:
-            predictor = _with_gain(shared, best, monitor)
+            record = records[best.offsets, best.late]
+            predictor = _with_gain(record, best, stage('gain of the filter', np.inf))
             break
         except ValueError:
             # its filter diverges
             able = [one for one in able if one is not best]
             if not able:
                 raise
-    return replace(record.identified(
-        predictor, best.label, [one.score for one in candidates], stage('linear model')),
-        warnings=warnings, alternatives=in_coordinates_of(predictor, _equals(best, able), record))
+    result = record.identified(predictor, best.label, [one.score for one in choice.candidates],
+                               stage('linear model', np.inf))
+    if best.offsets:
+        result = without_episode_inputs(result, len(plant.input_names))
+    return replace(result, warnings=warnings, steps=choice.ended(best), free_run=best.score.rmse,
+                   alternatives=() if best.offsets else in_coordinates_of(
+                       predictor, _equals(best, able), record),
+                   dead_time=record.period * np.array(best.late or np.zeros(
+                       len(plant.input_names))))
+
+
+def _dead_times(record: SplitRecord, linear: _StructureCandidate, monitor: Callable[..., bool]
+                ) -> list[tuple[int, ...]]:
+    """Return those, in samples, with which single outputs err least, and their neighbours."""
+    n_y, episodes = linear.errors.shape[1], record.episodes
+    longest = min(LONGEST, max(map(len, episodes)) // SHARE)
+    data = [Sampled.of(one, record.period, longest) for one in episodes
+            if len(one) > 2 * longest]
+    if not data:
+        return []
+    n_u = episodes[0].u.shape[1]
+    best = LinearModels(data, -(-len(linear.gain) // n_y), n_y).best((longest,) * n_u, monitor)
+    beside = [tuple(np.add(best, sign * row).tolist()) for row in np.eye(n_u, dtype=int)
+              for sign in (1, -1)]
+    return [late for late in (best, *beside) if any(late) and min(late) >= 0]
+
+
+def _moved(episode: Episode, dead_time: Array) -> Episode:
+    """Return an episode of the same length whose inputs act later, the first one before it."""
+    begin = episode.input_time[0] - np.max(dead_time)
+    late = replace(episode, input_time=np.append(begin, episode.input_time),
+                   u=np.vstack((episode.u[:1], episode.u))).delayed(dead_time)
+    assert late is not None
+    return late
 
 
 def _equals(best: _StructureCandidate, able: Sequence[_StructureCandidate]
@@ -170,92 +382,94 @@ def _equals(best: _StructureCandidate, able: Sequence[_StructureCandidate]
     """Return the others with as many states that err about as little as the best ones."""
     most = NEARLY * min(one.score.cost for one in able)
     return [Predictor(one.model.drift, one.gain) for one in able
-            if one is not best and one.hidden == best.hidden and one.score.cost <= most]
+            if one is not best and one.hidden == best.hidden and
+            (one.offsets, one.late) == (best.offsets, best.late) and one.score.cost <= most]
 
 
 def _plainest(candidates: Sequence[_StructureCandidate]) -> _StructureCandidate:
     """Return the smallest whose squared errors are not clearly above the least."""
-    scale = np.min([np.mean(one.errors ** 2, axis=0) for one in candidates], axis=0)
-    # errors of a simulation last: in blocks they are independent
-    squares = [np.array([np.mean(block ** 2 / scale) for block in np.array_split(
-        one.errors, max(2, len(one.errors) // SETTLING))]) for one in candidates]
+    squares = _blocks(candidates)
     least = min(squares, key=np.mean)
 
     def worse(own: Array) -> bool:
-        excess = own - least
+        excess, deviation = _excess(own, least)
         # of a model that errs wildly in a few blocks the scatter says nothing
-        return bool(np.mean(excess) > min(
-            _SIGMAS * np.std(excess) / np.sqrt(len(excess)), (_MOST - 1.0) * np.mean(least)))
+        return excess > min(_SIGMAS * deviation, _MOST - 1.0)
 
     able = [(len(one.model.theta), float(np.mean(own)), i) for i, (one, own) in enumerate(
         zip(candidates, squares, strict=True)) if not worse(own)]
     return candidates[min(able)[-1]]
 
 
+def _blocks(candidates: Sequence[_StructureCandidate]) -> list[Array]:
+    """Return the mean squared errors (k,) of candidates in blocks, all outputs alike."""
+    scale = np.min([np.mean(one.errors ** 2, axis=0) for one in candidates], axis=0)
+    # errors of a simulation last: in blocks they are independent
+    return [np.array([np.mean(block ** 2 / scale) for block in np.array_split(
+        one.errors, max(2, len(one.errors) // SETTLING))]) for one in candidates]
+
+
+def _excess(own: Array, other: Array) -> tuple[float, float]:
+    """Return by which share squared errors (k,) are above others, and its standard error."""
+    excess = (own - other) / np.mean(other)
+    return float(np.mean(excess)), float(np.std(excess) / np.sqrt(len(excess)))
+
+
 @dataclass(frozen=True)
 class _Shared:
-    """The common data of all candidates."""
+    """The common data of all networks."""
 
-    record: SplitRecord
-    highest_degree: int
-    seed: int
-    linear: _Polynomial  #: the linear predictor with one state that is not measured
-    deviation: Array  #: of its innovations
-    samples: int  #: longest piece that is simulated
+    linear: _StructureCandidate  #: beside which they are
+    data: tuple[Segments, Array]  #: pieces that are simulated, and where they start
+    learn_input_matrix: bool
+    budget: float  #: of each, in s of processor time
+
+    def allowed(self, network: NetworkDrift) -> bool:
+        """Return whether a network diverges far from the data only where the plant does."""
+        return network.bounded or self.linear.model.drift.growth_rate >= 0.0
+
+    def candidate(self, network: Refined[NetworkDrift]) -> _StructureCandidate | None:
+        """Return the candidate of a network."""
+        linear = self.linear
+        found = _candidate(network, linear.start, self.data[0], linear.hidden)
+        return found and replace(found, offsets=linear.offsets)
 
 
-def _piece_length(record: SplitRecord, linear: _Polynomial, learn_B: bool) -> int:
-    """Return the memory of the plant in samples, by simulations of a linear model."""
-    length = record.memory(linear.drift)
-    found = _simulated(PolynomialCoefficients(linear.drift, learn_B), linear.gain,
-                       *record.simulated(linear, length), lambda *_: False)
-    # a filter's own model forgets as fast as the filter does
-    return record.memory(found.model.drift) if np.isfinite(found.cost) else length
+def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[int, int]],
+                  stage: Callable[[str], Callable[..., bool]], backend: Backend) -> None:
+    """Add the best network of each size, of several starts."""
+    monitors = dict[str, Callable[..., bool]]()
+
+    def watch(name: str, _: object) -> bool:
+        if name not in monitors:
+            monitors[name] = stage(name)
+        return monitors[name]() and False
+
+    for units in _UNITS:
+        own = {name: item for name, item in items.items() if item[0] == units}
+        with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
+            fitted = [found for _, found in results if found is not None]
+        best = min(fitted, key=lambda one: one.cost, default=None)
+        choice.gains(best and shared.candidate(best))
 
 
-def _tried(shared: _Shared, count: int, tell: Tell) -> list[_StructureCandidate]:
-    """Return candidates with a number of hidden states: polynomials of rising degree, networks."""
-    record, found = shared.record, list[_StructureCandidate]()
-    last = shared.linear if count == 1 else None
-    search = _Search(record, None if last is None else shared.deviation)
-    linear: Refined[PolynomialCoefficients] | None = None
+def _network(shared: _Shared, item: tuple[int, int], tell: Tell
+             ) -> Refined[NetworkDrift] | None:
+    """Return a network that fits the record; None where it may diverge."""
+    end = time.process_time() + shared.budget
 
-    def begin(kind: int) -> Callable[..., bool]:
-        tell(kind)
-        return lambda *_: tell(kind)
+    def monitor(*_: object) -> bool:
+        tell(None)
+        return time.process_time() > end
 
-    for degree in range(1, shared.highest_degree + 1):
-        monitor = begin(degree)
-        try:
-            if last is None:
-                last = search.linear(count, monitor)
-            elif degree > 1:
-                last = search.refined(record.fit, raised(last), monitor)
-            data, starts = record.simulated(last, shared.samples)
-            refined = _simulated(
-                PolynomialCoefficients(last.drift, search.learn_B), last.gain, data, starts,
-                monitor)
-        except (ValueError, np.linalg.LinAlgError):
-            break
-        found += _candidate(refined, last.gain, count)
-        if linear is None:
-            linear, simulated = refined, (last.gain, data, refined.starts)
-    explained = _EXPLAINED * float(np.mean(search.deviation ** 2))
-    if linear is None:
-        return found
-    for kind, units in enumerate(_UNITS, shared.highest_degree + 1):
-        if any(np.mean(one.errors ** 2) <= explained for one in found):
-            break
-        monitor = begin(kind)
-        networks = [_simulated(NetworkDrift.beside(
-            linear.model.drift, units, _STARTS * shared.seed + start, ridge=_RIDGE,
-            learn_input_matrix=search.learn_B), *simulated, monitor) for start in range(_STARTS)]
-        # far from the data a network is constant, and the rest must not diverge there
-        unstable = linear.model.drift.growth_rate >= 0.0
-        bounded = [one for one in networks if unstable or one.model.bounded]
-        if bounded:
-            found += _candidate(min(bounded, key=lambda one: one.cost), simulated[0], count)
-    return found
+    monitor()
+    (units, seed), drift = item, shared.linear.model.drift
+    assert isinstance(drift, DriftModel)
+    found = _simulated(
+        NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
+                            learn_input_matrix=shared.learn_input_matrix),
+        shared.linear.gain, *shared.data, monitor)
+    return found if shared.allowed(found.model) else None
 
 
 def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
@@ -267,19 +481,25 @@ def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
                             monitor=monitor)
 
 
-def _candidate(refined: Refined[Any], gain: Array, hidden: int) -> list[_StructureCandidate]:
+def _candidate(refined: Refined[Any], start: Predictor[DriftModel], data: Segments, hidden: int
+               ) -> _StructureCandidate | None:
     """Return the candidate of a model, or none where its simulations diverge."""
     if not np.isfinite(refined.cost):
-        return []
-    errors = refined.left_out(SETTLING)
-    return [_StructureCandidate(refined.model, gain, hidden, errors)] * bool(
-        np.all(np.abs(errors) < _LOST))
+        return None
+    with np.errstate(all='ignore'):
+        errors = refined.left_out(SETTLING)
+        # a state that the first samples do not tell is of no use
+        free = Predictor(refined.model.drift, 0.0 * start.gain)
+        others = free.along(data, free.starts(data, refined.starts)).innovations
+        errors = np.where(np.mean(errors ** 2, axis=0) > np.mean(others ** 2, axis=0),
+                          errors, others)
+    return _StructureCandidate(refined.model, start, hidden, errors) if np.all(
+        np.abs(errors) < _LOST) else None
 
 
-def _with_gain(shared: _Shared, best: _StructureCandidate, monitor: Callable[..., bool]
+def _with_gain(record: SplitRecord, best: _StructureCandidate, monitor: Callable[..., bool]
                ) -> Predictor[Drift]:
     """Return the best candidate with a filter that is fitted to it."""
-    record = shared.record
     parts = sorted([*record.fit, *record.choose])
     start = Predictor(best.model.drift, best.gain)
     found = innovations_form(
@@ -324,34 +544,108 @@ class _Known:
 
 class _Search:
     """
-    Predictors of polynomial drifts that are fitted to segments of a record.
+    Candidates of polynomial drifts.
 
-    :ivar deviation: (n_y,) standard deviations of the innovations of the last one.
+    :ivar deviation: (n_y,) standard deviations of the innovations of the last filter.
+    :ivar samples: longest piece that is simulated; 0 until a model tells the plant's memory.
     """
 
-    def __init__(self, record: SplitRecord, deviation: Array | None = None) -> None:
+    def __init__(self, record: SplitRecord) -> None:
         self.record, self._plant = record, record.plant
-        self.deviation = np.ones(len(self._plant.state_names)) if deviation is None else deviation
+        self.deviation = np.ones(len(self._plant.state_names))
         self.learn_B = self._plant.B is None
+        self.samples = 0
 
-    def linear(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial:
-        """Return the best linear predictor."""
-        tried = []
-        for gains in _GAINS:
-            found, cost = self._refined(self.record.fit, self._start(hidden, gains), monitor)
-            tried.append((cost, found))
-        return self.refined(self.record.fit, min(tried, key=lambda pair: pair[0])[1], monitor)
+    def linear(self, hidden: int, monitor: Callable[..., bool]) -> _StructureCandidate | None:
+        """Return the linear model of an order; None where simulations diverge."""
+        samples = self.samples
+        for begin in (self._realised, self.from_filters):
+            start = begin(hidden, monitor)
+            found = start and self.simulated(start, hidden, monitor)
+            # an unstable plant in a closed loop has no realisation of its own
+            if found is not None and (begin == self.from_filters
+                                      or found.model.drift.growth_rate < 0.0):
+                return self._standardised(found) if hidden else found
+            self.samples = samples
+        return None
 
-    def refined(self, parts: Sequence[int], start: _Polynomial, monitor: Callable[..., bool]
-                ) -> _Polynomial:
-        """Return a predictor that fits some segments better, its hidden states standardised."""
-        found, _ = self._refined(parts, start, monitor)
-        self.deviation = np.std(self.record.innovations(found), axis=0)
-        return standardised(found, self.record.estimates(found))
+    def _standardised(self, found: _StructureCandidate) -> _StructureCandidate:
+        """Return a linear model whose hidden states are between -1 and 1 in the record."""
+        assert isinstance(found.model, PolynomialCoefficients)
+        try:
+            start = Predictor(found.model.drift, found.gain)
+            start = standardised(start, self.record.estimates(start))
+        except (ValueError, np.linalg.LinAlgError):
+            return found
+        return replace(found, model=replace(found.model, drift=start.drift), start=start)
 
-    def _refined(self, parts: Sequence[int], start: _Polynomial, monitor: Callable[..., bool]
+    def simulated(self, start: _Polynomial, hidden: int, monitor: Callable[..., bool]
+                  ) -> _StructureCandidate | None:
+        """Return the candidate whose simulations err least; None where they diverge."""
+        # a realisation or a filter may forget faster than the plant
+        for _ in range(1 if self.samples else 2):
+            samples = self.samples or self.record.memory(start.drift)
+            try:
+                data, starts = self.record.simulated(start, samples)
+            except ValueError:
+                return None
+            refined = _simulated(PolynomialCoefficients(start.drift, self.learn_B), start.gain,
+                                 data, starts, monitor)
+            if not np.isfinite(refined.cost):
+                return None
+            if not self.samples:
+                self.samples = self.record.memory(refined.model.drift)
+                if self.samples == samples:
+                    break
+        return _candidate(refined, start, data, hidden)
+
+    def extended(self, linear: _StructureCandidate) -> _Polynomial:
+        """Return a linear model with further inputs of the record, which do nothing yet."""
+        drift = linear.model.drift
+        assert isinstance(drift, DriftModel)
+        inputs = self._shape(0).box.inputs
+        B = np.hstack((drift.B, np.zeros((len(drift.B), len(inputs) - drift.B.shape[1]))))
+        return Predictor(replace(drift, B=B, box=replace(drift.box, inputs=inputs)), linear.gain)
+
+    def filtered(self, start: _Polynomial, monitor: Callable[..., bool]) -> _Polynomial | None:
+        """Return a filter that foresees the record better; None where there is none."""
+        try:
+            found, _ = self._refined(start, monitor)
+            self.deviation = np.std(self.record.innovations(found), axis=0)
+            return standardised(found, self.record.estimates(found))
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+
+    def _realised(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
+        """Return a stable linear model of the outputs, with a filter that corrects nothing."""
+        shape = self._shape(hidden)
+        (states, inputs), n_y = (shape.box.states, shape.box.inputs), len(self.deviation)
+        measured = states.only(states.names[:n_y])
+        monitor()
+        found = realised([replace(one, x=measured.to_deviation(one.x), u=inputs.to_deviation(
+            one.u)) for one in self.record.episodes], self.record.period, n_y + hidden
+            ) if self.learn_B else None
+        if found is None:
+            return None
+        A, B, c = found
+        start = Predictor(replace(shape, coefficients=np.vstack((c, A.T)), B=B),
+                          np.zeros((n_y + hidden, n_y)))
+        try:
+            return standardised(start, self.record.estimates(start)) if hidden else start
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+
+    def from_filters(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
+        """Return the best filter of a linear drift; it is stable where the plant is not."""
+        try:
+            tried = [self._refined(self._start(hidden, gains), monitor) for gains in _GAINS]
+        except ValueError:
+            return None
+        return self.filtered(min(tried, key=lambda pair: pair[1])[0], monitor)
+
+    def _refined(self, start: _Polynomial, monitor: Callable[..., bool]
                  ) -> tuple[_Polynomial, float]:
-        record = self.record
+        record, parts = self.record, self.record.fit
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
             PolynomialCoefficients(start.drift, self.learn_B), start.gain,
@@ -359,10 +653,10 @@ class _Search:
             settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost
 
-    def _start(self, hidden: int, gains: Sequence[float]) -> _Polynomial:
-        """Return a filter of outputs that move by themselves, each at a rate of its own."""
+    def _shape(self, hidden: int) -> DriftModel:
+        """Return a linear drift of nothing, with the box of the record."""
         plant, parts = self._plant, self.record.parts
-        n_y, n_x = len(plant.state_names), len(plant.state_names) + hidden
+        n_x = len(plant.state_names) + hidden
         names = tuple(f'hidden_{i + 1}' for i in range(hidden))
         y = np.concatenate([part.interpolated() for part in parts])
         rows = np.linspace(-1.0, 1.0, len(y))[:, None] * np.ones(hidden)
@@ -373,8 +667,14 @@ class _Search:
                         nominal_state=np.concatenate((plant.nominal_state, np.zeros(hidden))), B=B)
         box = Box.of(whole, np.hstack([y, rows]), np.concatenate([p.u for p in parts]),
                      nominal=False)
-        shape = DriftModel(box, 1, np.zeros((1 + n_x, n_x)), np.zeros((n_x, len(box.inputs))) if (
+        return DriftModel(box, 1, np.zeros((1 + n_x, n_x)), np.zeros((n_x, len(box.inputs))) if (
             B is None) else box.input_matrix(B))
+
+    def _start(self, hidden: int, gains: Sequence[float]) -> _Polynomial:
+        """Return a filter of outputs that move by themselves, each at a rate of its own."""
+        shape = self._shape(hidden)
+        n_y = len(self._plant.state_names)
+        n_x = n_y + hidden
         gain = np.zeros((n_x, n_y))
         for i in range(n_x):
             layer = min(i // n_y, len(gains) - 1)

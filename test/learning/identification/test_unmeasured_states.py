@@ -12,6 +12,7 @@ from scipy.optimize import fsolve
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import (
+    identify_structure,
     identify_unmeasured,
     Stopped,
     unmeasured_states,
@@ -73,6 +74,38 @@ def test_modes_and_gain_of_a_linear_plant():
     assert found.noise[0] == pytest.approx(NOISE, rel=0.15)
 
 
+@pytest.mark.parametrize(('rate', 'hidden'), [
+    (oscillator, 1), (lambda x, u: np.array([u - 0.4 * x[0] - 0.1 * x[0] ** 3, -x[1]]), 0)])
+def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate, hidden):
+    found = identify_structure(PLANT, [record(rate, samples=500)])
+    assert found.hidden == hidden
+    assert bool(found.steps) == bool(hidden)
+
+
+def test_the_best_so_far_is_taken_when_the_time_is_over():
+    found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
+    assert found.hidden == 1
+    assert any('left out after 0 s: drift of degree 1 with 2' in step for step in found.steps)
+
+
+def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
+    pushes = np.array([0.5, -0.2])
+    days = [record(lambda x, u, push=push: oscillator(x, u) + np.array([push, 0.0]),
+                   samples=400, seed=seed)
+            for seed, push in enumerate(pushes)]
+    found = identify_unmeasured(PLANT, days, 1, highest_degree=1)
+    drift = found.drift
+    assert drift.box.inputs.names == ('flow',)
+    # as it moves the steady state, whatever the coordinates
+    slope = drift.slope(drift.box.states.center)
+    moved = -np.linalg.solve(slope, found.offsets.T)[0]
+    assert moved == pytest.approx(-np.linalg.solve(A, [1.0, 0.0])[0] * (
+        pushes - np.mean(pushes)), rel=0.05)
+    assert np.sort_complex(np.linalg.eigvals(slope)) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(A)), rel=0.03)
+    assert any('offset of each episode' in step for step in found.steps)
+
+
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
     found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
                                 highest_degree=2)
@@ -118,7 +151,7 @@ def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypat
     settled = slice(100, None)
     errors = [np.sqrt(np.mean((simulated(drift, other)[settled] - other.x[settled, 0]) ** 2))
               for drift in (found.drift, found.linear)]
-    assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
+    assert errors[0] < min(2.0 * NOISE, 0.5 * errors[1])
 
 
 def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
