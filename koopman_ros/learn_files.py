@@ -82,7 +82,7 @@ def command_parser() -> argparse.ArgumentParser:
         'the model on; it takes no part in the training')
     options = parser.add_argument_group('training, by the parameters of the trainer node')
     for row in (_table(None, ('x [1]',), ('u [1]',)).rows[name] for name in _OPTIONS):
-        default = _DEFAULTS.get(row.name, row.default)
+        default: Any = _DEFAULTS.get(row.name, row.default)
         many = isinstance(default, tuple)
         notes = '; '.join(filter(None, (
             row.range_text if not row.choices else '', '' if many or row.default == '' else

@@ -278,10 +278,13 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             break
     if linear is None:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
-    search, records = first, {(False, ()): record}
+    search = first
+    records: dict[tuple[bool, tuple[int, ...]], SplitRecord] = {(False, ()): record}
     tried = list[_StructureCandidate]()
     monitor = stage('dead time')
-    for late in _dead_times(record, linear, monitor) if dead_times else ():
+    manipulated = [dead_times and name not in plant.disturbance_names
+                   for name in plant.input_names]
+    for late in _dead_times(record, linear, manipulated, monitor) if any(manipulated) else ():
         if monitor():
             break
         moved = _Search(SplitRecord(plant, [_moved(one, record.period * np.array(late))
@@ -313,11 +316,11 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         monitor = stage(f'drift of degree {degree} with {_not_measured(count)}')
         if not monitor():
             last = search.filtered(raised(last), monitor)
-            found = last and search.simulated(last, count, monitor)
-            choice.gains(found and replace(found, offsets=linear.offsets))
+            found = None if last is None else search.simulated(last, count, monitor)
+            choice.gains(None if found is None else replace(found, offsets=linear.offsets))
     if not choice.explained(explained):
         # in coordinates of a filter, whose hidden states have the range of those in the record
-        base = begin and search.simulated(begin, count, monitor)
+        base = None if begin is None else search.simulated(begin, count, monitor)
         linear = linear if base is None else replace(base, offsets=linear.offsets)
         shared = _Shared(linear, search.record.simulated(linear.start, search.samples),
                          search.learn_B, (end - time.process_time()) / len(networks))
@@ -352,8 +355,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                        len(plant.input_names))))
 
 
-def _dead_times(record: SplitRecord, linear: _StructureCandidate, monitor: Callable[..., bool]
-                ) -> list[tuple[int, ...]]:
+def _dead_times(record: SplitRecord, linear: _StructureCandidate, manipulated: Sequence[bool],
+                monitor: Callable[..., bool]) -> list[tuple[int, ...]]:
     """Return those, in samples, with which single outputs err least, and their neighbours."""
     n_y, episodes = linear.errors.shape[1], record.episodes
     longest = min(LONGEST, max(map(len, episodes)) // SHARE)
@@ -361,9 +364,10 @@ def _dead_times(record: SplitRecord, linear: _StructureCandidate, monitor: Calla
             if len(one) > 2 * longest]
     if not data:
         return []
-    n_u = episodes[0].u.shape[1]
-    best = LinearModels(data, -(-len(linear.gain) // n_y), n_y).best((longest,) * n_u, monitor)
-    beside = [tuple(np.add(best, sign * row).tolist()) for row in np.eye(n_u, dtype=int)
+    best = LinearModels(data, -(-len(linear.gain) // n_y), n_y).best(
+        tuple(longest * own for own in manipulated), monitor)
+    beside = [tuple(np.add(best, sign * row).tolist())
+              for row in np.eye(len(manipulated), dtype=int)[list(manipulated)]
               for sign in (1, -1)]
     return [late for late in (best, *beside) if any(late) and min(late) >= 0]
 
@@ -450,7 +454,7 @@ def _add_networks(choice: _Choice, shared: _Shared, items: Mapping[str, tuple[in
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
             fitted = [found for _, found in results if found is not None]
         best = min(fitted, key=lambda one: one.cost, default=None)
-        choice.gains(best and shared.candidate(best))
+        choice.gains(None if best is None else shared.candidate(best))
 
 
 def _network(shared: _Shared, item: tuple[int, int], tell: Tell
@@ -561,7 +565,7 @@ class _Search:
         samples = self.samples
         for begin in (self._realised, self.from_filters):
             start = begin(hidden, monitor)
-            found = start and self.simulated(start, hidden, monitor)
+            found = None if start is None else self.simulated(start, hidden, monitor)
             # an unstable plant in a closed loop has no realisation of its own
             if found is not None and (begin == self.from_filters
                                       or found.model.drift.growth_rate < 0.0):
