@@ -97,6 +97,7 @@ class _StructureCandidate:
     #: (N, n_y) in deviations, of simulations by models that were not fitted there, or from starts
     #: that are fitted to the first samples where those err more
     errors: Array
+    starts: Array  #: of its simulations, in deviations of where its search began
     offsets: bool = False  #: whether each episode has a constant disturbance
     late: tuple[int, ...] = ()  #: dead times (n_u,) of the inputs in samples, where there are any
 
@@ -322,7 +323,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         # in coordinates of a filter, whose hidden states have the range of those in the record
         base = None if begin is None else search.simulated(begin, count, monitor)
         linear = linear if base is None else replace(base, offsets=linear.offsets)
-        shared = _Shared(linear, search.record.simulated(linear.start, search.samples),
+        data, starts = search.record.simulated(linear.start, search.samples)
+        shared = _Shared(linear, (data, starts if base is None else base.starts),
                          search.learn_B, (end - time.process_time()) / len(networks))
         _add_networks(choice, shared, networks,
                       lambda text: stage(f'{text} with {_not_measured(count)}'),
@@ -497,7 +499,7 @@ def _candidate(refined: Refined[Any], start: Predictor[DriftModel], data: Segmen
         others = free.along(data, free.starts(data, refined.starts)).innovations
         errors = np.where(np.mean(errors ** 2, axis=0) > np.mean(others ** 2, axis=0),
                           errors, others)
-    return _StructureCandidate(refined.model, start, hidden, errors) if np.all(
+    return _StructureCandidate(refined.model, start, hidden, errors, refined.starts) if np.all(
         np.abs(errors) < _LOST) else None
 
 

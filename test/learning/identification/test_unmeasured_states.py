@@ -135,7 +135,7 @@ def test_a_known_input_matrix_is_kept():
 
 
 def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypatch):
-    # the first of all networks that is good enough
+    # one of all networks
     monkeypatch.setattr(unmeasured_states, '_UNITS', (8,))
     monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
 
@@ -145,13 +145,13 @@ def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypat
         return np.array([w - 0.4 * y - 2.0 * max(0.0, y - 0.3), 1.5 * (u - w)])
 
     found = identify_unmeasured(PLANT, [record(outlet, samples=1000, size=0.8)], 1,
-                                highest_degree=1)
+                                highest_degree=1, dead_times=False, seed=2)
     assert isinstance(found.drift, NetworkDrift)
     other = record(outlet, samples=600, size=0.8, seed=5)
     settled = slice(100, None)
     errors = [np.sqrt(np.mean((simulated(drift, other)[settled] - other.x[settled, 0]) ** 2))
               for drift in (found.drift, found.linear)]
-    assert errors[0] < min(2.0 * NOISE, 0.5 * errors[1])
+    assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
 
 
 def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
