@@ -94,7 +94,7 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
                            'new.safetensors', '--model_class', 'linear', '--states', 'level',
                            '--inputs', 'pump']) == 2
     assert 'the current model' in capsys.readouterr().out
-    assert load(folder / 'new.refused.safetensors').disturbances.names == ('rain',)
+    assert load(folder / 'new.rejected.safetensors').disturbances.names == ('rain',)
     assert learned('--disturbances', 'rain', '--input_matrix_degree', '1') == 1
     assert 'input_matrix_degree' in capsys.readouterr().err
     table(0).assign(**{'rain [mm]': 3.0}).to_csv('day.csv', index=False)

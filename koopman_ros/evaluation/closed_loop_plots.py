@@ -36,7 +36,7 @@ def plot_law_check(check: ClosedLoopTest, path: Path) -> Path:
             draw_loops(axes, check, i)
         legend(figure, panels, min(n, 2))
         figure.suptitle(f'{check.loops} closed loops:\nthe model is '
-                        f'{"accepted" if check.accepted else "refused"} as a controller')
+                        f'{"accepted" if check.accepted else "rejected"} as a controller')
     return path
 
 

@@ -185,7 +185,7 @@ def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
                  f'roll-out {_errors(one["heldout_error"], units)}',
                  f'law fails in {failed} of {loops} closed loops']
     line = 'chosen: ' * one['chosen'] + ', '.join([*parts, f'{one["seconds"]:.1f} s'])
-    return line + (f'; refused: {one["refusal"]}' if one['refusal'] else '')
+    return line + (f'; rejected: {one["refusal"]}' if one['refusal'] else '')
 
 
 def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:

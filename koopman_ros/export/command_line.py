@@ -64,7 +64,7 @@ def loop(model: str, law: str, parameters: Path | None = None
     :raises ValueError: for a model or parameters that the node refuses.
     """
     given = {'system': ''} if parameters is None else file_parameters(parameters, 'controller')
-    loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
+    loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))
     table = table_of(loaded.model, given)
     if unknown := sorted(set(given) - set(table.rows)):
         raise ExportError(f'{parameters}: {unknown[0]} is no parameter of this loop: correct or '

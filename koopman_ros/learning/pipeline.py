@@ -195,7 +195,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
     An accepted lift goes to the output file; the file that it replaces is kept as
-    ``.previous.safetensors``. A refused lift goes to ``.refused.safetensors``. If the lift that
+    ``.previous.safetensors``. A rejected lift goes to ``.rejected.safetensors``. If the lift that
     training makes of a sibling's would be refused, training starts again without the sibling.
     The result does not depend on the executor of the task.
 
@@ -479,7 +479,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
         metrics |= dict(zip(labels, map(float, values), strict=True))
     metrics |= {f'{FREE_RUN}_{name}': float(error)
                 for name, error in zip(run.names, run.rmse, strict=True)}
-    # a refused lift may diverge
+    # a rejected lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, verified_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
@@ -490,7 +490,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
 def _place(output: Path, accepted: bool) -> Path:
     """Return where a lift is written; an accepted one moves its predecessor aside."""
     if not accepted:
-        return output.with_suffix('.refused.safetensors')
+        return output.with_suffix('.rejected.safetensors')
     if output.exists():
         previous = backup_path(output)
         previous.unlink(missing_ok=True)

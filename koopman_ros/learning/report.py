@@ -61,7 +61,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     errors = tuple(f'error of {name} [{unit}]'
                    for name, unit in zip(states.names, states.units, strict=True))
     kind = '' if learned is None else f' ({learned.model.kind})'
-    yield f'**The new model{kind} is {"accepted" if retrained.accepted else "refused"}.**'
+    yield f'**The new model{kind} is {"accepted" if retrained.accepted else "rejected"}.**'
     warnings = () if decision is None else decision.warnings
     yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
     if retrained.model_file:
@@ -173,7 +173,7 @@ def _draw(path: Path, retrained: Retrained) -> bool:
                     low, high = row[3].get_ylim()
                     row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
                     row[3].legend(fontsize=8, loc='upper left')
-            word = 'accepted' if retrained.accepted else 'refused'
+            word = 'accepted' if retrained.accepted else 'rejected'
             figure.suptitle(f'Retraining: the new model is {word}')
     except ImportError:
         return False

@@ -72,7 +72,7 @@ class Provenance:
     @property
     def acceptance(self) -> str:
         """The verdict in words, with the reasons."""
-        verdict = {True: 'accepted', False: 'refused', None: 'never judged'}[self.accepted]
+        verdict = {True: 'accepted', False: 'rejected', None: 'never judged'}[self.accepted]
         return f'{verdict} ({"; ".join(self.reasons)})' if self.reasons else verdict
 
 

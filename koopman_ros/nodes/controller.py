@@ -81,7 +81,7 @@ class ControllerNode(ManagedNode):
             raise ConfigurationError(
                 f'no model is known for the system {system!r}: set model, or set system to one of '
                 f'{", ".join(bundled_plants())}')
-        loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
+        loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))
         self._table = table = table_of(loaded.model, given)
         # in the file of a whole loop; the controller has those of its model
         self._settings = self.declare_table(table, ('disturbances_measured',))
@@ -100,7 +100,7 @@ class ControllerNode(ManagedNode):
         loaded, self._loaded = self._loaded, None
         if loaded is None or loaded.name != parameters.model:
             loaded = load_suitable(parameters.model, self._signals,
-                                   force=parameters.load_refused_model)
+                                   force=parameters.load_rejected_model)
         signals = self._signals
         self._models = ModelReload(
             self, loaded, signals, self._model_situation,
@@ -304,7 +304,7 @@ class ControllerNode(ManagedNode):
             unheard_for=time.monotonic() - self._received,
             setpoint_received=self._requests.setpoint_received,
             request=self._requests.complaint,
-            model_refused=self._models.complaint,
+            model_rejected=self._models.complaint,
             model=lambda: {**self._models.figures(),
                            'dead time change': self._dead_time_change or 'none',
                            'safe input': self._safe_input_warning or 'within reach'})

@@ -16,7 +16,7 @@ _METRICS = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, re
 _METRICS_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
                       'noise': 'Measurement noise'}
 _STATUS = {'model file time': 'File written', 'model training data': 'Training data (digest)',
-           'model reloads': 'Reloads', 'model refused': 'Last file rejected',
+           'model reloads': 'Reloads', 'model rejected': 'Last file rejected',
            'model check': 'Check on recent data', 'law': 'Control law',
            'gain norm': 'Norm of the feedback gain',
            'predicted growth per sample': 'Predicted growth per sample'}

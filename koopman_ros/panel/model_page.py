@@ -40,7 +40,7 @@ from koopman_ros.panel.snapshot import (
 from koopman_ros.parameters.description import ParameterDescription
 
 _DONE = 'done [%]'
-_FORCE = 'load_refused_model'
+_FORCE = 'load_rejected_model'
 
 
 def model_page(page: PageLayout) -> None:

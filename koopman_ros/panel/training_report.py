@@ -20,7 +20,7 @@ MAX_TEXT = 1_000_000  # bytes of a text or of figures
 MAX_PICTURE = 16_000_000  # bytes
 _MAX_LINES, _MAX_LINE = 40, 500  # characters
 _PNG, _PNG_END = b'\x89PNG\r\n\x1a\n', b'IEND\xaeB`\x82'
-_ENDINGS = ('.refused.safetensors', '.safetensors')
+_ENDINGS = ('.rejected.safetensors', '.safetensors')
 # Figures of the trainer's status that tell one training from another.
 _IDENTIFYING = ('accepted', 'measurements_read', 'measurements_used', 'model_file')
 

@@ -75,7 +75,7 @@ class ControllerParameters:
     max_measurement_age: float = parameter(
         5.0, 'Age of a measurement on receipt above which diagnostics warn; 0: no warning.',
         's', 0.0, 86400.0)
-    load_refused_model: bool = parameter(
+    load_rejected_model: bool = parameter(
         False, 'Also load a model that its training rejected.')
     model_check_factor: float = parameter(
         2.0, 'A new model is rejected if its prediction error on recent measurements exceeds that '

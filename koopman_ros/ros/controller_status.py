@@ -80,7 +80,7 @@ class StatusContext:
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
     request: str  #: why the operator's last request was refused or limited, or empty
-    model_refused: str  #: why the last model, or that in force, was refused; or empty
+    model_rejected: str  #: why the last model, or that in force, was refused; or empty
     model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
 
     @property
@@ -242,8 +242,8 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
             'use_sim_time to false, or publish_clock of the plant to true')
     if now.request:
         yield REQUESTS, now.request
-    if now.model_refused:
-        yield MODEL, now.model_refused
+    if now.model_rejected:
+        yield MODEL, now.model_rejected
     if report.measurement.outside > 0.0:
         outside = _untrained(states.only(tuple(now.signals.states)), now.measured)
         yield MODEL, (f'{outside or "the state is far from the training data"}: '

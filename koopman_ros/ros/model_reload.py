@@ -51,7 +51,7 @@ class _Trial:
         outcome: LoadedModel | str
         try:
             outcome = load_suitable(
-                name, signals, force=situation.parameters.load_refused_model)
+                name, signals, force=situation.parameters.load_rejected_model)
             refuse_setpoints(outcome.model, situation)
             refuse_without_law(outcome.model, situation)
             outcome = replace(outcome, comparison=refuse_worse(present, outcome.model, situation))
@@ -172,7 +172,7 @@ class ModelReload:
             'model file time': self.in_force.file_time,
             'model training data': self.in_force.model.provenance.data_digest[:12] or 'none',
             'model reloads': self.reloads,
-            'model refused': self.refused or 'none',
+            'model rejected': self.refused or 'none',
             'model check': self.in_force.comparison or 'none',
             'model acceptance': self.in_force.model.provenance.acceptance,
         }

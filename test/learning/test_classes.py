@@ -182,7 +182,7 @@ def test_classes_side_by_side_in_report_and_summary(bag, tmp_path):
     lines = class_lines(figures)
     assert list(lines) == list(CLASSES)
     assert lines['linear'].startswith('chosen: ')
-    assert '; refused: ' in lines['identity lift']
+    assert '; rejected: ' in lines['identity lift']
     assert scalars(figures)['class linear'] == lines['linear']
 
 

@@ -122,7 +122,7 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     assert not retrained.accepted
     assert 'is not 10 % below that of the current model' in retrained.reasons[0]
     # nothing replaces the output, and the same data and seed give the same numbers
-    assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
+    assert [path.name for path in output.parent.iterdir()] == ['new.rejected.safetensors']
     refused = load(retrained.model_file)
     assert refused.provenance.accepted is False
     assert refused.provenance.reasons == retrained.reasons
@@ -223,7 +223,7 @@ def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
     assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
     assert retrained.summary()['input_gain']['temperature'] == {
         'coolant_temperature': pytest.approx(1.0 / 60.0, rel=1e-12)}
-    assert 'is refused.**' in page_of(retrained)
+    assert 'is rejected.**' in page_of(retrained)
 
 
 @pytest.mark.parametrize(('stage', 'done_before'), [

@@ -286,7 +286,7 @@ def test_a_printed_model_shows_its_ranges_rates_and_verdict():
     assert f'{model.eigenvalues.real[0]:.4g} per {model.time_unit}' in str(model)
     assert '  held-out rx: 0.25' in lines
     assert f'  dead time of {model.inputs.names[0]}: 7.5 s' in lines
-    assert lines[-1] == '  acceptance: refused (too few loops)'
+    assert lines[-1] == '  acceptance: rejected (too few loops)'
 
 
 def test_a_model_cannot_be_changed():

@@ -336,7 +336,7 @@ def test_a_reader_sees_the_old_file_or_the_new_one(path, sound, monkeypatch):
     (MODELS['monomials'], 'polynomial', 'never judged'),
     (MODELS['linear'], 'linear', 'never judged'),
     (MODELS['accepted'], 'identity lift, n_z = 5', 'accepted (error 0.2 K)'),
-    (MODELS['refused'], 'neural drift', 'refused (too large; too few)')])
+    (MODELS['refused'], 'neural drift', 'rejected (too large; too few)')])
 def test_class_and_acceptance_are_named(model, kind, acceptance, path):
     save(model, path)
     assert (load(path).kind, load(path).provenance.acceptance) == (kind, acceptance)

@@ -164,7 +164,7 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
     done, reason = bench.set(file)
     assert not done
     assert reason.startswith('the current model is kept: ')
-    assert 'load_refused_model' in reason
+    assert 'load_rejected_model' in reason
     status = ros.wait_for_status(STATUS, lambda s: s.message == reason)
     assert status.level == DiagnosticStatus.WARN
     assert value(status, 'model') == 'reactor_nz3'
@@ -175,18 +175,18 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
         True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
         '53.85 degC; acceptance: never judged')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
-    assert value(status, 'model refused') == 'none'
+    assert value(status, 'model rejected') == 'none'
 
-    result = change(load_refused_model=True, model=str(file))
+    result = change(load_rejected_model=True, model=str(file))
     assert result.successful, result.reason
     done, about = bench.reload()
     assert done
     assert 'too large an error' in about
-    status = ros.wait_for_status(STATUS, lambda s: 'in force though it was refused' in s.message)
+    status = ros.wait_for_status(STATUS, lambda s: 'in force though it was rejected' in s.message)
     assert (status.level, 'too large an error' in status.message) == (DiagnosticStatus.WARN, True)
-    assert value(status, 'model acceptance') == 'refused (too large an error)'
-    assert change(load_refused_model=False).successful
-    assert 'load_refused_model' in bench.reload()[1]
+    assert value(status, 'model acceptance') == 'rejected (too large an error)'
+    assert change(load_rejected_model=False).successful
+    assert 'load_rejected_model' in bench.reload()[1]
     assert ros.get_parameters('controller', 'model') == [str(file)]
 
     # a model and the bound that it needs are changed together

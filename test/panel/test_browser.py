@@ -229,16 +229,16 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         for force, name in ((True, str(bad)), (False, 'reactor_nz4')):
             # again if a busy machine did not read it in time
             ros.wait_until(lambda force=force, name=name: ros.set_parameters_atomically(
-                'controller', load_refused_model=force, model=name).successful)
+                'controller', load_rejected_model=force, model=name).successful)
         # the panel knows of it
         page.goto(f'{site.url}/tuning')
         card(page, 'Parameters of the controller').get_by_text('general', exact=True).click()
-        expect(page.locator('[data-parameter="load_refused_model"]').get_by_role(
+        expect(page.locator('[data-parameter="load_rejected_model"]').get_by_role(
             'combobox')).to_have_value('false')
         page.goto(f'{site.url}/model')
         activated(page, re.compile('Back to .*bad'), 'rejected this model: too inaccurate',
                   'refused', yes='Activate by force')
-        ros.wait_until(lambda: ros.get_parameters('controller', 'load_refused_model') == [False])
+        ros.wait_until(lambda: ros.get_parameters('controller', 'load_rejected_model') == [False])
         activated(page, re.compile('Back to reactor'))
         press(recording, 'Record')
         expect(recording).to_contain_text('recording to')
@@ -448,7 +448,7 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
             expect(row.locator('.answer')).to_have_text(said)
         # parameters with a few possible values are lists
         for node, name, choices in (('trainer', 'experiment_signal', ('manual', 'setpoint')),
-                                    ('controller', 'load_refused_model', ('true', 'false'))):
+                                    ('controller', 'load_rejected_model', ('true', 'false'))):
             page.get_by_label(f'Parameters of the {node}').get_by_text(
                 'general', exact=True).click()
             row = page.locator(f'[data-parameter="{name}"]')

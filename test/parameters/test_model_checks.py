@@ -61,7 +61,7 @@ def renamed(state: str, coolant: str) -> LiftedModel:
     (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
     (replace(SHIPPED, provenance=replace(
         SHIPPED.provenance, accepted=False, reasons=('too large an error',))),
-     'was refused (too large an error): train it again, or set load_refused_model'),
+     'was rejected (too large an error): train it again, or set load_rejected_model'),
 ])
 def test_unsuitable_model_is_refused_with_the_reason(
         tmp_path: Path, model: LiftedModel, words: str) -> None:

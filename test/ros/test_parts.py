@@ -169,7 +169,7 @@ def context(own: Controller, state: State, report: StepReport, silence: float = 
         reason='a reason', measured=own.model.states.center, setpoint_received=True,
         parameters=SimpleNamespace(
             max_measurement_age=5.0, measurement_timeout=0.0, tuning=own.tuning),
-        complaint='', unheard=(), unheard_for=0.0, request='', model_refused='', input='coolant',
+        complaint='', unheard=(), unheard_for=0.0, request='', model_rejected='', input='coolant',
         counts=Counts(measurements=measurements), model=dict, assembler=SimpleNamespace(
             awaited='', late={}, missing={}, duplicated={}),
         timing=SimpleNamespace(silence=silence, wall_silence=0.0, paused=False,
