@@ -88,8 +88,8 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
         raise ModelFileError(f'{path}: {reason}')
     if model.provenance.accepted is False and not force:
         raise ModelFileError(
-            f'{path} was {model.provenance.acceptance}: train it again, or set load_rejected_model '
-            'to true to use it anyway')
+            f'{path} was {model.provenance.acceptance}: train it again, or set '
+            'load_rejected_model to true to use it anyway')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and own.disturbances == signals.disturbances
