@@ -187,6 +187,17 @@ def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
     assert (found.level is Severity.WARN) is warned
 
 
+def test_a_late_input_of_the_time_before_the_start_is_said_to_be_assumed() -> None:
+    model = load(model_path('reactor_nz4'))
+    own = built(table_of(model, {'system': 'reactor'}).snapshot({
+        'coolant_temperature.dead_time': 2.5}), model)
+    state, messages = State(), []
+    for k in range(1, 5):
+        state, _, report = own.step(state, model.states.center, k * NANOSECONDS)
+        messages.append(statuses(context(own, state, report))['control'].message)
+    assert ['before the start is assumed' in text for text in messages] == [True] * 3 + [False]
+
+
 def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
     model = load(model_path('reactor_feed'))
     signals = signals_of(model)

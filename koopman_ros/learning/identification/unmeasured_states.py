@@ -489,11 +489,15 @@ def _simulated(model: _Model, gain: Array, data: Segments, starts: Array,
 
 def _candidate(refined: Refined[Any], start: Predictor[DriftModel], data: Segments, hidden: int
                ) -> _StructureCandidate | None:
-    """Return the candidate of a model, or none where its simulations diverge."""
+    """Return the candidate of a model; None where it diverges or hangs on a few samples."""
     if not np.isfinite(refined.cost):
         return None
     with np.errstate(all='ignore'):
-        errors = refined.left_out(SETTLING)
+        try:
+            errors = refined.left_out(SETTLING)
+        except np.linalg.LinAlgError:
+            # a few samples decide alone about some direction of the parameters
+            return None
         # a state that the first samples do not tell is of no use
         free = Predictor(refined.model.drift, 0.0 * start.gain)
         others = free.along(data, free.starts(data, refined.starts)).innovations
