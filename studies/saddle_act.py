@@ -11,7 +11,7 @@ of the model, go the same course with the same noise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from koopman_ros.demo.loop import FIRST_STAMP_NS, Operator, Row, running_loop, S
 from koopman_ros.demo.reactor import constant
 from koopman_ros.demo.results import draw_phases
 from koopman_ros.evaluation import at, simulate
-from koopman_ros.evaluation.simulate import Simulation
+from koopman_ros.evaluation.simulate import after_a_second, Simulation
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
@@ -181,16 +181,24 @@ def _operate(operator: Operator, bag: Path, learned: Path) -> list[tuple[str, fl
                  **{'temperature.setpoint_ramp': 0.0})
     operator.begin('lift', 'the lift has taken over')
     begin = operator.seconds
-    for when, value in COURSE.items():
+    for sent, when, value in _requests():
+        operator.run_until(begin + sent)
         operator.request_setpoints({'temperature': value}, begin + when)
-        # a later one in advance would be forgotten for it
-        operator.run_until(begin + when + 1.0)
     operator.run_until(begin + FOULED)
     operator.set('plant', **{'constants.heat_transfer_coefficient': (
         FOULING['heat_transfer_coefficient'] / UA * constant('heat_transfer_coefficient'))})
     operator.begin('fouling', 'the jacket fouls: UA -15 %')
     operator.run_until(begin + END)
     return operator.phases
+
+
+def _requests() -> Iterator[tuple[float, float, float]]:
+    """Yield when each set-point is sent, from when on it holds, both in s, and its value in K."""
+    sent = 0.0
+    for when, value in COURSE.items():
+        yield sent, when, value
+        # a later one in advance would replace it
+        sent = when + 1.0
 
 
 def _reconstructed(rows: list[Row], estimates: Mapping[int, JointState], model: LiftedModel,
@@ -295,8 +303,9 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
         return simulate(
             one, plant, [
                 at(0.0, Initialisation(u0)), at(fouled, becomes(reactor(FOULING))),
-                *(at(when, SetpointRequest(0, np.array([value])))
-                  for when, value in COURSE.items())],
+                *(at(sent, SetpointRequest(after_a_second(round(when * NANOSECONDS)),
+                                           np.array([value])))
+                  for sent, when, value in _requests())],
             duration=float(len(noise) - 1), C=np.eye(2)[-n_y:],
             sensor=lambda y, seconds: y + np.array([0.0, noise[round(seconds)]])[-n_y:])
 
@@ -308,7 +317,9 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
                       ('pi', _pi())):
         loop = other(one)
         costs[name] = _cost(loop.states[:, 1], loop.commands[:, 0], fouled)
-    ends = [*list(COURSE)[2:], fouled, len(T)]
+    # a law that plans moves before a set-point that it knows
+    ahead = _laws(true_model(), LAWS[:2]).best.law.horizon(1.0)
+    ends = [*(when - ahead for when in list(COURSE)[2:]), fouled, len(T)]
     offsets = [abs(float(np.mean(T[int(end) - _LATE:int(end)])) - value)
                for end, value in zip(ends, [355.0, 345.0, 345.0], strict=True)]
     counted = slice(first + int(_LEAD), run.fouled)
