@@ -25,7 +25,7 @@ import numpy as np
 from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.signals import Outputs
-from koopman_ros.export import c_code, example
+from koopman_ros.export import compiled_example
 from koopman_ros.export.command_line import loop
 from koopman_ros.export.vectors import vectors
 from koopman_ros.model import (
@@ -66,12 +66,7 @@ def compared(controller: Controller, samples: int, interval: float, seed: int = 
              compiler: str = 'gcc', flags: Sequence[str] = ()) -> Agreement:
     """Compile the code of a loop, run both over a sequence, and compare the answers."""
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        for name, text in {**c_code(controller, interval), 'example.c': example()}.items():
-            (folder / name).write_text(text)
-        program = folder / 'example'
-        subprocess.run([compiler, *FLAGS, *flags, folder / 'controller.c', folder / 'example.c',
-                        '-lm', '-o', program], check=True)
+        program = compiled_example(controller, interval, Path(place), compiler, (*FLAGS, *flags))
         rows = list(vectors(controller, samples, interval, seed))
         calls = ''.join(f'{",".join(call.row(controller))}\n' for call, _ in rows)
         begin = time.perf_counter()

@@ -15,7 +15,7 @@ from koopman_ros.control import Controller
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo.loop import Row
-from koopman_ros.export import c_code, example
+from koopman_ros.export import compiled_example
 from koopman_ros.export.vectors import Call
 
 
@@ -32,14 +32,11 @@ class ExportedLoop:
         compiler = os.environ.get('CC', 'cc')
         if shutil.which(compiler) is None:
             raise ValueError(f'the C compiler {compiler} is not installed: install gcc, or set CC')
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, text in {**c_code(controller, sample_period), 'example.c': example()}.items():
-            (folder / name).write_text(text)
-        subprocess.run([compiler, '-std=c99', '-O2', 'controller.c', 'example.c',
-                        '-lm', '-o', 'example'], cwd=folder, check=True)
+        program = compiled_example(controller, sample_period, folder, compiler,
+                                   ('-std=c99', '-O2'))
         self._controller, self._step_time = controller, step_time
         self._setpoint = np.array([setpoints[name] for name in controller.controlled.names])
-        self._process = subprocess.Popen([folder / 'example'], stdin=subprocess.PIPE,
+        self._process = subprocess.Popen([program], stdin=subprocess.PIPE,
                                          stdout=subprocess.PIPE, text=True)
         self._last = 0.0
         self.seconds: list[float] = []  #: of the commands, since the first measurement

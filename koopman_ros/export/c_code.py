@@ -9,9 +9,11 @@ expressions: a network and its derivatives take thirty lines of C for any model,
 CasADi.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 import math
+from pathlib import Path
+import subprocess
 from typing import Any
 
 import numpy as np
@@ -70,6 +72,22 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
 def example() -> str:
     """Return the program ``example.c``, which reads calls and prints answers."""
     return (files(__package__) / 'templates' / 'example.c').read_text()
+
+
+def compiled_example(controller: Controller, interval: float, folder: Path, compiler: str,
+                     flags: Sequence[str]) -> Path:
+    """
+    Write the code of a loop and the example to a folder, and compile them; return the program.
+
+    :raises subprocess.CalledProcessError: where the code does not compile.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in {**c_code(controller, interval), 'example.c': example()}.items():
+        (folder / name).write_text(text)
+    program = folder / 'example'
+    subprocess.run([compiler, *flags, folder / 'controller.c', folder / 'example.c', '-lm', '-o',
+                    program], check=True)
+    return program
 
 
 def _check(controller: Controller) -> None:
