@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Riccati equations of the continuous and of the sampled regulator, and Runge-Kutta steps."""
+"""Riccati equations of the continuous and the sampled regulator, Runge-Kutta steps, Jacobians."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from scipy.linalg.lapack import dgees, dgeev, dgesv
 
 from koopman_ros.core.arrays import Array
 
-__all__ = ['RiccatiSolution', 'RiccatiStatus', 'over_interval', 'runge_kutta_step',
-           'solve_riccati', 'spectral_radius', 'transition']
+__all__ = ['RiccatiSolution', 'RiccatiStatus', 'differences', 'over_interval',
+           'runge_kutta_step', 'solve_riccati', 'spectral_radius', 'transition']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
@@ -22,6 +22,9 @@ _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
 # Nor modes of a sampled plant within the rounding of its transition, where samples as far apart as
 # a period leave nothing else.
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
+# Step of a central difference, as a share of the magnitude: rounding and curvature both leave
+# about ten digits.
+_DIFFERENCE = 1e-5
 # The power series of exp(M) - I, for |M| < 1, by M to M^4 in rows that are multiplied by powers of
 # M^4 (M. S. Paterson, L. J. Stockmeyer, SIAM J. Comput. 2 (1973)).
 _SERIES = np.array([[1.0 / math.factorial(4 * i + j) for j in range(1, 5)] for i in range(5)])
@@ -251,6 +254,18 @@ def _size(matrix: Array) -> float:
     """Return the Frobenius norm."""
     flat = matrix.ravel()
     return math.sqrt(flat.dot(flat))
+
+
+def differences(function: Callable[[Array], Array], x: Array, scale: Array) -> Array:
+    """
+    Differentiate a function of (..., n) to (..., m) by central differences: (..., m, n).
+
+    :param scale: (n,) magnitudes of the arguments.
+    """
+    steps = _DIFFERENCE * np.diag(scale)
+    ahead, behind = (function(x[..., None, :] + sign * steps) for sign in (1.0, -1.0))
+    columns = (ahead - behind) / (2.0 * _DIFFERENCE * scale[:, None])
+    return np.asarray(columns.swapaxes(-1, -2), dtype=np.float64)
 
 
 def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:

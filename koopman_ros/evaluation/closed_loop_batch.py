@@ -21,7 +21,12 @@ from koopman_ros.control.laws import Law, Linear, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.core.solvers import (
+    differences,
+    RiccatiStatus,
+    runge_kutta_step,
+    solve_riccati,
+)
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import AppliedInputs, Estimate, MeasuredState, PendingInputs
 from koopman_ros.execution import Tell
@@ -45,7 +50,6 @@ _ESCAPED = 10.0
 _PATIENCE = 4
 # Share of the inputs' range, at either end, that a perfect model is not given.
 _KEPT = 0.1
-_DIFFERENCE = 1e-5  # step of a difference quotient, in scaled deviations
 
 
 @dataclass(frozen=True)
@@ -159,14 +163,13 @@ class DriftPlant:
 
     def slope(self, x: Array, v: Array) -> Array:
         """Return the derivatives (M, n_x, n_x + n_u) of the rate by state and input."""
-        n = x.shape[1]
-        both = np.hstack([x, v])
-        columns = []
-        for step in _DIFFERENCE * np.eye(both.shape[1]):
-            ahead, behind = both + step, both - step
-            columns.append(self.rate(ahead[:, :n], ahead[:, n:])
-                           - self.rate(behind[:, :n], behind[:, n:]))
-        return np.stack(columns, axis=-1) / (2.0 * _DIFFERENCE)
+        n, both = x.shape[1], np.hstack([x, v])
+
+        def rate(y: Array) -> Array:
+            rows = y.reshape(-1, y.shape[-1])
+            return self.rate(rows[:, :n], rows[:, n:]).reshape(*y.shape[:-1], n)
+
+        return differences(rate, both, np.ones(both.shape[1]))
 
     def holding(self, x: Array, v: Array) -> Array:
         """Return the inputs (M, n_u) nearest to `v` that hold the states (M, n_x) best."""

@@ -13,7 +13,6 @@ from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.units import (
     Display,
     display_unit,
-    quantity_text,
     SECONDS_PER_TIME_UNIT,
 )
 from koopman_ros.evaluation.closed_loop_test import (
@@ -264,11 +263,9 @@ def disagreement(found: Identified) -> str:
     if share <= _DIFFERENT:
         return ''
     worst = x[int(np.argmax(np.max(np.sum(differences ** 2, axis=2), axis=0)))]
-    place = ', '.join(f'{name} {quantity_text(value, unit)}' for name, unit, value in zip(
-        box.states.names, box.states.units, worst.tolist(), strict=True))
     return (f'{1 + len(found.alternatives)} drifts that explain the record equally well differ by '
-            f'{100.0 * share:.0f} % of the motion, most at {place}: record longer, with steps of '
-            'the input around that state')
+            f'{100.0 * share:.0f} % of the motion, most at {box.states.text(worst)}: record '
+            'longer, with steps of the input around that state')
 
 
 def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array

@@ -65,7 +65,7 @@ def _causes(found: Identified, episodes: Sequence[Episode]) -> dict[str, list[Ar
             causes.setdefault('input_matrix_degree', []).append(
                 (xi[:, :, None] * v[:, None]).reshape(len(xi), -1))
         if not found.constants:
-            # the past of the states has in it what comes from outside, too
+            # past states would also contain the effects of disturbances
             causes.setdefault('unmeasured_states', []).append(np.hstack([
                 _filtered(episode.time, v, -1.0 / (count * period)) / (count * period)
                 for count in _MEMORIES]))

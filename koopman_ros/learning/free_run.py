@@ -17,6 +17,7 @@ from scipy.optimize import least_squares, OptimizeResult
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
+from koopman_ros.core.solvers import differences
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 from koopman_ros.learning.identification import Drift, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
@@ -263,9 +264,7 @@ def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Ep
 
 def _memory(rate: Rate, states: Coordinates, x: Array, episode: Episode) -> float:
     """Return the slowest time constant at a state (n_x,), at most the time of the episode."""
-    n_x, u = len(states), episode.u[:1]
-    at = x + 1e-4 * states.scale * np.vstack([np.zeros(n_x), np.eye(n_x)])
-    here, *others = rate(at, np.repeat(u, 1 + n_x, axis=0)) / states.scale
-    slowest = np.min(np.abs(np.linalg.eigvals(np.transpose(np.subtract(others, here)) / 1e-4)))
+    u = np.repeat(episode.u[:1], len(states), axis=0)
+    slowest = np.min(np.abs(np.linalg.eigvals(differences(lambda y: rate(y, u), x, states.scale))))
     duration = float(episode.time[-1] - episode.time[0])
     return 1.0 / max(float(slowest), 1.0 / duration)

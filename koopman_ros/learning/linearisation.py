@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
-from koopman_ros.core.units import quantity_text, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.evaluation.closed_loop_batch import DriftPlant, Rate
 from koopman_ros.learning.identification import Identified
 from koopman_ros.learning.lift.metrics import lifted_rate
-from koopman_ros.model import Coordinates, LiftedModel
+from koopman_ros.model import LiftedModel
 
 # A mode is unstable if it grows by this power of e in the longest segment of the record.
 _GROWTH = 2.0
 # No noise is so small that a plant would stay where it grows by this power of e.
 _STILL = 20.0
-# It stays within so many standard deviations of the noise, or this share of the range.
-_SIGMAS, _SHARE = 4.0, 1e-3
-_CHANGE = 1e-6  # of an input, likewise
+# A plant rests while it stays within so many standard deviations of the noise, or within this
+# share of the range, and its inputs change by less than this share of theirs.
+_SIGMAS, _SHARE, _INPUT_SHARE = 4.0, 1e-3, 1e-6
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,6 @@ class OperatingPoint:
     def growth(self) -> float:
         """Rate of the fastest growing mode, in 1/time unit of the model."""
         return float(self.eigenvalues[0].real)
-
-    def text(self, states: Coordinates) -> str:
-        """Write the state, with units."""
-        return ', '.join(f'{name} {quantity_text(value, unit, ".4g")}'
-                         for name, unit, value in zip(
-                             states.names, states.units, self.x.tolist(), strict=True))
 
 
 def operating_points(model: LiftedModel, setpoints: Array) -> tuple[OperatingPoint, ...]:
@@ -89,7 +83,7 @@ def unfounded_instability(model: LiftedModel, found: Identified,
     longest = factor * max(float(one.time[-1] - one.time[0]) for one in episodes)
 
     def unstable(point: OperatingPoint) -> str:
-        return (f'it is unstable at {point.text(model.states)} (a mode grows by '
+        return (f'it is unstable at {model.states.text(point.x, ".4g")} (a mode grows by '
                 f'{point.growth:.3g} per {model.time_unit})')
 
     for point in points:
@@ -120,7 +114,7 @@ def _resting(found: Identified, episodes: Sequence[Episode]
     near = _SIGMAS * np.nan_to_num(found.noise) + _SHARE * box.states.scale
     for episode in episodes:
         x, u = episode.interpolated(), episode.inputs_at(episode.time)
-        changed = (np.abs(np.diff(u, axis=0)) > _CHANGE * box.inputs.scale).any(axis=1)
+        changed = (np.abs(np.diff(u, axis=0)) > _INPUT_SHARE * box.inputs.scale).any(axis=1)
         for rows in np.split(np.arange(len(x)), 1 + np.flatnonzero(changed)):
             # after it has settled
             rest = rows[len(rows) // 2:]

@@ -144,7 +144,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
            f'1/{learned.model.time_unit}. On the estimated drift {decision.law_check}.')
     yield f'Eigenvalues of the model at operating points [1/{learned.model.time_unit}]:'
     yield table(('operating point', 'eigenvalues'), (
-        (point.text(own), ', '.join(f'{value:.3g}' for value in np.real_if_close(
+        (own.text(point.x, '.4g'), ', '.join(f'{value:.3g}' for value in np.real_if_close(
             point.eigenvalues)))
         for point in decision.operating_points))
     if decision.statement:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, frozen, real, short_repr
 from koopman_ros.core.datasets import PlantDescription
+from koopman_ros.core.units import quantity_text
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,12 @@ class Coordinates:
         return Coordinates(self.names + others.names, self.units + others.units, *(
             np.concatenate([getattr(self, name), getattr(others, name)])
             for name in ('center', 'scale', 'lower', 'upper')))
+
+    def text(self, values: Array, number_format: str = '.6g') -> str:
+        """Write values (n,) with names and units, e.g. 'temperature 46.5 degC, level 2 m'."""
+        return ', '.join(f'{name} {quantity_text(value, unit, number_format)}'
+                         for name, unit, value in zip(
+                             self.names, self.units, values.tolist(), strict=True))
 
     def to_deviation(self, value: Array) -> Array:
         """Map physical values (..., n) to scaled deviations (..., n)."""

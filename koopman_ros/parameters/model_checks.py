@@ -15,7 +15,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import quantity_text, shown
 from koopman_ros.evaluation import compare, PredictionWindows
-from koopman_ros.model import Coordinates, LiftedModel, load_with_digest, ModelFileError
+from koopman_ros.model import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.signal_topics import Signals, signals_of, words_of
 
@@ -128,8 +128,8 @@ def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None
             if not model.distance(place) <= margin:
                 continue
             if (problem := controller.try_law(place, setpoint)) is not None:
-                tried = (f'tried at {listed(model.states, place)} with the set-point '
-                         f'{listed(controller.controlled, setpoint)} the control law of the model '
+                tried = (f'tried at {model.states.text(place)} with the set-point '
+                         f'{controller.controlled.text(setpoint)} the control law of the model '
                          f'fails ({words_of(signals_of(model))(problem)})')
                 # another model fails for the same reason
                 raise ModelFileError(tried if controller.usable.unusable is not None else
@@ -162,12 +162,6 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheck
         '' if found.tells else '; the signals moved too little for a stricter check')
 
 
-def listed(signals: Coordinates, values: Array) -> str:
-    """Write values (n,) for the operator."""
-    return ', '.join(f'{name} {quantity_text(value, unit)}' for name, unit, value in zip(
-        signals.names, signals.units, values.tolist(), strict=True))
-
-
 def rests_outside(controller: Controller) -> str:
     """Return the warning that the safe input keeps the plant where no law may act, or ''."""
     model, rest = controller.model, controller.rest
@@ -176,7 +170,7 @@ def rests_outside(controller: Controller) -> str:
         return ''
     safe, holding = controller.safe_input, rest.holding
     where = 'does not settle' if np.isnan(rest.x).any() else (
-        f'would settle at about {listed(model.states, rest.x)} by extrapolation')
+        f'would settle at about {model.states.text(rest.x)} by extrapolation')
     inputs = model.inputs.names, model.inputs.units
     better = ', '.join(
         f'{name}.safe_value = {quantity_text(held, unit)} or {"more" if held > now else "less"}'

@@ -12,13 +12,11 @@ from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
+from koopman_ros.core.solvers import differences
 from koopman_ros.core.units import check_time_unit, check_unit, SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
 
-# Step of a central difference, as a share of the magnitude of a state: rounding and curvature both
-# leave about ten digits.
-_DIFFERENCE = 1e-5
 # Largest difference between a given Jacobian and finite differences, as a share of the largest
 # entry in a row. Both are compared these shares of the magnitudes away from the nominal state.
 _JACOBIAN_TOLERANCE = 1e-4
@@ -42,15 +40,7 @@ class _DifferencedDrift:
     scale: Array  # (n_x,) magnitudes of the states
 
     def __call__(self, x: Array) -> Array:
-        return _differences(self.drift, x, self.scale)
-
-
-def _differences(function: ArrayFunction, x: Array, scale: Array) -> Array:
-    """Differentiate a function of states (..., n_x) to (..., n) by them: (..., n, n_x)."""
-    steps = _DIFFERENCE * np.diag(scale)
-    ahead, behind = (function(x[..., None, :] + sign * steps) for sign in (1.0, -1.0))
-    columns = (ahead - behind) / (2.0 * _DIFFERENCE * scale[:, None])
-    return np.asarray(columns.swapaxes(-1, -2), dtype=np.float64)
+        return differences(self.drift, x, self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +125,7 @@ class ControlAffineSystem:
             x = np.clip(self.nominal_state + share * scale, self.state_lower, self.state_upper)
             with np.errstate(all='ignore'):
                 given = np.asarray(self.drift_jacobian(x), dtype=np.float64)
-                expected = _differences(self.drift, x, scale)
+                expected = differences(self.drift, x, scale)
                 rate = np.abs(self.drift(x))[:, None]
             # in the magnitudes of the states
             largest = np.maximum(rate, np.max(np.abs(expected) * scale, axis=-1, keepdims=True))
@@ -199,7 +189,7 @@ class ControlAffineSystem:
         slope = self.drift_jacobian(x)
         if not callable(self.B):
             return slope
-        return slope + _differences(lambda states: self.forcing(states, u[..., None, :]), x,
+        return slope + differences(lambda states: self.forcing(states, u[..., None, :]), x,
                                     self.state_scale)
 
     def checked_state(self, name: str, value: ArrayLike) -> Array:
