@@ -94,6 +94,9 @@ def test_a_model_that_diverges_says_so(tmp_path):
 
 @pytest.mark.parametrize(('slope', 'words'), [
     (A, ''), (A * [[1.0, 1.0], [1.4, 1.0]], 'above that of the best linear model'),
+    # fits 0.4 and 2.0 % below
+    (A * [[1.0, 1.0], [1.13, 1.0]], ''),
+    (A * [[1.0, 1.0], [1.14, 1.0]], 'by more than 1 % of the motion'),
     (30.0 * np.eye(2), 'error of its free run, inf m in position')])
 def test_a_model_is_refused_whose_free_run_is_worse_than_that_of_the_linear_model(slope, words):
     test = read(table(), 'position [m]', 'force [N]')
