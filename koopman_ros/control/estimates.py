@@ -178,8 +178,11 @@ class StateEstimation:
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
-            far = outside > 0.0 and outside > max(
-                level.law.margin for level in self.levels.values())
+            # an estimate that strayed from the data is corrected; a plant that did is not known
+            margin = max(level.law.margin for level in self.levels.values())
+            far = outside > max(margin, 0.0) and (
+                self.outputs.determine_state
+                or self.model.distance(self.position(None, y)) > margin)
             lost = far or self._lost(state, time_ns)
             fresh = predicted is None or verdict.moved or not elapsed > 0.0 or lost
             predicted = self._corrected(
@@ -328,7 +331,7 @@ class StateEstimation:
     def transfer_estimate(self, estimate: Estimate, before: FallbackLevel,
                           now: FallbackLevel) -> Estimate:
         """Transfer an estimate from the model of one level to that of another."""
-        if before is now or not now.estimator.remembers:
+        if before.model is now.model or not now.estimator.remembers:
             return estimate
         return now.estimator.transferred(estimate, before.model.drift(estimate.x))
 
@@ -345,7 +348,9 @@ class StateEstimation:
         if not estimator.remembers:
             estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
         if old is new:
-            return replace(state, estimate=estimate)
+            # the level that acts may be gone, and its model with it
+            return replace(state, estimate=self.transfer_estimate(
+                estimate, predecessor.level(state.supervisor), self.level(state.supervisor)))
         x = old.states.to_physical(estimate.x)
         if old.states.names != new.states.names:
             # of what is not measured the new model has a view of its own

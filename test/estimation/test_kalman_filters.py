@@ -41,7 +41,7 @@ from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel
-from support.closed_loops import content, SECOND
+from support.closed_loops import content, SECOND, shipped
 from support.random_lifts import coordinates, random_lift
 
 FILTERS = [ExtendedKalmanFilter, UnscentedKalmanFilter]
@@ -422,3 +422,42 @@ def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_
         for late in (0, 10 ** 8):
             state, repeated, _ = one.step(state, y + 5.0, now - late)
             assert repeated == command
+
+
+def test_another_order_of_levels_goes_on_with_the_rate_that_was_estimated():
+    """From a PI law to levels of which the last has another model than the first."""
+    model, plant = shipped('two_state'), two_state_reactor()
+
+    def with_levels(*levels: str, **plugins: object) -> Controller:
+        return Controller(model, Tuning.for_model(
+            model, controlled=('temperature',), fallback_order=levels, plugins=plugins,
+            measurement_noise=np.array([0.02]), disturbance_noise=np.array([0.1])), TEMPERATURE)
+
+    x0, u0 = steady_state(plant, {'temperature': 312.15})
+    loop = simulate(
+        with_levels('pi', pi=PIParameters([0.0, 3.0], [1.0, 60.0])), Process(plant, 0, x0, u0), [
+            at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([312.15]))),
+            at(20.0, exchange(with_levels('sdre', 'linear')))],
+        duration=80.0, noise=np.array([0.02]), seed=9)
+    assert set(loop.levels[22:]) == {'sdre'}
+    assert np.max(np.abs(loop.states[:, 1] - 312.15)) < 0.3
+
+
+def test_an_estimate_that_strayed_from_the_data_is_corrected():
+    x0, u0 = held(350.0)
+
+    def strayed(loop: Loop) -> Loop:
+        estimate = loop.state.estimate
+        return replace(loop, state=replace(loop.state, estimate=replace(
+            estimate, x=estimate.x + np.array([2.0, 0.0]), covariance=None)))
+
+    loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
+        at(20.0, strayed)],
+        duration=60.0, noise=np.array([NOISE]), seed=8)
+    assert loop.levels[20] == 'safe'
+    assert loop.levels[-1] == 'sdre'
+    error = [report.estimate.state[0] - x[0] for report, x in zip(
+        loop.reports, loop.states, strict=False)]
+    assert error[20] > 0.5
+    assert np.max(np.abs(error[26:])) < 0.05
