@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from rclpy.utilities import get_rmw_implementation_identifier
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -35,6 +36,8 @@ _QUEUE_DEPTH = 5000
 _LINGER = 0.1  # s
 _CLOCK_PATIENCE = 1.0  # s from the start until the first /clock should be there
 _LONGEST_WAY_NS = 1_000_000_000  # from sending to receipt, on a machine that is busy
+# Middleware that gives the time of the take as that of receipt.
+_STAMPED_AT_TAKE = ('rmw_cyclonedds_cpp',)
 
 
 class _Taken(NamedTuple):
@@ -171,6 +174,7 @@ class Recorder:
 
     def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
         waiting: list[_Taken] = []
+        at_take = get_rmw_implementation_identifier() in _STAMPED_AT_TAKE
         with (handle := subscription.handle):
             # no more than can wait, lest a fast publisher keeps us here
             while len(waiting) < _QUEUE_DEPTH:
@@ -180,7 +184,7 @@ class Recorder:
                     self._empty_ns[topic] = now_ns
                     break
                 data, info = taken
-                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic])
+                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic], at_take)
                 waiting.append(_Taken(
                     topic, data, received_ns, info['source_timestamp'] or received_ns))
         return waiting
@@ -222,19 +226,22 @@ def take_raw(handle: Any, message_type: Any) -> tuple[bytes, Mapping[str, int]] 
     return handle.take_message(message_type, True)
 
 
-def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
+def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int, at_take: bool) -> int:
     """
     Return when a message was received, for its place in the recording.
 
-    rmw_fastrtps gives the time of receipt; rmw_cyclonedds when it was taken, just after `take_ns`,
-    which puts all that waited on one topic before the next. The sender's time is used then, or the
-    nearest possible time of receipt.
+    rmw_fastrtps gives the time of receipt; rmw_cyclonedds when it was taken, which puts all that
+    waited on one topic before the next. The sender's time is used then, or the nearest possible
+    time of receipt. Both never mix in one recording: a message that arrives while the topic is
+    read would come before another that was sent and received earlier.
 
     :param info: received and source timestamp in ns, 0 where unknown.
+    :param take_ns: just before it was taken.
     :param empty_ns: when nothing waited on its topic for the last time.
+    :param at_take: whether the middleware gives the time of the take as that of receipt.
     """
     received_ns, source_ns = info['received_timestamp'], info['source_timestamp']
-    if 0 < received_ns < take_ns:
+    if received_ns and not at_take:
         return received_ns
     latest_ns = received_ns or take_ns
     if not source_ns:

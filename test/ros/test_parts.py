@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.control import Controller, Mode, State, StepReport
@@ -85,6 +86,7 @@ def test_batch_is_recorded_in_the_order_of_sending(
         ) -> None:
     if at_the_take:
         monkeypatch.setattr(recorder, 'take_raw', stamped_at_the_take)
+        monkeypatch.setattr(recorder, '_STAMPED_AT_TAKE', (get_rmw_implementation_identifier(),))
     publishers = [ros.node.create_publisher(Temperature, name, topics.LOOP_QOS) for name in NAMES]
     recording = Recorder(ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES,
                          dict.fromkeys(NAMES, (Temperature, topics.LOOP_QOS)))
@@ -109,23 +111,23 @@ def test_batch_is_recorded_in_the_order_of_sending(
     assert all(m.publish_time_ns <= m.log_time_ns for m in messages)
 
 
-@pytest.mark.parametrize(('received', 'source', 'found'), [
-    (70, 60, 70),  # stamped on arrival
-    (100, 60, 60),  # at the take
-    (101, 60, 60),
-    (0, 60, 60),  # not at all
-    (101, 0, 101),
-    (0, 0, 100),
-    (101, 49.5, 49.5),  # on its way when nothing had come yet
-    (101, 20, 50),  # by a sender whose clock is late
-    (101, 900, 101),  # or early
-    (40, 30, 40),
+@pytest.mark.parametrize(('at_take', 'received', 'source', 'found'), [
+    (False, 70, 60, 70),
+    (False, 101, 60, 101),  # while the topic was read
+    (True, 100, 60, 60),
+    (True, 101, 60, 60),
+    (False, 0, 60, 60),  # not at all
+    (True, 101, 0, 101),
+    (False, 0, 0, 100),
+    (True, 101, 49.5, 49.5),  # on its way when nothing had come yet
+    (True, 101, 20, 50),  # by a sender whose clock is late
+    (True, 101, 900, 101),  # or early
 ])
-def test_time_of_receipt(received: float, source: float, found: float) -> None:
+def test_time_of_receipt(at_take: bool, received: float, source: float, found: float) -> None:
     info = {'received_timestamp': round(received * NANOSECONDS),
             'source_timestamp': round(source * NANOSECONDS)}
-    assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS) == round(
-        found * NANOSECONDS)
+    assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS,
+                      at_take=at_take) == round(found * NANOSECONDS)
 
 
 def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_state() -> None:
