@@ -258,7 +258,7 @@ def _noted(model: LiftedModel, one: ModelCandidate) -> LiftedModel:
 
 def _polynomial(prepared: PreparedSamples, degrees: Sequence[int]) -> LiftedModel:
     """Choose the degree; those with too many monomials to tell apart or to save fall out."""
-    tried, refusal = [], 'no degree was to be tried'
+    tried, refusal = [], 'no degree was given'
     for degree in degrees:
         try:
             model = Edmd(degree).learn(prepared.plant, prepared.parts[0], prepared.box)

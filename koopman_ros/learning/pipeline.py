@@ -60,7 +60,7 @@ from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
 
-# A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
+# A smaller change, in half-ranges of the current model's range, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
 
 # Shares of the whole at which reading, estimating, learning and judging begin and end.
@@ -170,7 +170,7 @@ class Retrained:
                 'trained_from': by_state(trained.lower),
                 'trained_to': by_state(trained.upper),
                 'heldout_error': by_state(self.decision.rmse),
-                'heldout_error_of_present_lift': None if self.decision.current_rmse is None else (
+                'heldout_error_of_current_model': None if self.decision.current_rmse is None else (
                     by_state(self.decision.current_rmse)),
                 'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
                 'heldout_rw': fit.rw,
@@ -207,7 +207,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
     :param test: a record that takes no part in the training. The new model is rejected if its free
         run errs more there than that of the best linear model.
     :raises BagReadError: for bags that cannot be used.
-    :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
+    :raises ModelFileError: when the current or the initial model cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` returned True; nothing is written.
     :raises WorkerLost: when workers are lost and none takes over; nothing is written then.

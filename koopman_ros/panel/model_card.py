@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Words for the active model: origin and figures in its file, and in the controller's status."""
+"""Words for the current model: origin and figures in its file, and in the controller's status."""
 
 from collections.abc import Mapping, Sequence
 
@@ -25,7 +25,7 @@ _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'measurements_used': 'Measurements used',
              'derivative_method': 'Derivatives', 'noise': 'Measurement noise',
              'heldout_error': 'Held-out error',
-             'heldout_error_of_present_lift': 'Held-out error of the active model',
+             'heldout_error_of_current_model': 'Held-out error of the current model',
              'heldout_error_of_linear_model': 'Held-out error of a linear model',
              'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
              'closed_loop_cost_beside_linear': 'Closed-loop cost relative to linear control'}

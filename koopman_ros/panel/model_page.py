@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Page of the active model, and of recording, experiments and training."""
+"""Page of the current model, and of recording, experiments and training."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class _Task:
 
 
 def _model(page: PageLayout) -> None:
-    with page.card('active model', 'Model', CONTROLLER):
+    with page.card('current model', 'Model', CONTROLLER):
         name = label('div', '', 'value')
         task, origin = _Task(columns=True), _Figures(columns=True)
         training = label('div', '', 'quiet')
@@ -112,9 +112,9 @@ def _model(page: PageLayout) -> None:
 
         async def activate(name: str, rejected: bool = False) -> None:
             now, view = page.source.snapshot, page.source.view
-            active = now.status(CONTROL).values.get('model', 'the active model')
+            current = now.status(CONTROL).values.get('model', 'the current model')
             details = [
-                name, f'It replaces {active} if it predicts the recent measurements as well.']
+                name, f'It replaces {current} if it passes the check on recent measurements.']
             changes: list[Sequence[str]] = []
             reasons = now.status(TRAINING).message
             try:
@@ -124,7 +124,7 @@ def _model(page: PageLayout) -> None:
             else:
                 rejected = new.provenance.accepted is False
                 reasons = '; '.join(new.provenance.reasons)
-                changes = [('', 'active model', 'new model'), *model_changes(
+                changes = [('', 'current model', 'new model'), *model_changes(
                     now, new, view.shown_ranges(training_ranges(new)))]
             if rejected:
                 details.append(f'✖ Training rejected this model: {reasons}.')

@@ -68,8 +68,8 @@ class MeasuredPlace:
 class StatePlaces(MeasuredPlace):
     """Where a measured state is; its set-points and prediction have the same type and field."""
 
-    quality_topic: str = _topic('Topic of the quality of the measurements, as levels of '
-                                'DiagnosticStatus: 0 good, 1 uncertain, above bad; empty: none.')
+    quality_topic: str = _topic('Topic of the measurement quality, as a level of '
+                                'DiagnosticStatus: 0 good, 1 uncertain, higher bad; empty: none.')
     quality_type: str = parameter(
         'std_msgs/msg/UInt8', 'Message type of the quality.', read_only=True,
         choices=('std_msgs/msg/UInt8', 'diagnostic_msgs/msg/DiagnosticStatus'))
@@ -82,7 +82,7 @@ class StatePlaces(MeasuredPlace):
 class AnalysisPlaces:
     """Where values of a state come that are rare and late, as from a laboratory."""
 
-    analysis_topic: str = _topic('Topic of rare values that come late, as of an analyser; empty: '
+    analysis_topic: str = _topic('Topic of late values, e.g. of a laboratory analyser; empty: '
                                  'none.')
     analysis_type: str = _topic('Message type of these values; empty: the usual type.')
     analysis_field: str = _topic('Message field that holds the value; empty: the usual field.')

@@ -32,7 +32,7 @@ from koopman_ros.ros.node import LoopNode
 POLL_PERIOD = 0.1  # s between two looks at a training
 
 
-def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
+def current_model(given: Mapping[str, Any]) -> LiftedModel | None:
     """Return the lift in use by parameters that were given, None where there is none yet."""
     own = plant_defaults(system_of(given), 'trainer')
     name = str(given.get('model', own.get('model', '')))

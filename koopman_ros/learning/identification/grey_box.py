@@ -109,8 +109,8 @@ def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equati
             with contextlib.suppress(ValueError):  # it diverges
                 tried.append((float(np.mean(record.innovations(one) ** 2)), noise, one))
     if not tried:
-        raise ValueError(f'with the initial constants, the {model.form} reproduce the episodes '
-                         'with no filter: give ranges closer to the true values')
+        raise ValueError(f'the {model.form} do not reproduce the episodes with the initial '
+                         'constants: give ranges closer to the true values')
     return min(tried, key=lambda one: one[:2])[2]
 
 
