@@ -66,7 +66,7 @@ class FreeRun:
         """Show the errors."""
         count = sum(map(len, self.episodes))
         return '\n  '.join([
-            f'free run of {count} measurements, after the start fitted to the first {self.init}:',
+            f'free run of {count} measurements, with the start fitted to the first {self.init}:',
             *(f'{name}: error {rmse:.4g} {unit}, fit {fit:.1f} %' for name, unit, rmse, fit in zip(
                 self.names, self.units, self.rmse, self.fit, strict=True))])
 

@@ -130,7 +130,7 @@ class Retrained:
                     'beyond_noise': one.excess,
                     'closed_loops': one.law_check.loops,
                     'closed_loops_failed': int(np.sum(one.law_check.failed)),
-                    'closed_loop_cost_beside_linear': one.law_check.median_ratio}
+                    'closed_loop_cost_over_linear': one.law_check.median_ratio}
             return said
 
         figures: dict[str, object] = {
@@ -180,8 +180,8 @@ class Retrained:
                 'closed_loop_statement': self.decision.statement,
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
-                'closed_loop_cost_beside_linear': check.median_ratio,
-                'worst_closed_loop_cost_beside_linear': check.worst_ratio,
+                'closed_loop_cost_over_linear': check.median_ratio,
+                'worst_closed_loop_cost_over_linear': check.worst_ratio,
             }
         figures['free_runs'] = {name: {
             'error': dict(zip(run.names, map(float, run.rmse), strict=True)),

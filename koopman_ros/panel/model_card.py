@@ -4,6 +4,8 @@
 """Words for the current model: origin and figures in its file, and in the controller's status."""
 
 from collections.abc import Mapping, Sequence
+import contextlib
+from datetime import datetime
 
 from koopman_ros.core.units import unit_label
 from koopman_ros.model import LiftedModel
@@ -28,7 +30,7 @@ _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'heldout_error_of_current_model': 'Held-out error of the current model',
              'heldout_error_of_linear_model': 'Held-out error of a linear model',
              'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
-             'closed_loop_cost_beside_linear': 'Closed-loop cost relative to linear control'}
+             'closed_loop_cost_over_linear': 'Closed-loop cost relative to linear control'}
 _COMPARED = ('Model class', 'Acceptance')
 _OUTSIDE = ' outside training box [half-ranges]'
 _UNKNOWN = ('', 'none', 'nan')
@@ -101,7 +103,10 @@ def training_card(values: Mapping[str, str]) -> dict[str, str]:
 def status_card(values: Mapping[str, str]) -> dict[str, str]:
     """Return the figures of the model in the controller's status, by their names in words."""
     found = {title: values.get(key, '') for key, title in _STATUS.items()}
-    found['File written'] = found['File written'][:19].replace('T', ' ')
+    with contextlib.suppress(ValueError):
+        # in local time, as the other times on the page
+        written = datetime.fromisoformat(found['File written']).astimezone()
+        found['File written'] = f'{written:%Y-%m-%d %H:%M:%S}'
     for key, value in values.items():
         if key.endswith(_OUTSIDE):
             name = key.removesuffix(_OUTSIDE)

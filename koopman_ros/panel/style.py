@@ -36,7 +36,7 @@ a { color: var(--text); }
 .big { font-size: 3.4rem; line-height: 1.05; font-weight: 600;
   font-variant-numeric: tabular-nums; }
 .mode { font-size: 2.4rem; line-height: 1.2; font-weight: 600; }
-.unit { font-size: 1.4rem; }
+.unit { font-size: 1.1rem; }
 .value { font-size: 1.5rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .abnormal { align-self: flex-start; color: #fff; background: var(--medium); padding: 2px 8px;
   font-weight: 600; }
@@ -88,6 +88,8 @@ a { color: var(--text); }
   .head { padding: 6px 8px; }
   .parameter { grid-template-columns: minmax(0, 1fr); }
   .big { font-size: 3rem; }
+  .changes { grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); }
+  .changes > :nth-child(3n + 1) { grid-column: 1 / -1; color: var(--quiet); }
 }
 """
 

@@ -31,6 +31,8 @@ EPOCH = 1e9  #: s; a later stamp is a wall time, an earlier one is a simulated t
 _GROUP = 1.0 / 15.0  # of the time shown; nearer events are one mark
 _LEAST = 0.1  # of the range of a signal, which an axis shows
 _HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
+# In charts narrower than this, names are in rows of at least this width, so far apart; in pixels.
+_NARROW, _WIDTH, _ROW = 600, 330, 20
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
           'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
 _ABNORMAL = '#8a4b00'
@@ -221,6 +223,16 @@ def ink(number: int) -> str:
         number) else '#1d1d1b'
 
 
+def legend_rows(names: Sequence[str]) -> int:
+    """Return the number of rows that names take below each other in a narrow chart."""
+    rows, room = 1, _WIDTH
+    for width in (7 * len(name) + 29 for name in names):
+        if width > room:
+            rows, room = rows + 1, _WIDTH
+        room -= width
+    return rows
+
+
 def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
     """Return the options of charts without data, one above the other."""
     several = range(len(charts))
@@ -247,14 +259,25 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     'transitionDuration': 0,
                     ':valueFormatter': "v => v == null ? '–' : (+v).toPrecision(6)",
                     'axisPointer': {'type': 'cross', 'label': {'backgroundColor': '#4d4d4a'}}},
+        # names of several pages are cut, rows of names need room
+        'media': [{'query': query, 'option': {
+            'legend': [{'type': kind}] * len(charts),
+            'grid': [{'top': top + height * at, 'height': height - top - _FOOT}
+                     for at, top in enumerate(tops)]}}
+            for query, kind, tops in (
+                ({'minWidth': _NARROW}, 'scroll', [_HEAD] * len(charts)),
+                ({'maxWidth': _NARROW - 1}, 'plain', [_HEAD + _ROW * (legend_rows(
+                    [pen(own.kind, own.label) for own in own_pens]) - 1)
+                    for _, own_pens in charts]))],
         'legend': [{'type': 'scroll', 'top': 4 + height * at, 'pageIconColor': '#4d4d4a',
                     'data': [own.title for own in own_pens if own.kind != 'planned'],
+                    # the unit is at the axis
+                    ':formatter': "name => name.split(' [')[0]",
                     'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
                     # less than that of the text cuts it where there are several pages of pens
                     'itemHeight': 14, 'itemWidth': 14}
                    for at, (_, own_pens) in enumerate(charts)],
-        'grid': [{'left': 56, 'right': 16, 'top': _HEAD + height * at,
-                  'height': height - _HEAD - _FOOT} for at in several],
+        'grid': [{'left': 56, 'right': 16}] * len(charts),
         'xAxis': [{'type': 'time', 'gridIndex': at, 'nameLocation': 'middle', 'nameGap': 22,
                    'nameTextStyle': {'color': '#4d4d4a'},
                    'axisPointer': {'label': {':formatter': f'p => ({_CLOCK})(p.value)'}},
@@ -262,7 +285,7 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
             for at in several],
         'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
                    'name': f'{", ".join(dict.fromkeys(own.label for own in own_pens))} [{unit}]',
-                   'axisLabel': {'color': '#1d1d1b'},
+                   'axisLabel': {'color': '#1d1d1b', 'hideOverlap': True},
                    'nameTextStyle': {'color': '#1d1d1b', 'align': 'left'},
                    'splitLine': {'lineStyle': {'color': '#c4c4c0'}}}
                   for at, (unit, own_pens) in enumerate(charts)],

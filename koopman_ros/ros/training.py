@@ -162,8 +162,9 @@ class Training:
         if state is None:
             return TaskReport(Severity.OK, 'not training')
         values = {'done [%]': 100.0 * state.share, **scalars(state.summary or {})}
-        if not state.ended or state.accepted:
+        if not state.ended:
             # the sentence stays while the figures move, or there would be a status a step
-            text = state.text if state.ended else state.text.split(',')[0]
-            return TaskReport(Severity.OK, text, {**values, 'step': state.text})
-        return TaskReport(Severity.WARN if state.refused else Severity.ERROR, state.text, values)
+            return TaskReport(Severity.OK, state.text.split(',')[0],
+                              {**values, 'step': state.text})
+        return TaskReport(Severity.OK if state.accepted else Severity.WARN if state.refused else
+                          Severity.ERROR, state.text, values)
