@@ -77,6 +77,9 @@ a { color: var(--text); }
 .q-field__control { background: #f4f4f2; }
 .q-dialog .card { background: var(--card); max-width: 560px; }
 .nicegui-echart { width: 100%; }
+.trends { height: var(--from-0); }
+@media (min-width: 640px) { .trends { height: var(--from-600); } }
+@media (min-width: 940px) { .trends { height: var(--from-900); } }
 .card .picture { display: block; max-width: 100%; height: auto; background: #fff; }
 .report { white-space: pre-wrap; overflow-wrap: anywhere; font-family: monospace;
   font-size: .85rem; }

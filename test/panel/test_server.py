@@ -442,7 +442,7 @@ def test_an_axis_shows_a_share_of_the_range_of_its_signals(
 @pytest.mark.parametrize(('lengths', 'rows'), [((), 1), ((11, 21), 1), ((11, 21, 21), 2),
                                                ((27, 19), 2), ((40,) * 5, 5), ((60,), 2)])
 def test_names_of_pens_have_rows_in_a_narrow_chart(lengths: tuple[int, ...], rows: int) -> None:
-    assert legend_rows(['x' * length for length in lengths]) == rows
+    assert legend_rows(['x' * length for length in lengths], 330) == rows
 
 
 def test_pens_of_a_chart_have_colours_of_their_own() -> None:
