@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, expect
 from koopman_ros.core.datasets import DriftSamples, Episode, PlantDescription
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.execution import Backend
@@ -117,6 +117,7 @@ def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: in
     :raises TrainingFailed: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
+    expect(found=(found, Identified), plant=(plant, PlantDescription))
     known, samples = _estimated(found, plant)
     return train(known, samples, IncrementalTraining(n_z), seed=seed, starts=starts, watch=watch,
                  loops=0)

@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.optimize import least_squares, OptimizeResult
 
-from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.arrays import Array, expect, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
 from koopman_ros.core.solvers import differences
@@ -138,6 +138,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """
+    expect(record=(record, Record))
     rate, states, inputs, dead_time = _drift(model, record.plant)
     measured = [i for i, name in enumerate(states.names) if name in record.plant.state_names]
     if not measured:
