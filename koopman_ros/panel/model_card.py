@@ -7,16 +7,10 @@ from collections.abc import Mapping, Sequence
 import contextlib
 from datetime import datetime
 
-from koopman_ros.core.units import unit_label
 from koopman_ros.model import LiftedModel
-from koopman_ros.model_classes import LINEAR, NEURAL_DRIFT
 from koopman_ros.panel.faceplates import Range, readable
 from koopman_ros.panel.snapshot import Snapshot
 
-_METRICS = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
-            'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
-_METRICS_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
-                      'noise': 'Measurement noise'}
 _STATUS = {'model file time': 'File written', 'model training data': 'Training data (digest)',
            'model reloads': 'Reloads', 'model rejected': 'Last file rejected',
            'model check': 'Check on recent data', 'law': 'Control law',
@@ -52,19 +46,7 @@ def model_card(model: LiftedModel) -> dict[str, str]:
         'Learned from': origin.plant, 'Derivatives': origin.method,
         'Written by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'Random seed': '' if origin.seed is None else str(origin.seed)}
-    titles = dict(_METRICS)
-    metrics = dict(origin.metrics)
-    if model.kind in (LINEAR, NEURAL_DRIFT):
-        # without a lift
-        metrics.pop('rw', None)
-    for key, title in _METRICS_OF_STATES.items():
-        for name, unit in zip(model.states.names, model.states.units, strict=True):
-            several = len(model.states.names) > 1
-            titles[f'{key}_{name}' if several else key] = (
-                f'{title}{f", {readable(name)}" if several else ""} '
-                f'[{unit if unit == "K" else unit_label(unit)}]')
-    return found | {titles.get(name, name): f'{figure:.4g}'
-                    for name, figure in metrics.items()}
+    return found | {title: f'{figure:.4g}' for title, figure in model.figures.items()}
 
 
 def model_changes(now: Snapshot, new: LiftedModel, trained: Mapping[str, Range]

@@ -284,7 +284,7 @@ def test_a_printed_model_shows_its_ranges_rates_and_verdict():
         assert sum(f'state {name}: trained from' in line and line.endswith(unit)
                    for line in lines) == 1
     assert f'{model.eigenvalues.real[0]:.4g} per {model.time_unit}' in str(model)
-    assert '  held-out rx: 0.25' in lines
+    assert '  held-out residual of the drift, relative: 0.25' in lines
     assert f'  dead time of {model.inputs.names[0]}: 7.5 s' in lines
     assert lines[-1] == '  acceptance: rejected (too few loops)'
 
