@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
+.PHONY: help learn demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -95,6 +95,8 @@ test-machines: $(VENV)/test.stamp  ## numerical tests under emulated processors,
 lint: $(VENV)/test.stamp  ## lint and type checks
 	$(BIN)/ruff check
 	$(BIN)/mypy
+
+learn: $(VENV)/train.stamp  ## set up training from Python and the command line, without ROS
 
 models: $(VENV)/train.stamp  ## retrain the bundled models -> config/models
 	$(BIN)/python -m studies.shipped_models

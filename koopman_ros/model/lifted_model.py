@@ -70,7 +70,7 @@ class Provenance:
     method: str = ''  #: how derivatives were found; empty where they were given
     #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
     model_class: str = ''
-    accepted: bool | None = None  #: verdict of the acceptance test; None for a model never judged
+    accepted: bool | None = None  #: verdict of the acceptance test; None for a model that was not tested
     reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
     closed_loops: str = ''  #: result of simulated closed loops, with its confidence
 
@@ -83,7 +83,7 @@ class Provenance:
     @property
     def acceptance(self) -> str:
         """The verdict in words, with the reasons."""
-        verdict = {True: 'accepted', False: 'rejected', None: 'never judged'}[self.accepted]
+        verdict = {True: 'accepted', False: 'rejected', None: 'not tested'}[self.accepted]
         return f'{verdict} ({"; ".join(self.reasons)})' if self.reasons else verdict
 
 

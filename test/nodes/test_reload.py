@@ -173,7 +173,7 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
 
     assert bench.reload() == (
         True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
-        '53.85 degC; acceptance: never judged')
+        '53.85 degC; acceptance: not tested')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model rejected') == 'none'
 
