@@ -137,7 +137,7 @@ $(VENV)/records.stamp: setup.py $(LOCK) $(VENV)/bench.stamp
 
 studies-records: SEEDS = 3
 studies-records: RECORDS = ../shared/records
-studies-records: $(VENV)/records.stamp  ## learning from measured records beside ARX, N4SID, NARX, EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
+studies-records: $(VENV)/records.stamp  ## learning from measured records, compared with ARX, N4SID, NARX and EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
 	$(BIN)/python -m studies.records --records $(RECORDS) --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## benchmarks against other programs, 20 min (BENCH=--quick: 2 min) -> out/bench

@@ -66,7 +66,7 @@ class MessageField:
     """
     Where a number is on the wire.
 
-    :raises ValueError: for a field that is no path of names and indices.
+    :raises ValueError: for a field that is not a path of names and indices.
     """
 
     topic: str  #: name of the topic

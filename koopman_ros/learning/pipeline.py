@@ -331,7 +331,7 @@ def _check_disturbances(plant: PlantDescription, episodes: Sequence[Episode]) ->
 
 def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode],
                progress: _Progress) -> Array:
-    """Return the dead times (n_u,) as the task has them, or as the record tells them, in s."""
+    """Return the dead times (n_u,) as the task has them, or as estimated from the record, in s."""
     names, seconds = plant.input_names, SECONDS_PER_TIME_UNIT[plant.time_unit]
     if unknown := ', '.join(name for name in task.dead_time if name not in names):
         raise ValueError(f'dead_time names {unknown}: the inputs are {", ".join(names)}')

@@ -70,7 +70,7 @@ class Provenance:
     method: str = ''  #: how derivatives were found; empty where they were given
     #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
     model_class: str = ''
-    accepted: bool | None = None  #: verdict of the acceptance test; None for a model that was not tested
+    accepted: bool | None = None  #: verdict of the acceptance test; None if not tested
     reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
     closed_loops: str = ''  #: result of simulated closed loops, with its confidence
 

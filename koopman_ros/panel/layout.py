@@ -227,7 +227,7 @@ class AnswerLine:
         self._label = label('div', '', 'answer').props('role=status aria-live=polite')
 
     def set_text(self, text: str) -> None:
-        """Show a text that is no refusal."""
+        """Show a text other than a refusal."""
         self._label.set_text(text)
         self._label.classes(remove='refused')
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the signals of a plant are on the wire, by parameter; topics that are no signal's."""
+"""Where the signals of a plant are on the wire, by parameter; topics of no signal."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class Signals:
     """
     The signals of a plant: names and units.
 
-    :raises ConfigurationError: for controlled signals that are no states, or too many.
+    :raises ConfigurationError: for controlled signals that are not states, or too many.
     """
 
     states: Mapping[str, str]  #: units of the measured states, by name
@@ -227,7 +227,7 @@ class SignalTopics:
     """
     The places of all signals.
 
-    :raises ConfigurationError: for a field that is no path in a message, or a missing topic.
+    :raises ConfigurationError: for a field that is not a path in a message, or a missing topic.
     """
 
     signals: Signals

@@ -249,7 +249,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
 
     Newton's method from the nominal point, by least norm where values leave a choice.
 
-    :raises ValueError: for a name that is no state.
+    :raises ValueError: for a name that is not a state.
     :raises EquilibriumError: when no input holds them.
     """
     if unknown := wanted.keys() - set(system.state_names):

@@ -94,7 +94,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
 
 def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equations]:
     """
-    Return the equations with the gain that foresees the next measurements of all episodes best.
+    Return the equations with the gain that predicts the next measurements of all episodes best.
 
     Of those of steady Kalman filters in the middle of the box, which are stable.
     """
@@ -121,7 +121,7 @@ def _refined(record: SplitRecord, start: Predictor[Equations], monitor: Callable
 
     Without one the estimate is that of maximum likelihood where nothing but the sensors is noisy,
     and a gain would bias the estimate from closed-loop data. With one it follows a plant that is
-    disturbed, too. The one is taken that foresees the measurements better.
+    disturbed, too. The one that predicts the measurements better is taken.
 
     :return: the equations with the filter that goes through all episodes, and how they were found.
     """
