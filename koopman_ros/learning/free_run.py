@@ -124,7 +124,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     Simulate a whole record by its inputs alone, and compare with the measurements.
 
     The start of each episode, unmeasured states included, is fitted to its first samples; after
-    these the simulation sees no measurement. Where the first samples contradict the model, as on a
+    these the simulation sees no measurement. If the first samples contradict the model, e.g. on a
     day with another ambient temperature, a constant disturbance of the rates of the measured
     states is fitted, too; a controller's disturbance observer does the same.
 
@@ -133,8 +133,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     :param init: samples to which the start is fitted; at most half of an episode.
     :param usual: (n_y,) root mean square error of the model's free run over a record that it was
         learned from, in its units; by default that of the model itself. The first samples
-        contradict the model where they err by more than 1.5 times that. Without it there is no
-        disturbance.
+        contradict the model if their error is above 1.5 times that. None: no disturbance is
+        fitted.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """
@@ -217,7 +217,7 @@ def _drift(model: AnyModel, plant: PlantDescription
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,
            indexed: Episode, count: int, step: float, usual: Array | None
            ) -> tuple[Array, Array]:
-    """Return the start (n_x,) that suits the first samples best, and a disturbance (n_x,)."""
+    """Return the start (n_x,) that fits the first samples best, and a disturbance (n_x,)."""
     segments = Segments.of([indexed.part(0, count)] if count > 1 else [indexed.part(0, 2)], step)
     rows = np.flatnonzero(segments.x[:, 0, 0])[:count]
     y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])

@@ -157,8 +157,10 @@ BROKEN = """() => {
             for (const word of data.matchAll(/([^\\s_-]|-(?=\\d))+/g)) {
                 range.setStart(texts.currentNode, word.index);
                 range.setEnd(texts.currentNode, word.index + word[0].length);
-                if (new Set([...range.getClientRects()].map(box => box.top)).size > 1) {
-                    found.push(word[0]);
+                const tops = [...range.getClientRects()].filter(box => box.width > 1).map(
+                    box => box.top);
+                if (Math.max(...tops) - Math.min(...tops) > 9) {
+                    found.push(`${word[0]} in ${data}`);
                 }
             }
         }
