@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The gate: acceptance of a model by the part of the record that it was not learned from."""
+"""The acceptance test of a model, on the part of the record that it was not learned from."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
