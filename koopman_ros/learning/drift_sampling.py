@@ -170,8 +170,8 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
 
     The rule is the same, its error another: the mean square by which predictions of the
     measurements that were held out err beyond their noise. Differences within the chance variation
-    of the noise count as equal. Classes that the acceptance test would reject, for their law, their
-    coordinates or a linear model that is as good, are refused.
+    of the noise count as equal. Classes that the acceptance test would reject for their law, their
+    coordinates or a linear model that is as good are refused.
 
     :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
         them and the rule.
