@@ -41,7 +41,7 @@ LONGEST_DEAD_TIME = 3600.0  #: s
 _FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
             'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
 _FIGURES_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
-                      'noise': 'Measurement noise'}
+                      'noise': 'Measurement noise', 'free_run': 'Free-run error (RMS)'}
 _SAMPLES = 256  # random states of a box whose training states are not known
 # Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
 _MAX_DRIFTS = 10_000
