@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
+.PHONY: help learn demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -96,6 +96,8 @@ lint: $(VENV)/test.stamp  ## lint and type checks
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
+learn: $(VENV)/train.stamp  ## set up training from Python and the command line, without ROS
+
 models: $(VENV)/train.stamp  ## retrain the bundled models -> config/models
 	$(BIN)/python -m studies.shipped_models
 
@@ -135,7 +137,7 @@ $(VENV)/records.stamp: setup.py $(LOCK) $(VENV)/bench.stamp
 
 studies-records: SEEDS = 3
 studies-records: RECORDS = ../shared/records
-studies-records: $(VENV)/records.stamp  ## learning from measured records beside ARX, N4SID, NARX, EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
+studies-records: $(VENV)/records.stamp  ## learning from measured records, compared with ARX, N4SID, NARX and EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
 	$(BIN)/python -m studies.records --records $(RECORDS) --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## benchmarks against other programs, 20 min (BENCH=--quick: 2 min) -> out/bench

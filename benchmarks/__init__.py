@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Speed of the package beside other programs: ``python -m benchmarks`` measures it."""
+"""Speed of the package compared with other programs, by ``python -m benchmarks``."""
 
 import os
 

@@ -19,10 +19,10 @@ PARTS = ('training', 'recording', 'loop')
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the parts asked for, one after the other; the figures of the others stay."""
+    """Run the selected parts, one after the other; the figures of the others stay."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks',
-        description='Measure the package beside other programs.')
+        description='Compare the package with other programs.')
     parser.add_argument('parts', nargs='*', metavar='part',
                         help=f'{", ".join(PARTS)} (default: all)')
     parser.add_argument('--quick', dest='extent', action='store_const', const='quick',
@@ -44,7 +44,7 @@ def main(args: list[str] | None = None) -> int:
                 write_figures(path, summary)
                 print(text + '\n', flush=True)
         except KeyboardInterrupt:
-            print(f'\ninterrupted; what was finished is in {given.output}', file=sys.stderr)
+            print(f'\ninterrupted; the finished parts are in {given.output}', file=sys.stderr)
             return 130
         figures['machine']['load_at_end'] = os.getloadavg()[0]
         write_figures(path, summary)

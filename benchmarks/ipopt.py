@@ -4,9 +4,9 @@
 """
 The solver of the paper: casadi with IPOPT and an exact Hessian, from two kinds of graph.
 
-`expanded` is one graph of scalars over all samples, as in the paper; `compiled`, what a patient
-user can get out of casadi: compiled derivatives of one sample, summed over the samples, and the
-Hessian of the whitening term by hand. Both take the same steps.
+`expanded` is one graph of scalars over all samples, as in the paper; `compiled`, the best
+that casadi offers: compiled derivatives of one sample, summed over the samples, and the
+Hessian of the whitening term written out. Both take the same steps.
 """
 
 from collections.abc import Callable, Sequence

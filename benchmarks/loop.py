@@ -41,7 +41,7 @@ def measure(plan: LoopPlan, figures: dict[str, Any], folder: Path) -> Iterator[s
 
 
 def _found(job: Any, *arguments: Any, folder: Path) -> dict[str, Any]:
-    """Return what a job finds in a process with nothing else."""
+    """Return the result of a job in a process with nothing else."""
     outcome = process.run(job, *arguments, folder=folder, megabytes=8e3)
     if outcome.failure:
         raise RuntimeError(f'{job.__module__} failed: {outcome.failure}')

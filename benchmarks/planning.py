@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a plan of the law `mpc` takes, beside do-mpc with IPOPT and casadi's generated SQP."""
+"""Time of a plan of the law `mpc`, of do-mpc with IPOPT, and of casadi's generated SQP."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -136,7 +136,7 @@ def _course(case: PartialCase, controller: Controller, samples: int
 
 
 def _problem(case: PartialCase, controller: Controller) -> SqpProblem:
-    """Return what the law plans, with the plant's own equations."""
+    """Return the plan of the law, with the plant's own equations."""
     model, law = controller.model, controller.levels['mpc'].law
     assert isinstance(law, RecedingHorizon) and law.planner is not None
     interval = case.period / case.system.seconds_per_time_unit
@@ -149,8 +149,8 @@ def _problem(case: PartialCase, controller: Controller) -> SqpProblem:
 
 
 def _sides(case: PartialCase, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
-    """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
-    # here, as whoever starts a comparison does without do-mpc
+    """Return the planners of a state and its target: the law alone, SQP, and do-mpc."""
+    # here, because do-mpc is optional
     from studies.partly_measured.dompc import DoMpcPlanner
 
     model, law = controller.model, controller.levels['mpc'].law

@@ -20,7 +20,7 @@ Tell: TypeAlias = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class ProcessResult:
-    """What a job has told."""
+    """The messages of a job."""
 
     events: tuple[dict[str, Any], ...]  #: in their order
     failure: str  #: why it did not end by itself, or empty
@@ -45,13 +45,13 @@ def processor_seconds(pid: int) -> float:
 def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: float,
         children: bool = False, needed: Sequence[str] = ()) -> ProcessResult:
     """
-    Run a job in a process; what it had told stays when it is ended.
+    Run a job in a process; its messages stay when it is ended.
 
-    :param job: takes a function that is told what it finds, and the arguments.
+    :param job: takes a function that receives its results, and the arguments.
     :param folder: where it runs, as compilers leave files there.
     :param megabytes: the memory that it may take.
     :param children: whether it may start processes itself.
-    :param needed: modules that jobs import besides their own. All are imported once, by the
+    :param needed: further modules that jobs import. All are imported once, by the
         process that the first job and those after it are forked from.
     """
     context = multiprocessing.get_context('forkserver')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What recording costs: a trainer sent numbered messages, our writer and mcap's from memory."""
+"""The cost of recording: a trainer sent numbered messages, our writer and mcap's from memory."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -40,10 +40,10 @@ class Finished(Exception):  # noqa: N818 - an end, not an error
 
 class CostTrace:
     """
-    What a solver has reached when, by a clock that stands still while its iterates are judged.
+    The progress of a solver, by a clock that stops while its iterates are judged.
 
     It counts the processor time of the one thread, which other programs disturb less; the time on
-    the wall is noted beside it. It ends at the last target for rw or at a limit in s.
+    the wall is noted, too. It ends at the last target for rw or at a limit in s.
     """
 
     def __init__(self, tell: Tell, case: PlanningCase, targets: list[float], limit: float) -> None:
@@ -53,7 +53,7 @@ class CostTrace:
         self._looks, self.done = 0, False
 
     def start(self, built: float = 0.0) -> None:
-        """Let the clock run from now on; building what is solved took so long, in s."""
+        """Start the clock; the argument is the time to build the problem, in s."""
         self._tell({'built': built})
         allow(self._tell, _SLACK * self._limit + _GRACE, f'stopped after {self._limit:g} s')
         self._judge(self._case.theta, 0.0, 0.0)

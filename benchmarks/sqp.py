@@ -28,7 +28,7 @@ _OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class SqpProblem:
-    """What is planned at each sample: the least cost of the way to a target."""
+    """The problem of each sample: the least cost of the way to a target."""
 
     rates: Rates  #: of the state, per time unit
     lengths: Array  #: (N,) of the intervals, in time units, each with one input
@@ -44,7 +44,7 @@ class Sqp:
     """Multiple shooting, a Runge-Kutta step an interval; each plan begins with the one before."""
 
     def __init__(self, problem: SqpProblem, solver: Any) -> None:
-        """Plan by what :func:`solver_of` returns, from nothing."""
+        """Plan by the result of :func:`solver_of`, without a start."""
         self._problem, self._solver = problem, solver
         n, n_u = (len(scale) for scale in problem.scale)
         self._n, self._size = n, n + n_u
@@ -77,7 +77,7 @@ def solver_of(problem: SqpProblem, folder: Path | None = None, compiler: str | N
     """
     Return the solver of a problem: generated C, its quadratic programs in it, if compiled.
 
-    :param folder: for what is generated.
+    :param folder: for the generated code.
     :param compiler: command of a C compiler; None for casadi's virtual machine.
     """
     solver = casadi.nlpsol('sqp', 'sqpmethod', _program(problem), _OPTIONS)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Training beside other solvers and other model classes: seconds to a given accuracy."""
+"""Training compared with other solvers and model classes: seconds to a given accuracy."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class TrainingPlan:
 
     cases: tuple[tuple[int, int], ...]  #: (samples, hidden units), each for all systems
     limit: float  #: of a solver in a case, s
-    build_limit: float  #: of building what a solver solves, beside imports, s
+    build_limit: float  #: of building the problem of a solver, without imports, s
     megabytes: float  #: limit of the memory
     #: of a solver that takes no longer than four seconds, of which the middle one counts: a busy
     #: moment is long beside a short run
@@ -129,7 +129,7 @@ def _trace(outcome: process.ProcessResult) -> list[dict[str, float]]:
 
 
 def _figures(system: str, outcomes: dict[str, process.ProcessResult]) -> dict[str, Any]:
-    """Turn what the solvers have told into times by target."""
+    """Turn the messages of the solvers into times by target."""
     def when(clock: str) -> dict[str, dict[str, float | None]]:
         return {name: {solver: next((event[clock] for event in _trace(outcome)
                                      if event['rw'] <= target), None)

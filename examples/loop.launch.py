@@ -5,7 +5,7 @@
 A whole loop from one parameter file: plant, controller and trainer.
 
 ``ros2 launch koopman_ros loop.launch.py system:=two_tanks`` takes that of a plant that is shipped,
-``parameters:=loop.yaml`` one's own. Each node configures and activates itself; with
+``parameters:=loop.yaml`` that of a file. Each node configures and activates itself; with
 ``autostart:=false`` it waits for a lifecycle manager. Without the file no node starts.
 """
 

@@ -101,7 +101,7 @@ def _loaded(model: str) -> LiftedModel | None:
 
 
 def _wanted(options: Mapping[str, Any], present: LiftedModel | None) -> list[list[str]]:
-    """Return states, inputs and disturbances as named, or as the present model has them."""
+    """Return states, inputs and disturbances as named, or as the current model has them."""
     named = [list(options[kind]) for kind in ('states', 'inputs', 'disturbances')]
     if present is None:
         if not (named[0] and named[1]):

@@ -55,8 +55,9 @@ class SensorLimits:
                          'check.',
         name='max_step', none=ANY)
     report_on_change: Array = column(
-        'measured', 0.0, 'Heartbeat of a sensor that reports changes only: the signal counts as '
-                         'unchanged for so long after each message; 0: it reports each sample.',
+        'measured', 0.0, 'Heartbeat interval of a sensor that reports only changes: the signal '
+                         'counts as unchanged for this time after each message; 0: it reports '
+                         'every sample.',
         's', maximum=86400.0, read_only=True)
     deadband: Array = column(
         'measured', 0.0, 'Largest change that such a sensor does not report.')
@@ -72,7 +73,7 @@ class SensorLimits:
 
 @dataclass(frozen=True)
 class DisturbanceLimits:
-    """Limits of the sensors of measured disturbances; where one is broken the value is held."""
+    """Sensor limits of the measured disturbances; if one is violated, the last value is held."""
 
     lower: Array = value_column(
         'disturbances', -UNBOUNDED, 'Lower end of the sensor range.', name='sensor_min')
@@ -144,10 +145,11 @@ class Tuning:
                        'filters); 0: a quarter of the trained range.')
     analysis_delay: Array = column(
         'states', 0.0, 'Largest delay of a value on analysis_topic, which corrects a Kalman '
-                       'filter at its stamp (within the last 300 samples); 0: no such values.',
+                       'filter at its stamp (within the last 300 samples); 0: late values are '
+                       'refused.',
         's', maximum=86400.0)
     analysis_noise: Array = column(
-        'states', 0.0, 'Standard deviation of the noise of such a value; 0: a hundredth of the '
+        'states', 0.0, 'Standard deviation of the noise of a late value; 0: a hundredth of the '
                        'trained range.')
     fallback_order: tuple[str, ...] = parameter(
         ('sdre', 'linear'), 'Control laws, best first: mpc (model predictive), sdre '

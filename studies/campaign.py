@@ -119,7 +119,7 @@ class Campaign:
 
 
 def _flattened(metrics: Metrics) -> Iterator[tuple[str, float | bool | None]]:
-    """Yield the figures with their paths; None for what JSON cannot hold."""
+    """Yield the figures with their paths; None for values that JSON cannot represent."""
     for name, value in metrics.items():
         for key, entry in (value.items() if isinstance(value, dict) else (('', value),)):
             yield (f'{name}/{key}' if key else name,

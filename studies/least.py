@@ -21,7 +21,7 @@ def least_course(task: Task, rates: Rates, lower: Array, upper: Array, *,
     :param lower: (n_u,) range of the inputs, to `upper` (n_u,).
     :param state_upper: (n_x,) limits of the states at the samples, infinite for none.
     :param step: (n_u,) most that an input changes between samples, where there is a limit; the
-        first sample then holds the first input of `guess`, as a controller does that hears of its
+        first sample then holds the first input of `guess`, as a controller does that receives its
         set-point there.
     :param guess: where to begin.
     :raises RuntimeError: where IPOPT finds none.

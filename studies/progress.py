@@ -18,7 +18,7 @@ _LINE_PERIOD = 5.0  # s between plain lines
 
 @contextlib.contextmanager
 def training_progress(label: str) -> Iterator[Watch]:
-    """Show the starts of a training; give what it yields to :func:`koopman_ros.learning.train`."""
+    """Show the starts of a training; the yielded function is `watch` of `learning.train`."""
     last_line = time.monotonic()
 
     def watch(now: MultistartProgress) -> bool:

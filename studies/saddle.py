@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The two-state reactor held at its saddle from its temperature alone, and what that costs.
+The two-state reactor held at its saddle from its temperature alone, and the cost.
 
 Run it as ``python -m studies.saddle`` (needs the `train` and `mpc` requirements).
 """
@@ -65,7 +65,7 @@ STARTS, ARRIVAL = 40, 600.0  # s
 
 @dataclass(frozen=True)
 class RunFigures:
-    """What a run was worth."""
+    """Cost and errors of a run."""
 
     #: integrals of (T - T_ref)^2 + (T_c - T_c,ref)^2 in K^2 min: until the jacket fouls, and after
     costs: tuple[float, float]

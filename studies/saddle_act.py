@@ -70,12 +70,12 @@ _SIGNALS = {'temperature': (320.0, 375.0),
 
 @dataclass(frozen=True)
 class _Run:
-    """A run, a row for each sample, with what the states were."""
+    """A run, a row for each sample, with the true states."""
 
     seconds: Array  #: (N,) since the first measurement
     measured: Array  #: (N,) in K
-    setpoints: Array  #: (N,) likewise, NaN before the first
-    commands: Array  #: (N,) likewise
+    setpoints: Array  #: (N,), NaN before the first
+    commands: Array  #: (N,)
     states: Array  #: (N, 2) in mol/L and K
     fouled: int  #: first sample at which the jacket is fouled
     #: (N,) the concentration that explains the heat that the model expects, NaN without one
@@ -83,7 +83,7 @@ class _Run:
 
     @property
     def noise(self) -> Array:
-        """What the sensor added (N,)."""
+        """Errors (N,) of the sensor."""
         return self.measured - self.states[:, 1]
 
 
@@ -204,7 +204,7 @@ def _requests() -> Iterator[tuple[float, float, float]]:
 def _reconstructed(rows: list[Row], estimates: Mapping[int, JointState], model: LiftedModel,
                    phases: list[tuple[str, float]]) -> _Run:
     """
-    Find the temperatures that the sensor's noise hides, which the concentration tells exactly.
+    Find the temperatures that the sensor's noise hides, which the concentration shows exactly.
 
     The plant publishes it without noise; none of the nodes under test listens.
     """
@@ -378,7 +378,7 @@ def draw(path: Path, run: _Run, phases: list[tuple[str, float]], model: LiftedMo
         middle.set_ylabel('coolant [°C]')
         middle.legend(loc='upper right', fontsize=8)
         lower.plot(minutes, run.states[:, 0], color='k', linewidth=1.0,
-                   label='that of the plant, which nobody measured')
+                   label='that of the plant, not measured')
         lower.plot(minutes, run.concentration, color='tab:orange', linewidth=0.8,
                    label='that which explains the heat that the lift expects')
         lower.set(ylabel='concentration [mol/L]', xlabel='plant time [min]',

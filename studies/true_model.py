@@ -30,7 +30,7 @@ class TrueModel(LiftedModel):
         Return the model about the nominal point, scaled by half the widths of its box.
 
         :param lower: (n_x,) of the box, to `upper` (n_x,), in state units.
-        :param input_lower: (n_u,) likewise.
+        :param input_lower: (n_u,) in input units.
         :raises ValueError: where B(x) is not affine.
         """
         states, inputs = (
@@ -73,7 +73,7 @@ class TrueModel(LiftedModel):
 
 def _input_matrix(system: ControlAffineSystem, states: Coordinates, inputs: Coordinates
                   ) -> tuple[Array, InputTerms | None]:
-    """Return B (n_x, n_u) at the nominal point and what it has beside, in scaled coordinates."""
+    """Return B (n_x, n_u) at the nominal point and its further terms, in scaled coordinates."""
     def scaled(x: Array) -> Array:
         found = system.input_matrix(states.to_physical(x)) * inputs.scale
         return np.asarray(found / states.scale[:, None])

@@ -112,10 +112,10 @@ def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: 
 
 def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
     """
-    Return what laws cost in each step under limits, and from how many starts they lose the plant.
+    Return the cost of laws in each step under limits, and the number of starts that they lose.
 
-    The cost is in K^2 min, infinite where the set-point is not reached. Lost is what leaves their
-    margin, so that the safe input acts, or has not arrived in the end.
+    The cost is in K^2 min, infinite where the set-point is not reached. A start is
+    lost if it leaves their margin, so that the safe input acts, or does not reach the set-point.
     """
     costs = []
     for begin, end in STEPS:
@@ -134,7 +134,7 @@ def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
 
 
 def least_costs(model: LiftedModel) -> list[str]:
-    """Return the least cost of each step under limits, found from what the law `mpc` did."""
+    """Return the least cost of each step under limits, found from the course of the law `mpc`."""
     costs = []
     for begin, end in STEPS:
         task = _limited_task(begin, end)

@@ -125,7 +125,7 @@ for one in found.contenders:
 
 # %%
 model = found.model
-print(f'10 N m: {found.chosen.law_check}; cost beside a linear law, median '
+print(f'10 N m: {found.chosen.law_check}; cost relative to a linear law, median '
       f'{found.chosen.law_check.median_ratio:.3f}')
 checks = {torque: evaluate_closed_loops(model, system.derivative, loops=32, limits=InputLimits(
     lower=np.array([-torque]), upper=np.array([torque]), rate=np.array([np.inf])))

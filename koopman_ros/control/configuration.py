@@ -13,7 +13,7 @@ import numpy as np
 from koopman_ros.control.estimates import StateEstimation
 from koopman_ros.control.fallback import build_levels, FallbackLevel
 from koopman_ros.control.supervisor import FallbackOrder
-from koopman_ros.core.arrays import Array, read_only, short_repr
+from koopman_ros.core.arrays import Array, expect, read_only, short_repr
 from koopman_ros.core.signals import Outputs
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import Tuning
@@ -35,6 +35,7 @@ class Configuration:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        expect(model=(self.model, LiftedModel), tuning=(self.tuning, Tuning))
         object.__setattr__(self, 'tuning', self.tuning.for_signals(
             self.model, self.measured.names))
         # what cannot be built is refused now, and what was built is kept

@@ -86,7 +86,7 @@ class StateEstimation:
         return PendingInputs(state.applied, time_ns, self.dead_ns)
 
     def assumed(self, state: State) -> float:
-        """Return for how many s more inputs act that were only assumed, as after a start."""
+        """Return the time in s for which assumed inputs, e.g. from before a start, still act."""
         return state.applied.assumed(state.commanded_ns or 0, self.dead_ns)
 
     def acting(self, state: State, time_ns: int) -> Array:
@@ -250,7 +250,7 @@ class StateEstimation:
         return estimator.correct(predicted, xi, elapsed)
 
     def _started(self, state: State, xi: Array, u: Array | None) -> Estimate:
-        """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
+        """Return the first estimate, at a state (n_x,) assumed steady under inputs (n_u,)."""
         estimator = self.level(state.supervisor).estimator
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:
@@ -284,7 +284,7 @@ class StateEstimation:
         return self._remembering(now, state, time_ns, elapsed)
 
     def corrected(self, state: State, index: int, value: float, stamp_ns: int) -> State | None:
-        """Return the state with a late value of a state taken into account; None for too late."""
+        """Return the state corrected by a late value of a state; None if it is too late."""
         states, noise = self.model.states, float(self.tuning.analysis_noise[index])
         x = states.to_physical(np.zeros(len(states)))
         x[index] = value

@@ -76,7 +76,7 @@ class Initialisation:
 
 @dataclass(frozen=True, slots=True)
 class AnalysisValue:
-    """A value of a state that comes late, as from a laboratory."""
+    """A late value of a state, e.g. from a laboratory."""
 
     stamp_ns: int  #: of the sample
     signal: str  #: name of the state
@@ -85,7 +85,7 @@ class AnalysisValue:
 
 @dataclass(frozen=True, slots=True)
 class ClearSafeState:
-    """The operator lets the laws act again after the safe state has latched."""
+    """The operator clears a latched safe state."""
 
 
 Event: TypeAlias = (Measurement | Silence | SetpointRequest | ManualCommand | ModeChange

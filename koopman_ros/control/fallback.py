@@ -125,8 +125,7 @@ class FallbackLevel:
         With inputs under way it acts on the state that is predicted for the time at which its
         command acts.
 
-        This is the one place where an exception of a law, or a result that is none, becomes a
-        failure with a reason.
+        Here alone exceptions and invalid results of a law become a failure with a reason.
 
         :param ahead: returns the set-points within a horizon in s, with the time until each.
         """

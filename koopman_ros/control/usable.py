@@ -85,8 +85,7 @@ def _unusable_signals(model: LiftedModel) -> str:
                 return (f'the trained range of {name} begins at {low:.4g} {unit}, which is '
                         'impossible: train the model again from other data')
             if not low <= center <= high:
-                remedy = ('record data around a state that the plant can '
-                          'hold' if kind == 'state' else
+                remedy = ('record data around a steady state' if kind == 'state' else
                           f'record {name} {"down" if center < low else "up"} to {text(center)}')
                 return (f'the nominal {name}, {text(center)}, is outside its trained range, '
                         f'{text(low)} to {text(high)}: {remedy} and train the model again')

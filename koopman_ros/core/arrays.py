@@ -44,6 +44,14 @@ def _brief(value: object) -> str:
     return repr(value)
 
 
+def expect(**given: tuple[object, type]) -> None:
+    """Raise TypeError for an argument that is not an instance of its class."""
+    for name, (value, kind) in given.items():
+        if not isinstance(value, kind):
+            raise TypeError(f'{name} must be of the class {kind.__name__}, got '
+                            f'{type(value).__name__}: check the order of the arguments')
+
+
 def real(value: ArrayLike, name: str) -> Array:
     """Return numbers as a float64 array; ValueError for complex or non-numeric ones."""
     array = np.asarray(value)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array, frozen, real, short_repr
-from koopman_ros.core.units import check_time_unit, check_unit
+from koopman_ros.core.units import check_time_unit, named_units
 
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
            'split_by_episode', 'within']
@@ -51,16 +51,8 @@ class PlantDescription:
     def __post_init__(self) -> None:
         check_time_unit(self.time_unit)
         for kind in ('state', 'input'):
-            for what in ('names', 'units'):
-                if isinstance(given := getattr(self, f'{kind}_{what}'), str):
-                    raise ValueError(f'{kind}_{what} is the string {given!r}: pass a sequence, '
-                                     f'({given!r},) for one {kind}')
-            names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
-            for unit in units:
-                check_unit(unit)
-            if len(units) != len(names) or len(set(names)) != len(names):
-                raise ValueError(f'incompatible {kind}_names and {kind}_units: expected different '
-                                 f'names and as many units, got {list(names)} and {list(units)}')
+            names, units = named_units(
+                kind, getattr(self, f'{kind}_names'), getattr(self, f'{kind}_units'))
             nominal = real(getattr(self, f'nominal_{kind}'), f'nominal_{kind}').copy()
             if nominal.shape != (len(names),):
                 raise ValueError(f'incompatible nominal_{kind}: expected one number for each of '
@@ -301,10 +293,11 @@ class DriftSamples:
                              f'episode, got an array {episode.shape} of {episode.dtype}')
         object.__setattr__(self, 'episode', episode)
         for name in ('x', 'dxdt', 'u'):
-            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            array = np.ascontiguousarray(real(getattr(self, name), name))
             if array.ndim != 2 or len(array) != len(self):
                 raise ValueError(
-                    f'incompatible {name}: expected ({len(self)}, n), got {array.shape}')
+                    f'incompatible {name}: expected ({len(self)}, n), got {array.shape}: pass one '
+                    f'row per sample and one column per signal, {name}[:, None] for a single one')
             if count := np.count_nonzero(~np.isfinite(array)):
                 raise ValueError(
                     f'{name} contains {count} values that are not finite: remove those samples')

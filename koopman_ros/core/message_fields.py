@@ -66,7 +66,7 @@ class MessageField:
     """
     Where a number is on the wire.
 
-    :raises ValueError: for a field that is no path of names and indices.
+    :raises ValueError: for a field that is not a path of names and indices.
     """
 
     topic: str  #: name of the topic
@@ -104,7 +104,7 @@ class MessageField:
         try:
             return float(value)
         except (TypeError, ValueError) as error:
-            raise LookupError(f'{self.field} of a message of {self.topic} ({self.type}) is no '
+            raise LookupError(f'{self.field} of a message of {self.topic} ({self.type}) is not a '
                               'number') from error
 
     def expect(self, message: Any) -> None:
@@ -171,7 +171,7 @@ def _index(message: Any, key: str) -> int:
         return int(key)
     names = _names(message)
     if names is None:
-        raise ValueError(f'{key!r} is no number, and the message has no names')
+        raise ValueError(f'{key!r} is not a number, and the message has no names')
     return names.index(key)
 
 

@@ -45,11 +45,11 @@ def plugin_class(name: str, kind: str, known: Mapping[str, type[Any] | str], bas
     """
     Return the class of a plug-in, see :func:`load_plugin`, which fulfils the contract of its base.
 
-    :raises ValueError: for one that is no subclass, or lacks a method, naming it.
+    :raises ValueError: for another class, or one that lacks a method, naming it.
     """
     found = load_plugin(name, kind, known)
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f'the {kind} {name!r} is no subclass of '
+        raise ValueError(f'the {kind} {name!r} is not a subclass of '
                          f'{base.__module__}.{base.__name__}: derive the class from it')
     if missing := sorted(getattr(found, '__abstractmethods__', ())):
         raise ValueError(f'the {kind} {name!r} lacks {", ".join(missing)}: define '

@@ -98,7 +98,8 @@ class StatusCode(Enum):
         'input weight, or measure more often')
     PACKAGE_MISSING = 'package_missing', (
         'it needs {package}, which is not installed: pip install {package}')
-    NO_PI_GAIN = 'no_pi_gain', 'no signal has a pi_gain: set it for the controlled signals'
+    NO_PI_GAIN = 'no_pi_gain', (
+        'no signal has a PI gain: set pi.<signal>.gain of the controlled signals')
     PLAN_NOT_SOLVED = 'plan_not_solved', (
         'no plan within the input limits was found ({flag})')
     PLAN_MOVES = 'plan_moves', 'the plan did not converge in {iterations} iterations'
@@ -139,8 +140,8 @@ class StatusCode(Enum):
         '{most} set-points are already scheduled, the maximum: wait until some have taken effect, '
         'or send this one with stamp 0')
     ANALYSIS_REFUSED = 'analysis_refused', (
-        'the value of {signal} is {age:.4g} s old and cannot correct the estimate, which reaches '
-        'back {reach:.4g} s: check its stamp, analysis_delay and estimator')
+        'the late value of {signal} is {age:.4g} s old, but estimates are kept for {reach:.4g} s '
+        'only: check its stamp, analysis_delay and estimator')
     NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
         'manual command refused in automatic mode: switch to manual mode first')
     MANUAL_NOT_FINITE = 'manual_not_finite', (

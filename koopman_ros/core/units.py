@@ -104,6 +104,25 @@ def check_unit(unit: str) -> None:
                          'dimensionless') from error
 
 
+def named_units(kind: str, names: Sequence[str], units: Sequence[str]
+                ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """
+    Return names and units of states or inputs.
+
+    :raises ValueError: for a string in place of a sequence, an unknown unit, or other numbers.
+    """
+    for what, given in (('names', names), ('units', units)):
+        if isinstance(given, str):
+            raise ValueError(f'{kind}_{what} is the string {given!r}: pass a sequence, '
+                             f'({given!r},) for one {kind}')
+    for unit in units:
+        check_unit(unit)
+    if len(units) != len(names) or len(set(names)) != len(names):
+        raise ValueError(f'incompatible {kind}_names and {kind}_units: expected different '
+                         f'names and as many units, got {list(names)} and {list(units)}')
+    return tuple(names), tuple(units)
+
+
 def _check_form(unit: str) -> None:
     if unit and (len(unit) > _LONGEST or not _UNIT.fullmatch(unit)):
         raise ValueError(f'{unit[:_LONGEST]!r} is not a valid unit expression')

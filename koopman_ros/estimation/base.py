@@ -153,7 +153,7 @@ class Estimator(ABC):
         """
         Predict an estimate over a number of inputs.
 
-        :param pieces: seconds, and the (n_u,) input that acts for so long, in scaled deviations.
+        :param pieces: seconds, and the (n_u,) input that acts for this time, in scaled deviations.
         :param rate: (n_x,) due to the measured disturbances, or None.
         :return: the estimate then, without that rate, or None as from :meth:`predict`.
         """

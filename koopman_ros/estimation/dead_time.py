@@ -53,7 +53,7 @@ class AppliedInputs:
             [self.values[row][i] for i, row in enumerate(rows)])
 
     def assumed(self, time_ns: int, dead_ns: tuple[int, ...]) -> float:
-        """Return for how many s after a time inputs act that were applied before the first one."""
+        """Return the time in s for which inputs from before the first known one still act."""
         first = next((time for time in self.times_ns if time > _ALWAYS // 2), time_ns)
         return max(0, first + max(dead_ns, default=0) - time_ns) / NANOSECONDS
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The recent past of a filter, in which a value that comes late is taken into account."""
+"""The recent history of a filter, for corrections by late values."""
 
 from __future__ import annotations
 

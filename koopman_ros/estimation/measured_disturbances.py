@@ -33,7 +33,7 @@ class MeasuredDisturbances:
             None if time is None else time + by_ns for time in self.times_ns))
 
     def lost_for(self, names: Sequence[str], time_ns: int) -> Array:
-        """Return for how many seconds (n_d,) each was not measured; infinity before the first."""
+        """Return the age (n_d,) in s of each last measurement; infinity before the first."""
         faulty = {fault.values['signal'] for fault in self.faults}
         return np.array([np.inf if time is None else (time_ns - time) / NANOSECONDS
                          if name in faulty else 0.0

@@ -183,7 +183,7 @@ class ClosedLoopTest:
 
 def statement(checks: Sequence[ClosedLoopTest], models: int = 1) -> str:
     """
-    Say which share of all starts may fail, from loops drawn at random; nothing without loops.
+    Return a bound of the share of all starts that may fail, in words; '' without loops.
 
     The bound is that of Clopper and Pearson (1934), for the mean over the checks.
 
@@ -224,23 +224,21 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
                           backend: Backend | None = None, disturbances: Sequence[str] = ()
                           ) -> ClosedLoopTest | None:
     """
-    Let a model's law control a drift that the model was not learned from, where the data are.
+    Test a model's law in closed loops on a drift that the model was not learned from.
 
-    It fails where it costs more than 1.05 times as much as the averaged law that knows that drift,
-    or does not arrive though that one does, with four fifths of the inputs' range, too: then a
-    better model would do better. Where it has no gain, does not arrive, or costs more than 1.1
-    times the better of two linear laws without failing so, it is poor by itself, and no model
-    would help.
+    A loop fails if it costs more than 1.05 times as much as with the averaged law that knows that
+    drift, or does not reach the set-point although that law does, also with four fifths of the
+    range of the inputs: a better model would do better. It is poor if the law has no gain, does
+    not reach the set-point, or costs more than 1.1 times the better of two linear laws, without
+    failing: a better model would not help.
 
-    Starts and set-points are drawn at random where the data are, within the distance that training
-    states have from each other; if these are not known, from the box. Set-points are steady states
-    of that drift, held by an input within its limits; if none is among the data, the nearest ones
-    are taken. All laws get that input, as from a
-    disturbance observer at rest. Inputs are held from sample to sample, and act after the dead
-    time of the model, which the law bridges as in operation, by the inputs under way; the other
-    laws know the state at which each input will act. Where no law reaches the
-    set-point within the limits, they run again without: the limits must not hide a model that is
-    wrong far from the data.
+    Starts and set-points are drawn at random near the data, within the distance of training states
+    from each other; without these, from the box. Set-points are steady states of that drift under
+    an input within its limits; if none is near the data, the nearest ones are used. All laws know
+    that input, as with a disturbance observer at rest. Inputs are held from sample to sample, and
+    act after the dead time of the model, which the law predicts as in operation; the other laws
+    know the state at which each input acts. If no law reaches the set-point within the limits,
+    they run again without limits, which must not hide a model that is wrong far from the data.
 
     :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
         and per time unit of the model; affine in the input.

@@ -50,7 +50,7 @@ class MeasurementBuffer:
         Take a measurement of all states into account; one that is older restarts the history.
 
         :param report: its outcome.
-        :param command: (n_u,) in force before it, or None; where the input is measured, that
+        :param command: (n_u,) before it, or None; where the input is measured, that
             counts.
         :param seconds: how much is to be remembered.
         :param disturbances: (n_d,) measured ones that act, or None where there are none.
@@ -224,7 +224,7 @@ class ModelComparison:
     """How well two models predict recent measurements."""
 
     seconds: float  #: how long that was
-    present: Array  #: (n_x,) root mean square error of the model in force, in units
+    present: Array  #: (n_x,) root mean square error of the current model, in units
     candidate: Array  #: (n_x,) of the one that is to take over; infinite where it diverges
     motion: Array  #: (n_x,) how far the signals moved
     negligible: Array  #: (n_x,) an error that is as good as none
@@ -236,7 +236,7 @@ class ModelComparison:
 
     @property
     def ratio(self) -> Array:
-        """How many times (n_x,) as much as the present model the candidate errs."""
+        """Ratio (n_x,) of the error of the candidate to that of the current model."""
         return self.candidate / self.allowance
 
     @property
@@ -248,7 +248,7 @@ class ModelComparison:
 def compare(present: Controller, candidate: Controller,
             windows: PredictionWindows) -> ModelComparison | None:
     """
-    Let the models of two controllers predict; None where the present one never can.
+    Let the models of two controllers predict; None where the current one never can.
 
     Where not every state is measured they start from the estimates of their filters.
     """

@@ -151,7 +151,7 @@ class _ReplayRun:
             self._other_state = self._other_controller.switch_to(controller, self._state)
 
     def _exchange(self, record: records.EventRecord, state: State) -> None:
-        """Put other parameters or another model in force."""
+        """Activate other parameters or another model."""
         before = self._controller
         self._state = self._put_in_force(record, before.model).switch_to(before, state)
         if self._other is not None and 'parameters' in record.fields:

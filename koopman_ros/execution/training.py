@@ -147,9 +147,9 @@ def outcome_text(summary: Mapping[str, Any]) -> str:
         reasons = '; '.join(summary['reasons'])
         kept = f'; saved as {summary["model_file"]}' if summary['model_file'] else ''
         return f'the new model ({summary["model_class"]}) is rejected: {reasons}{kept}'
-    present = summary['heldout_error_of_present_lift']
+    present = summary['heldout_error_of_current_model']
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
-        'heldout_error_of_present_lift', 'present one'))
+        'heldout_error_of_current_model', 'current model'))
     units = summary['units']
     return (f'the new model ({summary["model_class"]}) is accepted: its error on held-out data is '
             f'{_errors(summary["heldout_error"], units)}, that of the {name} '

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Export a control loop as C code, for where there is no Python.
+Export a control loop as C code, for targets without Python.
 
 Writes controller.c, controller.h, example.c, test_vectors.csv and README.md.
 """
@@ -35,14 +35,14 @@ def main(arguments: list[str] | None = None) -> int:
     add: Callable[..., Any] = parser.add_argument
     add('--version', action='version', version=__version__)
     add('model', help='name of a bundled model, or path of a .safetensors file')
-    add('--law', default='sdre', choices=('sdre', 'linear'), help='best law; better ones of '
-        'fallback_order are left out (default: sdre)')
-    add('--parameters', type=Path, metavar='FILE', help='parameter file of the controller node; '
-        'by default its defaults for the model')
+    add('--law', default='sdre', choices=('sdre', 'linear'), help='highest control law; those '
+        'above it in fallback_order are left out (default: sdre)')
+    add('--parameters', type=Path, metavar='FILE', help='parameter file of the controller node '
+        '(default: its defaults for the model)')
     add('--sample_period', type=float, required=True, metavar='S',
         help='shortest time between two calls, in s')
     add('--output', type=Path, default=Path('controller'), metavar='FOLDER',
-        help='folder for the files (default: controller)')
+        help='output folder (default: controller)')
     options = parser.parse_args(arguments)
     try:
         if not options.sample_period > 0.0:
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
 def loop(model: str, law: str, parameters: Path | None = None
          ) -> tuple[LoadedModel, Controller]:
     """
-    Return a model and its controller as the controller node would build it, from a law on.
+    Return a model and its controller as the controller node would build it.
 
     :raises ValueError: for a model or parameters that the node refuses.
     """
@@ -67,8 +67,8 @@ def loop(model: str, law: str, parameters: Path | None = None
     loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))
     table = table_of(loaded.model, given)
     if unknown := sorted(set(given) - set(table.rows)):
-        raise ExportError(f'{parameters}: {unknown[0]} is no parameter of this loop: correct or '
-                          'remove it')
+        raise ExportError(f'{parameters}: {unknown[0]} is not a parameter of this loop: correct '
+                          'or remove it')
     # a file may say 1 for 1.0
     values = {name: float(value) if isinstance(table.rows[name].default, float) else value
               for name, value in given.items()}

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The gate: acceptance of a model by the part of the record that it was not learned from."""
+"""The acceptance test of a model, on the part of the record that it was not learned from."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -62,7 +62,7 @@ _MISSING = 0.05
 class Thresholds:
     """Thresholds that a lift has to reach."""
 
-    #: by this share its held-out error must be smaller than those of the present lift, where
+    #: by this share its held-out error must be smaller than those of the current model, where
     #: there is one, and of the best linear model
     margin: float = 0.1
     condition: float = 1e4  #: largest condition number of E[z z']
@@ -143,7 +143,7 @@ class HeldOut:
     def reasons(self, model: LiftedModel, rmse: Array, figures: LiftMetrics,
                 law_check: ClosedLoopTest, linear: bool) -> tuple[str, ...]:
         """
-        Say why a model must not be used whatever the present one is.
+        Say why a model must not be used, even without a current one.
 
         :param rmse: (n_x,) error of its predictions, in state units.
         :param linear: whether it is a linear one itself, which need not be better than that.
@@ -173,7 +173,7 @@ class AcceptanceResult:
     warnings: tuple[str, ...]  #: for the user, in either case
     rmse: Array  #: (n_x,) error of its predictions of the measurements, in state units
     drift_rmse: Array  #: (n_x,) the same of the drift that it was learned from
-    current_rmse: Array | None  #: (n_x,) the same of the present lift, None without one
+    current_rmse: Array | None  #: (n_x,) the same of the current model, None without one
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
@@ -201,7 +201,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
                    watch: Callable[[float], bool] = lambda _: False,
                    backend: Backend | None = None) -> AcceptanceResult:
     """
-    Compare a new lift with the present and a linear one, held out, and close its loop.
+    Compare a new model with the current and a linear one on held-out data, and close its loop.
 
     :param learned: the trained model, or the comparison by :func:`compare_classes`, of which the
         chosen model is judged, and whose closed loops are not run again.

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, expect
 from koopman_ros.core.datasets import DriftSamples, Episode, PlantDescription
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.execution import Backend
@@ -117,6 +117,7 @@ def learn_lift(found: Identified, plant: PlantDescription, n_z: int, *, seed: in
     :raises TrainingFailed: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
+    expect(found=(found, Identified), plant=(plant, PlantDescription))
     known, samples = _estimated(found, plant)
     return train(known, samples, IncrementalTraining(n_z), seed=seed, starts=starts, watch=watch,
                  loops=0)
@@ -169,8 +170,8 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
 
     The rule is the same, its error another: the mean square by which predictions of the
     measurements that were held out err beyond their noise. Differences within the chance variation
-    of the noise count as equal. Refused are classes that the gate would refuse for their law,
-    their coordinates or for a linear model that is as good.
+    of the noise count as equal. Classes that the acceptance test would reject for their law, their
+    coordinates or a linear model that is as good are refused.
 
     :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
         them and the rule.

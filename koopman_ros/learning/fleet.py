@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Retraining of many plants in one call, each with a gate of its own, one plant a job."""
+"""Retraining of many plants in one call, each with its own acceptance test, one plant a job."""
 
 from __future__ import annotations
 

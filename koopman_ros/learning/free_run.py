@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.optimize import least_squares, OptimizeResult
 
-from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.arrays import Array, expect, short_repr
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
 from koopman_ros.core.solvers import differences
@@ -66,7 +66,7 @@ class FreeRun:
         """Show the errors."""
         count = sum(map(len, self.episodes))
         return '\n  '.join([
-            f'free run of {count} measurements, after the start fitted to the first {self.init}:',
+            f'free run of {count} measurements, with the start fitted to the first {self.init}:',
             *(f'{name}: error {rmse:.4g} {unit}, fit {fit:.1f} %' for name, unit, rmse, fit in zip(
                 self.names, self.units, self.rmse, self.fit, strict=True))])
 
@@ -124,7 +124,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     Simulate a whole record by its inputs alone, and compare with the measurements.
 
     The start of each episode, unmeasured states included, is fitted to its first samples; after
-    these the simulation sees no measurement. Where the first samples contradict the model, as on a
+    these the simulation sees no measurement. If the first samples contradict the model, e.g. on a
     day with another ambient temperature, a constant disturbance of the rates of the measured
     states is fitted, too; a controller's disturbance observer does the same.
 
@@ -133,11 +133,12 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     :param init: samples to which the start is fitted; at most half of an episode.
     :param usual: (n_y,) root mean square error of the model's free run over a record that it was
         learned from, in its units; by default that of the model itself. The first samples
-        contradict the model where they err by more than 1.5 times that. Without it there is no
-        disturbance.
+        contradict the model if their error is above 1.5 times that. None: no disturbance is
+        fitted.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """
+    expect(record=(record, Record))
     rate, states, inputs, dead_time = _drift(model, record.plant)
     measured = [i for i, name in enumerate(states.names) if name in record.plant.state_names]
     if not measured:
@@ -216,7 +217,7 @@ def _drift(model: AnyModel, plant: PlantDescription
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,
            indexed: Episode, count: int, step: float, usual: Array | None
            ) -> tuple[Array, Array]:
-    """Return the start (n_x,) that suits the first samples best, and a disturbance (n_x,)."""
+    """Return the start (n_x,) that fits the first samples best, and a disturbance (n_x,)."""
     segments = Segments.of([indexed.part(0, count)] if count > 1 else [indexed.part(0, 2)], step)
     rows = np.flatnonzero(segments.x[:, 0, 0])[:count]
     y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])

@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 
+from koopman_ros.core.arrays import expect
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, LOOPS
@@ -151,6 +152,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     :raises ValueError: for an unknown name; otherwise as :func:`train`, where the class was
         requested or the cause is in the samples.
     """
+    expect(plant=(plant, PlantDescription), samples=(samples, DriftSamples))
     n_x = samples.x.shape[1]
     recipes = usual_recipes(n_x) if recipes is None else recipes
     names: tuple[str, ...] = (LINEAR, POLYNOMIAL, *recipes)
@@ -258,7 +260,7 @@ def _noted(model: LiftedModel, one: ModelCandidate) -> LiftedModel:
 
 def _polynomial(prepared: PreparedSamples, degrees: Sequence[int]) -> LiftedModel:
     """Choose the degree; those with too many monomials to tell apart or to save fall out."""
-    tried, refusal = [], 'no degree was to be tried'
+    tried, refusal = [], 'no degree was given'
     for degree in degrees:
         try:
             model = Edmd(degree).learn(prepared.plant, prepared.parts[0], prepared.box)

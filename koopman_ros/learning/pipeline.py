@@ -60,7 +60,7 @@ from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
 
-# A smaller change, in half-ranges of the present lift's box, is neither a spike nor a jump.
+# A smaller change, in half-ranges of the current model's range, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
 
 # Shares of the whole at which reading, estimating, learning and judging begin and end.
@@ -130,7 +130,7 @@ class Retrained:
                     'beyond_noise': one.excess,
                     'closed_loops': one.law_check.loops,
                     'closed_loops_failed': int(np.sum(one.law_check.failed)),
-                    'closed_loop_cost_beside_linear': one.law_check.median_ratio}
+                    'closed_loop_cost_over_linear': one.law_check.median_ratio}
             return said
 
         figures: dict[str, object] = {
@@ -170,7 +170,7 @@ class Retrained:
                 'trained_from': by_state(trained.lower),
                 'trained_to': by_state(trained.upper),
                 'heldout_error': by_state(self.decision.rmse),
-                'heldout_error_of_present_lift': None if self.decision.current_rmse is None else (
+                'heldout_error_of_current_model': None if self.decision.current_rmse is None else (
                     by_state(self.decision.current_rmse)),
                 'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
                 'heldout_rw': fit.rw,
@@ -180,8 +180,8 @@ class Retrained:
                 'closed_loop_statement': self.decision.statement,
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
-                'closed_loop_cost_beside_linear': check.median_ratio,
-                'worst_closed_loop_cost_beside_linear': check.worst_ratio,
+                'closed_loop_cost_over_linear': check.median_ratio,
+                'worst_closed_loop_cost_over_linear': check.worst_ratio,
             }
         figures['free_runs'] = {name: {
             'error': dict(zip(run.names, map(float, run.rmse), strict=True)),
@@ -207,7 +207,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
     :param test: a record that takes no part in the training. The new model is rejected if its free
         run errs more there than that of the best linear model.
     :raises BagReadError: for bags that cannot be used.
-    :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
+    :raises ModelFileError: when the current or the initial model cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` returned True; nothing is written.
     :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
@@ -331,7 +331,7 @@ def _check_disturbances(plant: PlantDescription, episodes: Sequence[Episode]) ->
 
 def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode],
                progress: _Progress) -> Array:
-    """Return the dead times (n_u,) as the task has them, or as the record tells them, in s."""
+    """Return the dead times (n_u,) as the task has them, or as estimated from the record, in s."""
     names, seconds = plant.input_names, SECONDS_PER_TIME_UNIT[plant.time_unit]
     if unknown := ', '.join(name for name in task.dead_time if name not in names):
         raise ValueError(f'dead_time names {unknown}: the inputs are {", ".join(names)}')

@@ -86,12 +86,12 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
     """
     Read the episodes of some bags: all of them, or a selection where they are many.
 
-    A record of more than `most` samples is read twice. The first reading tells its range, and over
+    A record of more than `most` samples is read twice. The first reading finds its range, and over
     how many samples the motion is linear except for noise: these are averaged, which loses
     nothing. The second one chooses segments, see :class:`Selection`.
 
     :param hidden: whether states are to be found that are not measured.
-    :param tick: told of the samples of a long record as they are read.
+    :param tick: called with the samples of a long record as they are read.
     :param backend: where long records are read, a bag a task; this process by default.
     :raises BagReadError: for bags that cannot be used.
     """

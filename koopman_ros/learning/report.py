@@ -63,7 +63,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     kind = '' if learned is None else f' ({learned.model.kind})'
     yield f'**The new model{kind} is {"accepted" if retrained.accepted else "rejected"}.**'
     warnings = () if decision is None else decision.warnings
-    yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
+    yield bullets([*retrained.reasons, *(f'Warning: {warning}.' for warning in warnings)])
     if retrained.model_file:
         yield f'Model file: `{retrained.model_file}`'
     if retrained.alternative_files:
@@ -136,7 +136,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
             run.names, run.units, run.rmse, run.fit, strict=True)), (2, 3))
     eigenvalues = ', '.join(f'{value:.3g}' for value in learned.model.eigenvalues)
     own = learned.model.states
-    yield 'Set-points can be given within ' + ', '.join(
+    yield 'Set-points are accepted within ' + ', '.join(
         f'{low:.5g} to {high:.5g} {unit} of {name}'
         for name, unit, low, high in zip(own.names, own.units, own.lower, own.upper, strict=True))
     yield (f'Lift: n_z = {learned.model.n_z}, rw = {learned.figures.fit.rw:.2g}, condition number '
@@ -148,7 +148,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
             point.eigenvalues)))
         for point in decision.operating_points))
     if decision.statement:
-        yield f'Simulated closed loops from where the data are: {decision.statement}.'
+        yield f'Simulated closed loops, started in the training range: {decision.statement}.'
 
 
 def _label(signals: Coordinates, k: int) -> str:
@@ -201,11 +201,11 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
 
 
 def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
-    """Return label, rate and colour of the present lift and of the new one, where they are."""
+    """Return label, rate and colour of the current model and of the new one, where they are."""
     new = None if retrained.learned is None else retrained.learned.model
     seconds = SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]
     return [(name, lifted_rate(model.joined, seconds), color)
-            for name, model, color in (('present model', retrained.present, 'tab:red'),
+            for name, model, color in (('current model', retrained.present, 'tab:red'),
                                        ('new model', new, 'tab:green')) if model is not None]
 
 

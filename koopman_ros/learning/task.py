@@ -31,13 +31,13 @@ class TrainingTask:
 
     bags: tuple[str, ...]  #: files or folders
     output: str  #: model file to write, ending in ``.safetensors``
-    model: str  #: file of the present lift, empty to learn the first one
-    states: tuple[RecordedState, ...]  #: those of the present lift, in any order
+    model: str  #: file of the current model, empty to learn the first one
+    states: tuple[RecordedState, ...]  #: those of the current model, in any order
     inputs: tuple[RecordedInput, ...]  #: likewise
     plant: str = ''  #: name of the plant in a first lift
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
     #: class to learn, a name of `compare`, ``'best'`` for the one that its rule takes, or
-    #: ``'same'`` for that of the present lift, the best where there is none
+    #: ``'same'`` for that of the current model, the best if there is none
     model_class: str = SAME
     coordinates: int = 0  #: n_z of the identity lift; 0: two more than states
     seed: int = 0  #: of the split and of the training, and of the reduction of a long record
@@ -56,7 +56,7 @@ class TrainingTask:
     disturbances: tuple[str, ...] = ()
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
     #: not compared with the present one, which has other states. -1: as many as free runs of the
-    #: record need, see :func:`identify_structure`; none where there is a present lift
+    #: record need, see :func:`identify_structure`; none if there is a current model
     unmeasured_states: int = 0
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
     #: it; empty for a polynomial. Its states that are not in the bags are estimated, too.
@@ -98,8 +98,8 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     """
     Return the plant as far as the task describes it, and its signals in order.
 
-    :param current: the present lift, where there is one.
-    :raises ValueError: for a task whose parts do not fit each other or the present lift.
+    :param current: the current model, if there is one.
+    :raises ValueError: for a task whose parts do not fit each other or the current model.
     """
     if task.physical_model and (task.unmeasured_states > 0 or task.input_gain):
         raise ValueError(f'physical_model = {task.physical_model!r} defines the states and the '

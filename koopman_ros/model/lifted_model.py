@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
-from koopman_ros.core.units import check_time_unit, display_unit, SECONDS_PER_TIME_UNIT, shown
+from koopman_ros.core.units import (
+    check_time_unit,
+    display_unit,
+    printed,
+    SECONDS_PER_TIME_UNIT,
+    shown,
+)
 from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.observables import NetworkObservables, Observables
@@ -31,6 +37,11 @@ from koopman_ros.model_classes import (
 
 LONGEST_DEAD_TIME = 3600.0  #: s
 
+# Figures on held-out data in words, by their names in files.
+_FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
+            'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
+_FIGURES_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
+                      'noise': 'Measurement noise', 'free_run': 'Free-run error (RMS)'}
 _SAMPLES = 256  # random states of a box whose training states are not known
 # Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
 _MAX_DRIFTS = 10_000
@@ -59,7 +70,7 @@ class Provenance:
     method: str = ''  #: how derivatives were found; empty where they were given
     #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
     model_class: str = ''
-    accepted: bool | None = None  #: verdict of the acceptance test; None for a model never judged
+    accepted: bool | None = None  #: verdict of the acceptance test; None if not tested
     reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
     closed_loops: str = ''  #: result of simulated closed loops, with its confidence
 
@@ -72,7 +83,7 @@ class Provenance:
     @property
     def acceptance(self) -> str:
         """The verdict in words, with the reasons."""
-        verdict = {True: 'accepted', False: 'rejected', None: 'never judged'}[self.accepted]
+        verdict = {True: 'accepted', False: 'rejected', None: 'not tested'}[self.accepted]
         return f'{verdict} ({"; ".join(self.reasons)})' if self.reasons else verdict
 
 
@@ -134,7 +145,8 @@ class LiftedModel:
             self.inputs.names, self.dead_time.tolist(), strict=True) if seconds > 0.0]
         rates = self.eigenvalues.real
         lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
-                  *(f'held-out {name}: {value:.3g}' for name, value in about.metrics.items()),
+                  *(f'{title[0].lower()}{title[1:]}: {value:.3g}'
+                    for title, value in self.figures.items()),
                   *[f'simulated closed loops: {about.closed_loops}'] * bool(about.closed_loops),
                   f'acceptance: {about.acceptance}']
         return '\n  '.join(lines)
@@ -171,6 +183,19 @@ class LiftedModel:
                 ('verified_loops', self.verified_loops and self.verified_loops.n_x)):
             if width is not None and width != n_x:
                 raise ValueError(f'incompatible {name}: expected {n_x} states, got {width}')
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Figures of the training, by their names in words, with units."""
+        titles = dict(_FIGURES)
+        for key, title in _FIGURES_OF_STATES.items():
+            for name, unit in zip(self.states.names, self.states.units, strict=True):
+                titles[f'{key}_{name}'] = f'{title}, {name.replace("_", " ")} [{printed(unit)}]'
+                titles[key] = f'{title} [{printed(unit)}]'
+        # these have no lift
+        left_out = ('rw',) if self.kind in (LINEAR, NEURAL_DRIFT) else ()
+        return {titles.get(name, name): value for name, value in self.provenance.metrics.items()
+                if name not in left_out}
 
     @cached_property
     def n_x(self) -> int:

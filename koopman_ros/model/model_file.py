@@ -93,7 +93,7 @@ def check(model: LiftedModel) -> None:
     """
     Check that a model can be controlled with, and that its texts fit logs and messages.
 
-    :raises TypeError: for a name, unit or note of its origin that is no text.
+    :raises TypeError: for a name, unit or note of its origin that is not a text.
     :raises ValueError: naming the size and its limit, or the text and its error.
     """
     lift, origin = model.observables, model.provenance

@@ -265,7 +265,7 @@ class PanelNode(LoopNode):
             node.on_event(event)
 
     def _read_model(self, status: Mapping[str, str]) -> None:
-        """Show training range and origin of the active model if its file can be read here."""
+        """Show training range and origin of the current model if its file can be read here."""
         in_force = {key: status.get(key, '') for key in ('model', 'model reloads')}
         name = in_force['model']
         if not name or in_force == self._model:

@@ -103,7 +103,7 @@ class PlayerNode(LoopNode):
                     self._give_up(
                         f'no command for the measurement at {self._open / NANOSECONDS:.3f} s '
                         f'within {self._settings.answer_timeout:g} s: check that the controller '
-                        'is running; a rate above 0 plays without waiting for answers')
+                        'is running; a rate above 0 plays without waiting for commands')
             elif self._lockstep:
                 self._play_in_lockstep()
             else:

@@ -21,7 +21,7 @@ from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import run
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.signals import by_topic
-from koopman_ros.ros.training import present_lift, Training
+from koopman_ros.ros.training import current_model, Training
 
 
 class TrainerNode(ManagedNode):
@@ -30,7 +30,7 @@ class TrainerNode(ManagedNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('trainer', **options)
         given = self.given()
-        present = present_lift(given)
+        present = current_model(given)
         table = trainer_table(present, given)
         self._table, self._present = table, present
         self._recording: Recording | None = None

@@ -40,7 +40,7 @@ class AlarmStore:
     :param path: of the file, which may be missing or empty.
     :param now: wall time.
     :ivar complaint: why the content of a file was not loaded, or empty; the file was moved aside.
-    :raises ValueError: for a file that is no file of alarms.
+    :raises ValueError: for a file without alarms.
     :raises OSError: for a file that cannot be read, or a folder that cannot be written.
     """
 

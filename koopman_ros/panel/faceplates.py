@@ -49,7 +49,7 @@ class Faceplate:
     unit: str  #: as it is printed
     span: Range  #: of its bar
     decimals: int  #: of its numbers
-    training: Range | None  #: training range of the active model
+    training: Range | None  #: training range of the current model
     abnormal: str  #: abnormal condition in words, or empty
     limits: Range | None  #: of the command, or of a state in the MPC
     active: str  #: active limits of the plan in words, or empty

@@ -179,6 +179,7 @@ class PageLayout:
     def control(self, element: Any) -> Any:
         """Return a control, disabled for a viewer."""
         if not self.enabled:
+            element.props['title'] = NOT_ALLOWED.text
             element.disable()
         return element
 
@@ -187,10 +188,13 @@ class PageLayout:
         found: ui.button = self.control(ui.button(text, on_click=act).props('outline'))
         return found
 
-    def allow(self, control: Any, possible: bool) -> None:
-        """Enable a control for operators while it can act."""
-        if control.enabled is not (enabled := self.enabled and possible):
-            control.set_enabled(enabled)
+    def allow(self, control: Any, possible: bool, obstacle: str) -> None:
+        """Enable a control for operators while it can act; otherwise it shows the obstacle."""
+        title = '' if possible else obstacle
+        if self.enabled and (control.enabled, control.props.get('title', '')) != (possible, title):
+            control.props['title'] = title
+            control.set_enabled(possible)
+            control.update()
 
     async def confirm(self, question: str, yes: str, details: Sequence[str] = (),
                       changes: Sequence[Sequence[str]] = ()) -> bool:
@@ -223,7 +227,7 @@ class AnswerLine:
         self._label = label('div', '', 'answer').props('role=status aria-live=polite')
 
     def set_text(self, text: str) -> None:
-        """Show a text that is no refusal."""
+        """Show a text other than a refusal."""
         self._label.set_text(text)
         self._label.classes(remove='refused')
 

@@ -1,20 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Words for the active model: origin and figures in its file, and in the controller's status."""
+"""Words for the current model: origin and figures in its file, and in the controller's status."""
 
 from collections.abc import Mapping, Sequence
+import contextlib
+from datetime import datetime
 
-from koopman_ros.core.units import unit_label
 from koopman_ros.model import LiftedModel
-from koopman_ros.model_classes import LINEAR, NEURAL_DRIFT
 from koopman_ros.panel.faceplates import Range, readable
 from koopman_ros.panel.snapshot import Snapshot
 
-_METRICS = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
-            'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
-_METRICS_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
-                      'noise': 'Measurement noise'}
 _STATUS = {'model file time': 'File written', 'model training data': 'Training data (digest)',
            'model reloads': 'Reloads', 'model rejected': 'Last file rejected',
            'model check': 'Check on recent data', 'law': 'Control law',
@@ -25,10 +21,10 @@ _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'measurements_used': 'Measurements used',
              'derivative_method': 'Derivatives', 'noise': 'Measurement noise',
              'heldout_error': 'Held-out error',
-             'heldout_error_of_present_lift': 'Held-out error of the active model',
+             'heldout_error_of_current_model': 'Held-out error of the current model',
              'heldout_error_of_linear_model': 'Held-out error of a linear model',
              'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
-             'closed_loop_cost_beside_linear': 'Closed-loop cost relative to linear control'}
+             'closed_loop_cost_over_linear': 'Closed-loop cost relative to linear control'}
 _COMPARED = ('Model class', 'Acceptance')
 _OUTSIDE = ' outside training box [half-ranges]'
 _UNKNOWN = ('', 'none', 'nan')
@@ -50,19 +46,7 @@ def model_card(model: LiftedModel) -> dict[str, str]:
         'Learned from': origin.plant, 'Derivatives': origin.method,
         'Written by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'Random seed': '' if origin.seed is None else str(origin.seed)}
-    titles = dict(_METRICS)
-    metrics = dict(origin.metrics)
-    if model.kind in (LINEAR, NEURAL_DRIFT):
-        # without a lift
-        metrics.pop('rw', None)
-    for key, title in _METRICS_OF_STATES.items():
-        for name, unit in zip(model.states.names, model.states.units, strict=True):
-            several = len(model.states.names) > 1
-            titles[f'{key}_{name}' if several else key] = (
-                f'{title}{f", {readable(name)}" if several else ""} '
-                f'[{unit if unit == "K" else unit_label(unit)}]')
-    return found | {titles.get(name, name): f'{figure:.4g}'
-                    for name, figure in metrics.items()}
+    return found | {title: f'{figure:.4g}' for title, figure in model.figures.items()}
 
 
 def model_changes(now: Snapshot, new: LiftedModel, trained: Mapping[str, Range]
@@ -101,7 +85,10 @@ def training_card(values: Mapping[str, str]) -> dict[str, str]:
 def status_card(values: Mapping[str, str]) -> dict[str, str]:
     """Return the figures of the model in the controller's status, by their names in words."""
     found = {title: values.get(key, '') for key, title in _STATUS.items()}
-    found['File written'] = found['File written'][:19].replace('T', ' ')
+    with contextlib.suppress(ValueError):
+        # in local time, as the other times on the page
+        written = datetime.fromisoformat(found['File written']).astimezone()
+        found['File written'] = f'{written:%Y-%m-%d %H:%M:%S}'
     for key, value in values.items():
         if key.endswith(_OUTSIDE):
             name = key.removesuffix(_OUTSIDE)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Page of the active model, and of recording, experiments and training."""
+"""Page of the current model, and of recording, experiments and training."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class _Task:
 
 
 def _model(page: PageLayout) -> None:
-    with page.card('active model', 'Model', CONTROLLER):
+    with page.card('current model', 'Model', CONTROLLER):
         name = label('div', '', 'value')
         task, origin = _Task(columns=True), _Figures(columns=True)
         training = label('div', '', 'quiet')
@@ -112,9 +112,9 @@ def _model(page: PageLayout) -> None:
 
         async def activate(name: str, rejected: bool = False) -> None:
             now, view = page.source.snapshot, page.source.view
-            active = now.status(CONTROL).values.get('model', 'the active model')
+            current = now.status(CONTROL).values.get('model', 'the current model')
             details = [
-                name, f'It replaces {active} if it predicts the recent measurements as well.']
+                name, f'It replaces {current} if it passes the check on recent measurements.']
             changes: list[Sequence[str]] = []
             reasons = now.status(TRAINING).message
             try:
@@ -124,7 +124,7 @@ def _model(page: PageLayout) -> None:
             else:
                 rejected = new.provenance.accepted is False
                 reasons = '; '.join(new.provenance.reasons)
-                changes = [('', 'active model', 'new model'), *model_changes(
+                changes = [('', 'current model', 'new model'), *model_changes(
                     now, new, view.shown_ranges(training_ranges(new)))]
             if rejected:
                 details.append(f'✖ Training rejected this model: {reasons}.')
@@ -188,8 +188,8 @@ def _recording(page: PageLayout) -> None:
 
     def show(now: Snapshot) -> None:
         found = now.status(RECORDING)
-        page.allow(record, 'bag' not in found.values)
-        page.allow(stop, 'bag' in found.values)
+        page.allow(record, 'bag' not in found.values, 'a recording is running')
+        page.allow(stop, 'bag' in found.values, 'no recording is running')
         task.show(found, {key: value for key, value in found.values.items()
                           if not key.startswith('messages on') and value not in found.message})
 
@@ -215,8 +215,8 @@ def _experiment(page: PageLayout) -> None:
         reason = experiment_obstacle(now)
         obstacle.set_text(f'Start is not possible: {reason}')
         show_if(obstacle, bool(reason))
-        page.allow(begin, not reason)
-        page.allow(end, experiment_running(now))
+        page.allow(begin, not reason, reason)
+        page.allow(end, experiment_running(now), 'no experiment is running')
         task.show(found, {'time left [s]' if key == 'left [s]' else key: value
                           for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
@@ -283,8 +283,8 @@ def _training(page: PageLayout) -> None:
         except ValueError:
             done = math.nan
         running = done < 100.0 and found.level == OK and 'accepted' not in found.values
-        page.allow(train, not running)
-        page.allow(cancel, running)
+        page.allow(train, not running, 'a training is running')
+        page.allow(cancel, running, 'no training is running')
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)
         share.set_text('' if math.isnan(done) else f'{done:.0f} %')
         task.show(found, training_card(found.values))

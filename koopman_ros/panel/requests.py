@@ -123,7 +123,7 @@ class Requests:
         """Answer the requests for which the controller has no answer in time."""
         for request in [one for one in self._open if now > one.deadline]:
             self._answer(request, Answer(False, request.refused or (
-                f'the controller did not answer within {TIMEOUT:g} s: look at its log')))
+                f'the controller did not answer within {TIMEOUT:g} s: check its log')))
 
     def _answer(self, request: _Open, answer: Answer) -> None:
         self._open.remove(request)

@@ -62,7 +62,7 @@ class Snapshot:
     shelved: tuple[Alarm, ...]
     silences: tuple[SilentTopic, ...]
     parameters: Mapping[str, Mapping[str, ParameterDescription]]  #: by role
-    model: Mapping[str, str]  #: origin and held-out figures of the active model
+    model: Mapping[str, str]  #: origin and held-out figures of the current model
     previous_model: str  #: active before, or empty
 
     def status(self, name: str) -> TaskStatus:

@@ -36,7 +36,7 @@ a { color: var(--text); }
 .big { font-size: 3.4rem; line-height: 1.05; font-weight: 600;
   font-variant-numeric: tabular-nums; }
 .mode { font-size: 2.4rem; line-height: 1.2; font-weight: 600; }
-.unit { font-size: 1.4rem; }
+.unit { font-size: 1.1rem; }
 .value { font-size: 1.5rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .abnormal { align-self: flex-start; color: #fff; background: var(--medium); padding: 2px 8px;
   font-weight: 600; }
@@ -77,6 +77,9 @@ a { color: var(--text); }
 .q-field__control { background: #f4f4f2; }
 .q-dialog .card { background: var(--card); max-width: 560px; }
 .nicegui-echart { width: 100%; }
+.trends { height: var(--from-0); }
+@media (min-width: 640px) { .trends { height: var(--from-600); } }
+@media (min-width: 940px) { .trends { height: var(--from-900); } }
 .card .picture { display: block; max-width: 100%; height: auto; background: #fff; }
 .report { white-space: pre-wrap; overflow-wrap: anywhere; font-family: monospace;
   font-size: .85rem; }
@@ -88,6 +91,8 @@ a { color: var(--text); }
   .head { padding: 6px 8px; }
   .parameter { grid-template-columns: minmax(0, 1fr); }
   .big { font-size: 3rem; }
+  .changes { grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); }
+  .changes > :nth-child(3n + 1) { grid-column: 1 / -1; color: var(--quiet); }
 }
 """
 

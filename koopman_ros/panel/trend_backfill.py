@@ -36,7 +36,7 @@ def read_past(path: str, wiring: SignalTopics, read: Mapping[str, str],
     :param resolve: full name of a topic.
     :param span: s of the past that is kept.
     :param ended: whether to stop.
-    :raises BagReadError: for a file that is no bag.
+    :raises BagReadError: for a file that is not a bag.
     """
     signals = wiring.signals
     places: dict[str, list[tuple[str, str, MessageField, Any]]] = {}

@@ -31,6 +31,9 @@ EPOCH = 1e9  #: s; a later stamp is a wall time, an earlier one is a simulated t
 _GROUP = 1.0 / 15.0  # of the time shown; nearer events are one mark
 _LEAST = 0.1  # of the range of a signal, which an axis shows
 _HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
+# Pixels for the names of pens in charts from these widths on, of which the style sheet knows.
+_WIDTHS = {0: 320, 600: 560, 900: 860}
+_ROW = 20  # pixels of each further row of names
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
           'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
 _ABNORMAL = '#8a4b00'
@@ -87,7 +90,9 @@ class TrendChart:
         self.marks: Sequence[MarkGroup] = ()  #: events in the time shown
         self._chart = ui.echart(_options(self._charts, height, zoom)).props(
             'aria-label="Trends of all signals" role=img')
-        self._chart.style['height'] = f'{height * len(self._charts) + (40 if zoom else 0)}px'
+        self._chart.classes('trends').style(';'.join(
+            f'--from-{width}: {sum(height + more for more in _rows(self._charts, room)) + 40}px'
+            for width, room in _WIDTHS.items()))
         if zoom:
             self._chart.on('chart:datazoom', self._on_zoom, ['start', 'end', 'batch'],
                            throttle=_PAUSE, leading_events=False)
@@ -203,8 +208,9 @@ def _lines(own: _Pen, face: Faceplate, marks: Sequence[MarkGroup]) -> list[dict[
     ranges = {'trained': face.training, 'limit': face.limits} if (
         own.kind in ('measured', 'commands')) else {}
     # the chart fails at an end that is not finite
-    found: list[dict[str, Any]] = [{'yAxis': end, 'name': name} for name, bounds in ranges.items()
-                                   for end in bounds or () if math.isfinite(end)]
+    found: list[dict[str, Any]] = [
+        {'yAxis': end, 'name': f'{own.label} {name}'} for name, bounds in ranges.items()
+        for end in bounds or () if math.isfinite(end)]
     return found + [{
         'xAxis': 1e3 * mark.time, 'name': mark.label, 'text': mark.text.replace('; ', '\n'),
         'symbol': 'circle',
@@ -219,6 +225,30 @@ def ink(number: int) -> str:
     red, green, blue = colorsys.hls_to_rgb(share, 0.28 + 0.14 * (number % 2), 0.4)
     return f'#{round(255 * red):02x}{round(255 * green):02x}{round(255 * blue):02x}' if (
         number) else '#1d1d1b'
+
+
+def legend_rows(names: Sequence[str], width: int) -> int:
+    """Return the number of rows that names of pens take in a width in pixels."""
+    rows, room = 1, width
+    for needed in (7 * len(name) + 29 for name in names):
+        if needed > room:
+            rows, room = rows + 1, width
+        room -= needed
+    return rows
+
+
+def _rows(charts: _Charts, width: int) -> list[int]:
+    """Return the pixels for further rows of names of each chart."""
+    return [_ROW * (legend_rows([pen(own.kind, own.label) for own in pens], width) - 1)
+            for _, pens in charts]
+
+
+def _places(charts: _Charts, height: int, width: int) -> dict[str, Any]:
+    """Return the options for the places of charts and their names."""
+    rows = _rows(charts, width)
+    tops = [height * at + sum(rows[:at]) for at in range(len(rows))]
+    return {'legend': [{'top': top + 4} for top in tops],
+            'grid': [{'top': top + _HEAD + more} for top, more in zip(tops, rows, strict=True)]}
 
 
 def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
@@ -247,14 +277,16 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     'transitionDuration': 0,
                     ':valueFormatter': "v => v == null ? '–' : (+v).toPrecision(6)",
                     'axisPointer': {'type': 'cross', 'label': {'backgroundColor': '#4d4d4a'}}},
-        'legend': [{'type': 'scroll', 'top': 4 + height * at, 'pageIconColor': '#4d4d4a',
+        'media': [{'query': {'minWidth': width}, 'option': _places(charts, height, room)}
+                  for width, room in _WIDTHS.items()],
+        'legend': [{'type': 'plain',
                     'data': [own.title for own in own_pens if own.kind != 'planned'],
+                    # the unit is at the axis
+                    ':formatter': "name => name.split(' [')[0]",
                     'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
-                    # less than that of the text cuts it where there are several pages of pens
                     'itemHeight': 14, 'itemWidth': 14}
-                   for at, (_, own_pens) in enumerate(charts)],
-        'grid': [{'left': 56, 'right': 16, 'top': _HEAD + height * at,
-                  'height': height - _HEAD - _FOOT} for at in several],
+                   for _, own_pens in charts],
+        'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT} for _ in charts],
         'xAxis': [{'type': 'time', 'gridIndex': at, 'nameLocation': 'middle', 'nameGap': 22,
                    'nameTextStyle': {'color': '#4d4d4a'},
                    'axisPointer': {'label': {':formatter': f'p => ({_CLOCK})(p.value)'}},
@@ -262,7 +294,7 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
             for at in several],
         'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
                    'name': f'{", ".join(dict.fromkeys(own.label for own in own_pens))} [{unit}]',
-                   'axisLabel': {'color': '#1d1d1b'},
+                   'axisLabel': {'color': '#1d1d1b', 'hideOverlap': True},
                    'nameTextStyle': {'color': '#1d1d1b', 'align': 'left'},
                    'splitLine': {'lineStyle': {'color': '#c4c4c0'}}}
                   for at, (unit, own_pens) in enumerate(charts)],

@@ -46,7 +46,7 @@ def trend_page(page: PageLayout) -> None:
             for mark in reversed(chart.marks):
                 label('div', f'{_clock(mark.time)}  {mark.text}').props('role=listitem')
             if not chart.marks:
-                label('div', 'none in this time', 'quiet')
+                label('div', 'none in this period', 'quiet')
 
     def end() -> float | None:
         return time_of_day(str(until.value), page.source.view.trends.latest or 0.0)

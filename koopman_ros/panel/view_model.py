@@ -233,7 +233,7 @@ class LoopViewModel:
 
     def take_model(self, ranges: Mapping[str, Range], about: Mapping[str, str]) -> None:
         """
-        Take the content of the active model's file.
+        Take the content of the current model's file.
 
         :param ranges: training ranges, in the units of the signals.
         :param about: origin and held-out figures, in words.

@@ -128,7 +128,7 @@ def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None
             if not model.distance(place) <= margin:
                 continue
             if (problem := controller.try_law(place, setpoint)) is not None:
-                tried = (f'tried at {model.states.text(place)} with the set-point '
+                tried = (f'at {model.states.text(place)} with the set-point '
                          f'{controller.controlled.text(setpoint)} the control law of the model '
                          f'fails ({words_of(signals_of(model))(problem)})')
                 # another model fails for the same reason
@@ -155,10 +155,10 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheck
     most = situation.parameters.model_check_factor
     if most and not found.ratio[i] <= most:
         raise ModelFileError(
-            f'the model {words.format("present one")}, at most {most * found.allowance[i]:.2g} '
+            f'the model {words.format("current one")}, at most {most * found.allowance[i]:.2g} '
             f'{unit} are allowed: train it again with more data, or set model_check_factor = 0 to '
             'load it anyway')
-    return words.format('model before') + (
+    return words.format('previous model') + (
         '' if found.tells else '; the signals moved too little for a stricter check')
 
 

@@ -148,7 +148,7 @@ class PlantTable(ParameterTable[PlantParameters]):
         for name, unit in disturbances.items():
             if name not in self._si:
                 raise ConfigurationError(
-                    f'disturbances_measured names {name}, which is no constant of {system}: '
+                    f'disturbances_measured names {name}, which is not a constant of {system}: '
                     f'choose from {", ".join(self._si) or "none"}')
             try:
                 conversion(self._si[name], unit)

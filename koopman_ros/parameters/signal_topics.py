@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the signals of a plant are on the wire, by parameter; topics that are no signal's."""
+"""Where the signals of a plant are on the wire, by parameter; topics of no signal."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ class MeasuredPlace:
 class StatePlaces(MeasuredPlace):
     """Where a measured state is; its set-points and prediction have the same type and field."""
 
-    quality_topic: str = _topic('Topic of the quality of the measurements, as levels of '
-                                'DiagnosticStatus: 0 good, 1 uncertain, above bad; empty: none.')
+    quality_topic: str = _topic('Topic of the measurement quality, as a level of '
+                                'DiagnosticStatus: 0 good, 1 uncertain, higher bad; empty: none.')
     quality_type: str = parameter(
         'std_msgs/msg/UInt8', 'Message type of the quality.', read_only=True,
         choices=('std_msgs/msg/UInt8', 'diagnostic_msgs/msg/DiagnosticStatus'))
@@ -82,7 +82,7 @@ class StatePlaces(MeasuredPlace):
 class AnalysisPlaces:
     """Where values of a state come that are rare and late, as from a laboratory."""
 
-    analysis_topic: str = _topic('Topic of rare values that come late, as of an analyser; empty: '
+    analysis_topic: str = _topic('Topic of late values, e.g. of a laboratory analyser; empty: '
                                  'none.')
     analysis_type: str = _topic('Message type of these values; empty: the usual type.')
     analysis_field: str = _topic('Message field that holds the value; empty: the usual field.')
@@ -112,7 +112,7 @@ class Signals:
     """
     The signals of a plant: names and units.
 
-    :raises ConfigurationError: for controlled signals that are no states, or too many.
+    :raises ConfigurationError: for controlled signals that are not states, or too many.
     """
 
     states: Mapping[str, str]  #: units of the measured states, by name
@@ -227,7 +227,7 @@ class SignalTopics:
     """
     The places of all signals.
 
-    :raises ConfigurationError: for a field that is no path in a message, or a missing topic.
+    :raises ConfigurationError: for a field that is not a path in a message, or a missing topic.
     """
 
     signals: Signals

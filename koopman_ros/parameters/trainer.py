@@ -208,8 +208,8 @@ class TrainerParameters:
         'inputs', 0.0, 'Delay between a command and its application, where that is not recorded.',
         's', 0.0, 3600.0)
     dead_time: Array = column(
-        'inputs', -1.0, 'Dead time between the applied input and its effect; -1: found from the '
-        'record.', 's', -1.0, 3600.0)
+        'inputs', -1.0, 'Dead time between the applied input and its effect; -1: estimated from '
+                        'the record.', 's', -1.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
@@ -402,12 +402,14 @@ class PlayerParameters:
         'run_1', 'Bag to play: a .mcap file or a bag folder; or a .csv of set-points with the '
         'columns time [s] and <signal> [unit].', read_only=True)
     setpoint_ramps: bool = parameter(
-        False, 'Ramps between the rows of a .csv, in place of steps.', read_only=True)
+        False, 'Ramp the set-points between the rows of a .csv, instead of stepping them.',
+        read_only=True)
     ramp_period: float = parameter(
         1.0, 'Time between two set-points of a ramp.', 's', 0.01, 3600.0, read_only=True)
     setpoint_lead: float = parameter(
-        0.0, 'Time by which set-points of a .csv are sent ahead, with the stamp from which they '
-        'hold, so that the law mpc knows them; 0: not ahead.', 's', 0.0, 3600.0, read_only=True)
+        0.0, 'Time by which set-points of a .csv are sent in advance, stamped with the time at '
+             'which they take effect, so that the law mpc prepares for them; 0: not in '
+             'advance.', 's', 0.0, 3600.0, read_only=True)
     system: str = parameter(
         DEFAULT_SYSTEM, 'Bundled plant whose topics are the defaults; any other name: no '
         'defaults.', read_only=True)

@@ -39,7 +39,7 @@ class Constants:
     """
     The base of a plant's class, whose constants are checked.
 
-    :raises ValueError: for a constant that is no number or outside its range.
+    :raises ValueError: for a constant that is not a number or outside its range.
     """
 
     def __post_init__(self) -> None:
@@ -144,7 +144,7 @@ def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:
 
     An unchanged default or end of a range is returned exactly.
 
-    :raises ValueError: for a name that is no constant of the plant.
+    :raises ValueError: for a name that is not a constant of the plant.
     """
     rows = {row.name: row for row in _rows(plant)}
     if unknown := values.keys() - rows.keys():

@@ -90,7 +90,7 @@ def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
     Integrate a state over one hold with the explicit Runge-Kutta pair DOP853.
 
     Why not LSODA: every input step is a kink after which a multistep method has to build up its
-    history again, so that over one second it is no quicker, and its error at the same tolerance
+    history again, so that over one second it is not quicker, and its error at the same tolerance
     is larger by orders of magnitude. The plants are not stiff within their bounds.
 
     :param start_time: time of its start, for the message of an error.

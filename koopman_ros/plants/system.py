@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.solvers import differences
-from koopman_ros.core.units import check_time_unit, check_unit, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import check_time_unit, named_units, SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
 
@@ -78,14 +78,10 @@ class ControlAffineSystem:
     def __post_init__(self) -> None:
         check_time_unit(self.time_unit)
         for kind in ('state', 'input'):
-            names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
-            object.__setattr__(self, f'{kind}_names', names)
-            object.__setattr__(self, f'{kind}_units', units)
-            for unit in units:
-                check_unit(unit)
-            if len(names) != len(units):
-                raise ValueError(f'incompatible {kind}_units: expected ({len(names)},), '
-                                 f'got ({len(units)},)')
+            for what, given in zip(('names', 'units'), named_units(
+                    kind, getattr(self, f'{kind}_names'), getattr(self, f'{kind}_units')),
+                    strict=True):
+                object.__setattr__(self, f'{kind}_{what}', given)
         if not self.state_names:
             raise ValueError('state_names is empty: a system needs at least one state')
         if not callable(self.B):
@@ -253,7 +249,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
 
     Newton's method from the nominal point, by least norm where values leave a choice.
 
-    :raises ValueError: for a name that is no state.
+    :raises ValueError: for a name that is not a state.
     :raises EquilibriumError: when no input holds them.
     """
     if unknown := wanted.keys() - set(system.state_names):

@@ -159,7 +159,7 @@ def _check_names(states: Sequence[SignalColumn], inputs: Sequence[SignalColumn],
     if twice := [name for name in every if every.count(name) > 1]:
         raise ValueError(f'{twice[0]} is named twice: give each signal once')
     if unknown := [name for name in linear if name not in every[len(states):]]:
-        raise ValueError(f'linear names {unknown[0]}, which is no input: name some of '
+        raise ValueError(f'linear names {unknown[0]}, which is not an input: choose from '
                          f'{", ".join(every[len(states):])}')
 
 
@@ -182,7 +182,7 @@ def _recorded_input(signal: SignalColumn) -> RecordedInput:
 
 def _unit_in_bag(signal: SignalColumn) -> str:
     if not signal.unit:
-        raise ValueError(f"{signal.name} has no unit, and bags have none: write '{signal.name} "
-                         "[m]', or 1 in the brackets for none")
+        raise ValueError(f"{signal.name} has no unit, and a bag stores none: write '{signal.name} "
+                         "[m]', or [1] if it is dimensionless")
     check_unit(signal.unit)
     return signal.unit

@@ -93,8 +93,8 @@ def table_of(source: Source) -> Any:
             raise ValueError(f'{source} is a MAT file of version 7.3, which SciPy does not read: '
                              "save it with '-v7'") from error
     what = f'a {type(source).__name__}' if not isinstance(source, str | os.PathLike) else source
-    raise ValueError(f'{what} is no record: give a .csv, .parquet, .mat or .mcap file, the folder '
-                     'of a bag, a DataFrame of pandas, or columns by name')
+    raise ValueError(f'{what} is not a record: give a .csv, .parquet, .mat or .mcap file, the '
+                     'folder of a bag, a DataFrame of pandas, or columns by name')
 
 
 def _columns(arrays: Mapping[str, Any]) -> Any:
@@ -130,7 +130,7 @@ def with_unit(table: Any, signal: SignalColumn, report: ImportReport) -> SignalC
         raise ValueError(f'the record has no column {signal.column!r}, it has {_headers(table)}: '
                          'name one of them')
     if not (signal.unit or found[1]):
-        report.note(f"{signal.name} has no unit, 1 is taken: write '{signal.name} [m]' for m")
+        report.note(f"{signal.name} has no unit, 1 is assumed: write '{signal.name} [m]' for m")
     return replace(signal, unit=signal.unit or found[1] or '1')
 
 
@@ -191,8 +191,8 @@ def _numbers_in_seconds(numbers: Any, unit: str, name: str) -> Array:
         return since / NANOSECONDS
     span = float(np.nanmax(since) - np.nanmin(since))
     if span >= _LONGEST or abs(float(first)) >= _LATEST:
-        raise ValueError(f'the times in {name!r} go from {first} to {first + span:.6g}, which can '
-                         f"be no seconds: give their unit, as in time='{name} [ns]'")
+        raise ValueError(f'the times in {name!r} go from {first} to {first + span:.6g}, which '
+                         f"cannot be seconds: give their unit, e.g. time='{name} [ns]'")
     return since
 
 
@@ -279,8 +279,8 @@ class TableImport:
         known = int(np.argmax((last >= 0).all(axis=1)))
         for j, signal in enumerate(self.inputs):
             if missing := int(np.sum(rows[known:, j] < 0)):
-                self.report.note(f'{self.label}: {signal.name} has no value in {missing} rows, '
-                                 'where the value before is held')
+                self.report.note(f'{self.label}: {signal.name} has no value in {missing} rows, in '
+                                 'which the previous value is held')
         return np.take_along_axis(u, np.maximum(last, 0), axis=0), known
 
     def _ends(self, seconds: Array, x: Array, jump: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -80,12 +80,12 @@ class StatusContext:
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
     request: str  #: why the operator's last request was refused or limited, or empty
-    model_rejected: str  #: why the last model, or that in force, was refused; or empty
-    model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
+    model_rejected: str  #: why the last model, or the current one, was refused; or empty
+    model: Callable[[], Mapping[str, object]]  #: gives figures of the current model
 
     @property
     def reason(self) -> str:
-        """Reason of the present level, or empty."""
+        """Reason of the current level, or empty."""
         return words_of(self.signals)(self.report.reason)
 
     @property
@@ -349,7 +349,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'predicted growth per sample': float(law.growth),
         **labelled(inputs, 'transfer', transfer, difference=True),
         **labelled(dict.fromkeys(inputs, 's'), 'dead time', dead_times),
-        'inputs before the start act for [s]': now.controller.estimation.assumed(state),
+        'effect of inputs before the start ends in [s]': now.controller.estimation.assumed(state),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,

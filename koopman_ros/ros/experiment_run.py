@@ -69,7 +69,7 @@ class ExperimentRun:
 
     :param commanded: last command of the inputs, by name, as far as it is known.
     :param on_end: called when the steps are over, with the reason when it must command no more.
-    :raises ValueError: for bounds that are no plan.
+    :raises ValueError: for bounds that exclude a plan.
     """
 
     def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: SignalTopics,

@@ -18,7 +18,7 @@ from koopman_ros.parameters.trainer import trainer_signals, trainer_table
 from koopman_ros.ros.managed import one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import init
-from koopman_ros.ros.training import POLL_PERIOD, present_lift, task_fields
+from koopman_ros.ros.training import current_model, POLL_PERIOD, task_fields
 
 
 def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
@@ -66,7 +66,7 @@ def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
                     enable_rosout=False)
     try:
         given = node.given()
-        present = present_lift(given)
+        present = current_model(given)
         settings = node.declare_table(trainer_table(present, given))
         bags = list(filter(None, settings.bags))
         if not bags:

@@ -38,6 +38,6 @@ class LatchFile:
                 self._path.unlink(missing_ok=True)
         except OSError as error:
             self._log.error(
-                f'the latched safe state would {"not " if latched else ""}outlast a restart: '
-                f'{self._path} cannot be {"written" if latched else "removed"} ({error}): check '
-                'its folder, or set ROS_HOME to a writable one')
+                f'{self._path} cannot be {"written" if latched else "removed"} ({error}), so '
+                f'after a restart the safe state will {"not " if latched else ""}be latched: '
+                'check its folder, or set ROS_HOME to a writable one')

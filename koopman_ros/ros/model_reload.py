@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reload of a controller's model: read and tried in a thread, put in force between two samples."""
+"""Reload of a controller's model: read and tried in a thread, activated between two samples."""
 
 from collections.abc import Callable, Collection
 import contextlib
@@ -83,7 +83,7 @@ class ModelReload:
     set` can print why it was rejected. A read from a disk that does not answer cannot be ended: no
     file is read twice at once, and few files together.
 
-    :param reloaded: called in the executor when the service has put another model in force.
+    :param reloaded: called in the executor when the service has activated another model.
     :param refused: called there when a model was refused.
     """
 
@@ -100,7 +100,7 @@ class ModelReload:
 
     async def on_reload(self, _: Trigger.Request, response: Trigger.Response
                         ) -> Trigger.Response:
-        """Read the file of the model in force again, for the service."""
+        """Read the file of the current model again, for the service."""
         name = self.in_force.name
         trial = self._start(name, self._situation())
         patience = threading.Timer(_LONG_WAIT, trial.end, [
@@ -147,23 +147,22 @@ class ModelReload:
         return self._refuse(outcome)
 
     def take_over(self) -> bool:
-        """Put the model that was accepted with the last change of parameters in force, if any."""
+        """Activate the model that was accepted with the last change of parameters, if any."""
         accepted, self._accepted = self._accepted, None
         if accepted is not None:
             self._swap(accepted)
         return accepted is not None
 
     def end(self) -> None:
-        """Put no model in force any more, not even one that is being read."""
+        """Activate no model any more, not even one that is being read."""
         self._ended = True
 
     @property
     def complaint(self) -> str:
-        """Why the last model was refused, or why training refused the one in force; or ''."""
+        """Why the last model was refused, or why training refused the current one; or ''."""
         about = self.in_force.model.provenance
         return self.refused or ('' if about.accepted is not False else (
-            f'model {self.in_force.name} is in force though it was {about.acceptance}: train it '
-            'again'))
+            f'the current model {self.in_force.name} was {about.acceptance}: train it again'))
 
     def figures(self) -> dict[str, object]:
         """Return the diagnostics of the current model."""

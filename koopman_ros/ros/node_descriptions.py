@@ -93,7 +93,7 @@ def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
 
 
 _NAMES = ('plant', 'controller', 'trainer', 'player', 'replay', 'panel')
-_HOSTS = 'it runs one node in each'
+_HOSTS = 'runs one node in each'
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
             subscribes=(*dict.fromkeys((*wiring.topics, *recorded)), topics.CLOCK),
             serves=('~/record', '~/experiment', '~/train', '~/cancel_training', *lifecycle,
                     *STANDARD_SERVICES),
-            many='it trains the plant of each from its bags, and exits'),
+            many='trains the plant of each from its bags, then exits'),
         'player': Program(
             'Plays the measurements and set-points of a bag, in recorded time or in lock-step '
             'with a controller.',
@@ -262,8 +262,8 @@ def help_text(name: str, given: Mapping[str, Any] = MappingProxyType({})) -> str
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
     called = f'{name} [--loops file]' if program.many else name
     many = '\n' + _filled(
-        f'With --loops, a file of namespaces, one a line, {program.many}. Parameters are given by '
-        f'the full name of a node, e.g. /line_1/reactor_3/{name}.', '') + '\n'
+        f'--loops reads a file with one namespace per line, and {program.many}. Parameters are '
+        f'given by the full name of a node, e.g. /line_1/reactor_3/{name}.', '') + '\n'
     other = '' if name == 'replay' else (
         f'For another system: {name} --help --ros-args -p system:=NAME\n')
     parameters = '\n'.join(_help_row(row) for row in table.rows.values())

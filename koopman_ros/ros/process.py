@@ -17,6 +17,7 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from koopman_ros import __version__
 from koopman_ros.core.paths import LOOPBACK_PROFILE
 from koopman_ros.process_entry import force_exit_after, handle_signals
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
@@ -159,7 +160,10 @@ def _given(args: list[str] | None) -> dict[str, str]:
 
 
 def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None:
-    """Print the help, or refuse an unknown argument; return an exit code, or None to start."""
+    """Print help or version, or refuse an argument; return an exit code, or None to start."""
+    if '--version' in (sys.argv if args is None else args):
+        print(__version__, flush=True)
+        return 0
     if {'--help', '-h'} & {*(sys.argv if args is None else args)}:
         # the tables of all nodes
         from koopman_ros.ros.node_descriptions import help_text

@@ -64,7 +64,7 @@ class Recorder:
     Messages are logged at their receipt by the node's clock. Where `use_sim_time` is set, that is
     the last /clock received before, and recording begins with the first one, as that of
     `ros2 bag record --use-sim-time`. Where it is not set and /clock is published, /clock is
-    recorded too as soon as a message without a stamp is expected: its receipt is no plant time.
+    recorded too as soon as a message without a stamp is expected: its receipt is not plant time.
 
     Messages wait in the middleware until :meth:`take`. Any method raises OSError where the bag
     cannot be written, and LookupError where the definition of a type is not installed.

@@ -66,7 +66,7 @@ class Timing:
         return found
 
     def ignore(self, at: tuple[float, int, int], why: Advance = Advance.OLD) -> None:
-        """Take down that a measurement, or a part of one, came and is no news."""
+        """Take down that a measurement, or a part of one, came and is not new."""
         self._ignored = (*at[:2], why)
 
     def note(self, stamp_ns: int, at: tuple[float, int, int]) -> None:

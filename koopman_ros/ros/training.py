@@ -32,7 +32,7 @@ from koopman_ros.ros.node import LoopNode
 POLL_PERIOD = 0.1  # s between two looks at a training
 
 
-def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
+def current_model(given: Mapping[str, Any]) -> LiftedModel | None:
     """Return the lift in use by parameters that were given, None where there is none yet."""
     own = plant_defaults(system_of(given), 'trainer')
     name = str(given.get('model', own.get('model', '')))
@@ -162,8 +162,9 @@ class Training:
         if state is None:
             return TaskReport(Severity.OK, 'not training')
         values = {'done [%]': 100.0 * state.share, **scalars(state.summary or {})}
-        if not state.ended or state.accepted:
+        if not state.ended:
             # the sentence stays while the figures move, or there would be a status a step
-            text = state.text if state.ended else state.text.split(',')[0]
-            return TaskReport(Severity.OK, text, {**values, 'step': state.text})
-        return TaskReport(Severity.WARN if state.refused else Severity.ERROR, state.text, values)
+            return TaskReport(Severity.OK, state.text.split(',')[0],
+                              {**values, 'step': state.text})
+        return TaskReport(Severity.OK if state.accepted else Severity.WARN if state.refused else
+                          Severity.ERROR, state.text, values)

@@ -23,11 +23,11 @@ QUICK = ('nan-short', 'measurements-lost', 'clock-zero', 'controller-killed', 'b
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the cases asked for and the endurance run; return 1 where one was not survived."""
+    """Run the selected cases and the endurance run; return 1 if one was not survived."""
     groups = dict.fromkeys([*PLANTS, *(case.group for case in CASES.values())])
     parser = argparse.ArgumentParser(
         prog='python -m studies.faults',
-        description='Put faults into the loop and judge what it does.')
+        description='Inject faults into the loop, and judge its reaction.')
     parser.add_argument('names', nargs='*', metavar='name',
                         help=f'a case, a plant or group ({", ".join(groups)}), or '
                              f'{", ".join(DAYS)} (default: all)')
@@ -67,7 +67,7 @@ def _run(cases: Sequence[FaultCase], days: Sequence[str], hours: float, folder: 
                 endured[name] = run_endurance(folder / 'logs' / name, check, hours, DAYS[name])
                 print('\n'.join(endured[name]['reasons']) or 'survived')
     except KeyboardInterrupt:
-        print(f'\ninterrupted; what was finished is in {folder}', file=sys.stderr)
+        print(f'\ninterrupted; the finished cases are in {folder}', file=sys.stderr)
         return 130
     survived = report.write(folder, results, endured, traces)
     print(f'\n{sum(result["survived"] for result in results.values())} of {len(results)} cases '

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A case of the campaign, and what was seen of it while it ran: plain figures, without ROS."""
+"""A case of the campaign and its observations while it ran: plain figures, without ROS."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FaultCase:
-    """A fault, and what the loop is to make of it; values are in the units of the messages."""
+    """A fault and the expected reaction of the loop; values are in the units of the messages."""
 
     group: str  #: heading in the report
     name: str  #: by which it is called on the command line
-    does: str  #: what is done, for the report
+    does: str  #: the fault in words, for the report
     #: does it; the runner has let the loop settle before, and lets it recover afterwards
     play: Callable[[FaultHarness], None]
 
     between: bool = False  #: whether messages are altered
-    on: FaultPlant = REACTOR  #: what the loop controls
+    on: FaultPlant = REACTOR  #: plant of the loop
     plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)  #: parameters
     controller: Mapping[str, object] = field(default_factory=dict)  #: parameters
     setpoint: tuple[float, ...] = REACTOR.setpoint  #: requested at the start
@@ -97,11 +97,11 @@ class LoopTrace:
     records: list[tuple[float, str]] = field(default_factory=list)
     begin: float = math.inf  #: when the fault began
     end: float = math.inf  #: when the fault was over, or had been put in where it stays
-    complaints: list[str] = field(default_factory=list)  #: what went wrong, in sentences
+    complaints: list[str] = field(default_factory=list)  #: failures, in sentences
     notes: list[str] = field(default_factory=list)  #: figures worth a line in the report
 
     def reported(self) -> list[str]:
-        """Return what diagnostics reported from the fault on: ``<node>: <task>: <sentence>``."""
+        """Return the diagnostics from the fault on: ``<node>: <task>: <sentence>``."""
         return [f'{status.name}: {status.message}' for status in self.statuses
                 if status.seconds >= self.begin]
 
@@ -113,7 +113,7 @@ class LoopTrace:
         """
         Return the times (N - 1,) of the commands after the first and their largest steps.
 
-        A step is that of an input from the command before, or from what was measured of it,
+        A step is that of an input from the previous command, or from its measurement,
         whichever is less: when messages are lost it is not the one, and when the controller is a
         new one it need not be the other.
         """

@@ -58,7 +58,7 @@ def _shows(shown: float) -> Maker:
 
 
 def _shifted(shift: Callable[[float], float]) -> Maker:
-    """Make a sensor that is wrong by so much after so many seconds."""
+    """Make a sensor with this error after these seconds."""
     return lambda: value(lambda seconds, measured: measured + shift(seconds))
 
 
@@ -149,7 +149,7 @@ _MESSAGES = (
            plant={**LOCKSTEP, 'start_time': 10_000.0}),
     _clock('clock-far', 'stamps jump 60 years ahead, and then back', _stamps(1_900_000_000), 60.0),
     _clock('clock-zero', 'stamps are zero', lambda: stamped(lambda _: 0), 30.0),
-    _clock('clock-stopped', 'stamps stand still', partial(frozen, 'stamp_ns'), 30.0,
+    _clock('clock-stopped', 'stamps do not advance', partial(frozen, 'stamp_ns'), 30.0,
            says=('^controller: control: .*does not advance',)),
     _clock('clock-jitter', 'stamps are up to 0.4 s wrong', lambda: stamped(_jittered), 120.0),
     _clock('clock-twins', 'two measurements with each stamp', _twins(0.01), 60.0),
@@ -326,7 +326,7 @@ def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
     yield every('lost', '30 % lost', lambda: lost(0.3), long, 'messages')
     yield every('commands-lost', '30 % of the commands lost', lambda: lost(0.3), long,
                 'messages', 'commands')
-    yield every('clock-stopped', 'stamps stand still', partial(frozen, 'stamp_ns'))
+    yield every('clock-stopped', 'stamps do not advance', partial(frozen, 'stamp_ns'))
     yield every('clock-back', 'stamps jump an hour back, and then ahead', _stamps(-3600), long,
                 plant={**LOCKSTEP, 'start_time': 10_000.0})
     yield every('clock-forward', 'stamps jump an hour ahead, and then back', _stamps(3600), long)
@@ -350,7 +350,7 @@ def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
         yield case(f'setpoints-{name}', f'set-points at 1 kHz: {does}',
                    partial(operators.storm_of_setpoints, asked=tuple(asked)), code=code)
     # the outflow below cannot be less than the inflow from above
-    yield case('not-held', 'a set-point that no flow can hold beside the other',
+    yield case('not-held', 'a set-point that no flow can hold together with the other',
                operators.not_held, code=StatusCode.SETPOINT_NOT_HELD)
     yield case('mode-once', 'manual mode for 20 samples, and back, without a bump', partial(
         operators.mode_once, seconds=20.0 * on.period), bump=_TANK_BUMP)
@@ -459,7 +459,7 @@ def _silent(on: FaultPlant) -> Iterator[FaultCase]:
                    altered, make=_shows(math.nan), seconds=4.0), between=True,
                controller=_SHORT_HOLD, worst=_NEAR[on.name])
     yield case('sensor', 'unmeasured', 'no measurement and no watch over it, while an operator '
-               'asks for a set-point, and then for inputs by hand', silence.unmeasured,
+               'requests a set-point, and then commands inputs manually', silence.unmeasured,
                **{**fast, 'controller': {**_BY_CLOCK, 'measurement_timeout': 0.0}})
     case = partial(_on, on, 'processes')
     yield case('activated-again', 'deactivated and activated in manual mode, the inputs not '
@@ -501,7 +501,7 @@ _SILENCE = (
     *_silent(REACTOR), *_silent(TWO_TANKS), _ahead(TWO_TANKS),
     # one of its sensors has a topic of its own
     _ahead(replace(QUADRUPLE_TANK, wired={**QUADRUPLE_TANK.wired, 'level_4.topic': 'level_4'})),
-    _on(REACTOR, 'clocks', 'seconds-stopped', 'the seconds of the stamps stand still, their '
+    _on(REACTOR, 'clocks', 'seconds-stopped', 'the seconds of the stamps do not advance, their '
         'nanoseconds go on, 150 s', partial(silence.without_news,
                                             make=partial(silence.cycle, 1, 1.0)),
         plant={**_FAST, 'sample_period': 0.3}, controller=_BY_CLOCK, between=True,

@@ -37,7 +37,7 @@ _RECORDED = ('temperature', 'coolant_setpoint')
 
 @dataclass(frozen=True)
 class Day:
-    """What is run, and between what its set-points and constants are drawn."""
+    """The loops of the run, and the ranges of their set-points and constants."""
 
     on: FaultPlant
     setpoints: tuple[float, float]
@@ -62,7 +62,7 @@ DAYS = {
 
 
 def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None:
-    """Do what may happen in a day: each ends by itself."""
+    """Events that may happen in a day: each ends without help."""
     what, _, alteration = event.partition(': ')
     match event:
         case 'set-point':
@@ -109,7 +109,7 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS,
     """
     Run plant, controller and trainer for some hours of plant time, and account for everything.
 
-    :param folder: for the bag, which is deleted afterwards, and for what the processes print.
+    :param folder: for the bag, which is deleted afterwards, and for the output of the processes.
     :param check: called all the time; may raise to end it.
     :return: figures by name, among them the `reasons` held against it, in sentences.
     """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plant and controller as real processes, to put faults into, with an operator beside them."""
+"""Plant and controller as real processes for fault injection, with an operator."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def run(case: FaultCase, folder: Path, check: Callable[[], None] = lambda: None
     """
     Run a case in a domain of its own and judge it.
 
-    :param folder: for what the processes print.
+    :param folder: for the output of the processes.
     :param check: called all the time; may raise to end the case, whose processes end then, too.
-    :return: figures by name, as of :func:`judge`, or why it was `skipped`; and what happened.
+    :return: figures by name, as of :func:`judge`, or why it was `skipped`; and the observations.
     """
     started = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ class FaultHarness:
     :param limit: wall time of the case, s.
     :param check: called at every turn; may raise to end the case.
     :param between: whether the interceptor stands between plant and controller.
-    :param on: what the loop controls.
+    :param on: plant of the loop.
 
     :ivar ros: the processes' harness, whose node is the operator's.
     :ivar interceptor: traces the messages between plant and controller, and alters them.
@@ -172,7 +172,7 @@ class FaultHarness:
 
     def _publishers(self, places: Mapping[str, MessageField]
                     ) -> dict[str, Callable[[float], None]]:
-        """Return what publishes a value of each signal."""
+        """Return a function that publishes a value of each signal."""
         made: dict[str, Callable[[float], None]] = {}
         for topic, kind, names in by_topic(places):
             publisher = self.ros.node.create_publisher(kind, topic, topics.LOOP_QOS)
@@ -190,7 +190,7 @@ class FaultHarness:
         self.ros.meet('controller')
         for publisher in self._spoken:
             self.wait(publisher.get_subscription_count,
-                      f'nobody subscribes to {publisher.topic_name}')
+                      f'no node subscribes to {publisher.topic_name}')
 
     def ask(self, **values: float) -> None:
         """Ask for set-points by signal, which the trace is not to hold."""
@@ -248,7 +248,7 @@ class FaultHarness:
 
     def wait(self, done: Callable[[], T], complaint: str) -> T:
         """
-        Wait until a condition holds and return what it returned.
+        Wait until a condition holds and return its value.
 
         :raises HarnessError: when it never does, or a process ends by itself.
         """
@@ -290,7 +290,7 @@ class FaultHarness:
             self.trace.complaints.append(complaint)
 
     def wait_for_report(self, *patterns: str) -> None:
-        """Wait until diagnostics have reported what matches each pattern since the fault began."""
+        """Wait until diagnostics have reported a match of each pattern since the fault began."""
         for pattern in patterns:
             self.wait(lambda pattern=pattern: any(  # type: ignore[misc]
                 re.search(pattern, text) for text in self.trace.reported()),

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What lies between plant and controller: traces messages, and alters them where asked to.
+The connection of plant and controller: traces messages, and alters them on request.
 
-An alteration turns one packet into none or more; one with a memory is made anew for each case.
+An alteration turns one packet into none or more; one with a memory is built again for each case.
 """
 
 from collections import deque
@@ -35,7 +35,7 @@ _BEHIND = 'plant/'  # before the topics of a plant whose messages are altered
 
 
 def remapped(on: FaultPlant) -> tuple[str, ...]:
-    """Return what a plant is started with when messages are altered."""
+    """Return the parameters of a plant whose messages are altered."""
     topics_ = dict.fromkeys(place.topic for place in (
         *on.wiring.measured.values(), *on.wiring.commands.values()))
     return tuple(word for topic in topics_ for word in ('-r', f'{topic}:={_BEHIND}{topic}'))
@@ -57,7 +57,7 @@ def unchanged(packet: Packet) -> list[Packet]:
 
 
 def part(alter: Alteration, *names: str) -> Alteration:
-    """Alter what a packet says of some signals; the rest passes."""
+    """Alter the values of some signals in a packet; the others pass."""
     def altered(packet: Packet) -> list[Packet]:
         own, rest = ({name: value for name, value in packet.values.items()
                       if (name in names) is wanted} for wanted in (True, False))
@@ -132,7 +132,7 @@ def swapped() -> Alteration:
 
 
 def delayed(messages: int) -> Alteration:
-    """Deliver each message when so many later ones were sent."""
+    """Deliver each message after this number of later ones."""
     waiting: deque[Packet] = deque()
 
     def alter(packet: Packet) -> list[Packet]:
@@ -144,15 +144,15 @@ def delayed(messages: int) -> Alteration:
 
 class Interceptor:
     """
-    A trace of what plant and controller publish.
+    A trace of the messages of plant and controller.
 
     Where it stands between them it is the actuator, too, which holds its last command when none
     arrives: so lock-step goes on whatever is lost.
 
     :param between: whether all messages between plant and controller pass through it.
 
-    :ivar measurements: what is done to measurements on their way to the controller.
-    :ivar commands: what is done to commands on their way to the plant.
+    :ivar measurements: alteration of measurements on their way to the controller.
+    :ivar commands: alteration of commands on their way to the plant.
     """
 
     def __init__(self, node: Node, on: FaultPlant, between: bool) -> None:
@@ -199,7 +199,7 @@ class Interceptor:
 
     def _publishers(self, places: Mapping[str, MessageField], before: str = ''
                     ) -> Callable[[Packet], None]:
-        """Return what publishes a packet, what it says of one topic in one message."""
+        """Return a function that publishes a packet, the values of one topic in one message."""
         parts = [(self._node.create_publisher(kind, f'{before}{topic}', topics.LOOP_QOS), kind,
                   names) for topic, kind, names in by_topic(places)]
 

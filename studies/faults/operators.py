@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the campaign does to messages on their way, and what operators do, as fast as it goes."""
+"""Alterations of messages by the campaign, and actions of operators, without delays."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -45,7 +45,7 @@ def altered(loop: FaultHarness, make: Maker, seconds: float, setpoint: tuple[flo
 
 
 def biased(loop: FaultHarness) -> None:
-    """Nobody can correct a biased sensor, but an operator can be told."""
+    """No controller can correct a biased sensor, but diagnostics can report it."""
     with loop.fault():
         loop.interceptor.measurements = value(lambda _, measured: measured + 2.0)
         loop.run_for(300.0)
@@ -147,7 +147,7 @@ def storm_of_modes(loop: FaultHarness) -> None:
 
 
 def mode_once(loop: FaultHarness, seconds: float = 60.0) -> None:
-    """Take over by hand for a while, without a command."""
+    """Switch to manual mode for a while, without a command."""
     with loop.fault():
         loop.ros.set_bool('controller/set_automatic', False)
         loop.run_for(seconds)
@@ -184,7 +184,7 @@ def stepped(loop: FaultHarness) -> None:
 
 
 def out_of_reach(loop: FaultHarness) -> None:
-    """Ask for what the model was never trained for; the set-point of before stays."""
+    """Request a set-point outside the trained range; the previous one stays."""
     with loop.fault():
         loop.ask(temperature=120.0)
         loop.wait_for_report('request refused')
@@ -212,7 +212,7 @@ def limited(loop: FaultHarness) -> None:
 
 
 def not_held(loop: FaultHarness) -> None:
-    """Ask for what the inputs cannot hold; the set-points of before stay."""
+    """Request set-points that the inputs cannot hold; the previous ones stay."""
     with loop.fault():
         loop.ask(**loop.on.never)
         loop.wait_for_report('cannot be held')

@@ -44,11 +44,11 @@ class FaultPlant:
     #: a set-point that no input can hold beside the others
     never: Mapping[str, float] = field(default_factory=dict)
     highest: float = math.inf  #: of the controlled states, from which on it is lost
-    kind: str = ''  #: what plant and controller are told that they are; its name by default
+    kind: str = ''  #: `system` of plant and controller; its name by default
 
     @property
     def system(self) -> str:
-        """What plant and controller are told that they are."""
+        """The parameter `system` of plant and controller."""
         return self.kind or self.name
 
     @cached_property
@@ -58,7 +58,7 @@ class FaultPlant:
 
     @cached_property
     def parameters(self) -> ControllerParameters:
-        """What its controllers are started with."""
+        """Parameters of its controllers at start."""
         return self.table.snapshot({**self.wired, **self.tuned})
 
     def each_input(self, name: str) -> list[float]:
@@ -94,12 +94,12 @@ class FaultPlant:
 
     @property
     def unit(self) -> str:
-        """Of the controlled states, to be read behind a difference: a kelvin is no degree."""
+        """Of the controlled states, to be read behind a difference: a kelvin is not a degree."""
         return self.wiring.signals.states[self.controlled[0]]
 
     @property
     def input_unit(self) -> str:
-        """Of the inputs, likewise."""
+        """The same of the inputs."""
         return self.wiring.signals.inputs[self.inputs[0]]
 
     @property
@@ -122,7 +122,7 @@ class FaultPlant:
         return self.default(f'{name}.min'), self.default(f'{name}.max')
 
     def default(self, parameter: str) -> Any:
-        """Return what a parameter of its controllers is when nobody has changed it."""
+        """Return the unchanged value of a parameter of its controllers."""
         return self.tuned.get(parameter, self.table.rows[parameter].default)
 
 

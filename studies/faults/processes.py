@@ -181,7 +181,7 @@ def second_plant(loop: FaultHarness, says: tuple[str, ...] = TWO_PLANTS) -> None
 
 
 def flood(seconds: float, count: int) -> None:
-    """Come and go with so many participants at once, and print how many there were."""
+    """Create and remove this number of participants at once, and print their number."""
     end, come = time.monotonic() + seconds, 0
     while time.monotonic() < end:
         present = []

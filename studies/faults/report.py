@@ -68,7 +68,8 @@ def _sections(figures: dict[str, Any]) -> Iterator[str]:
            f'{by_plant(results)}. Plant and controller are real processes; times are plant time.')
     yield ('A case is survived if every command was finite, within its range and without a bump, '
            'the plant was not lost and came back to its set-points in time, diagnostics reported '
-           'the fault, the commands follow from the records to the bit, and no process failed.')
+           'the fault, the commands are reproduced from the records bit-identically, and no '
+           'process failed.')
     on = [plant for plant in PLANTS.values()
           if plant.name in {result['plant'] for result in results.values()}]
     yield plots.table(

@@ -120,7 +120,7 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
 
 
 def activated_again(loop: FaultHarness) -> None:
-    """Deactivate and activate a controller that commands lower inputs by hand."""
+    """Deactivate and activate a controller that commands lower inputs in manual mode."""
     loop.ros.set_bool('controller/set_automatic', False)
     wanted = tuple(0.5 * (loop.on.range(name)[0] + last) for name, last in zip(
         loop.on.inputs, loop.trace.commands[-1].values, strict=True))
@@ -186,7 +186,7 @@ def cleaned_up(loop: FaultHarness) -> None:
 
 
 def no_plug_in(loop: FaultHarness) -> None:
-    """Name what is no law and no estimator, and what ends a process, while the loop runs."""
+    """Name objects that are not laws or estimators, or that end a process, while the loop runs."""
     with loop.fault():
         for change in _NO_PLUG_INS:
             refused = loop.set_parameters('controller', **change)
@@ -216,7 +216,7 @@ def hosted(loop: FaultHarness) -> None:
 # Silence.
 
 def unmeasured(loop: FaultHarness) -> None:
-    """Request a set-point, then command by hand, while a sensor reports nothing."""
+    """Request a set-point, then command manually, while a sensor reports nothing."""
     def commands_from(before: int) -> list[tuple[float, ...]]:
         return [command.values for command in loop.trace.commands[before:]]
 
@@ -277,7 +277,7 @@ def demo(loop: FaultHarness) -> None:
         loop.wait(lambda: not process.running or time.monotonic() > deadline, '')
         code = process.stop(signal.SIGINT)
         printed = process.output()
-        loop.expect(code not in (0, -signal.SIGINT), f'the demo ran beside the loop: {code}')
+        loop.expect(code not in (0, -signal.SIGINT), f'the demo ran next to the loop: {code}')
         loop.expect(domain in printed, f'the demo does not print the domain {domain}: {printed}')
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the linear coordinates of a lift add to its drift, and what classes do in harder cases."""
+"""The benefit of the linear coordinates of a lift, and model classes in harder cases."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -171,7 +171,7 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
 
 def _used(name: str, model: LiftedModel, held_out: DriftSamples, outside: DriftSamples, lift: bool,
           starts: int) -> Metrics:
-    """Judge a model of good data by what it is used for."""
+    """Judge a model of good data by its use."""
     case = CASES[name]
     error = rollout_rmse(model, held_out)
     found: Metrics = {

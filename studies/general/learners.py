@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Classes of models that are set beside each other; to add one, name it in LEARNERS or RECIPES."""
+"""Model classes to compare; to add one, name it in LEARNERS or RECIPES."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,11 +18,11 @@ from koopman_ros.model import Box, LiftedModel, PolynomialObservables
 
 @dataclass(frozen=True)
 class Learned:
-    """A model and what learning it took."""
+    """A model and the cost of its training."""
 
     model: LiftedModel
     seconds: float  #: of the processor, of a training that decides by itself
-    refused: str | None = None  #: why it was refused, '' where it was not; None for what never is
+    refused: str | None = None  #: why it was refused, or ''; None for a class that never is
 
 
 Learner: TypeAlias = Callable[[PlantDescription, DriftSamples, int], Learned]

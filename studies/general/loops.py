@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a law costs on the true plant, beside laws that know the plant and beside the least."""
+"""Cost of a law on the true plant, relative to laws that know the plant and to the least."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class LoopEnd:
 
 @dataclass(frozen=True)
 class Known:
-    """What laws that know the plant get, by start."""
+    """Results of laws that know the plant, by start."""
 
     lqr: tuple[LoopEnd, ...]  #: with the linear-quadratic gain of the nominal state
     #: with that of the true drift as :meth:`Regulation.factorised` factorises it
@@ -53,7 +53,7 @@ class Known:
 
 @cache
 def known(name: str, starts: int) -> Known:
-    """Find what there is to compare with: the same for all seeds and models of a case."""
+    """Return the reference results: the same for all seeds and models of a case."""
     case = CASES[name]
 
     def natural(model: LiftedModel, x: Array, target: Target, weights: Weights) -> Feedback:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Each case from a seed: models of all classes, what they predict and what their laws cost."""
+"""Each case from a seed: models of all classes, their predictions and the costs of their laws."""
 
 from functools import partial
 

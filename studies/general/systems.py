@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plants that the law is held to: their equations, where they start and what excites them."""
+"""Plants of the study: their equations, initial states and excitation."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

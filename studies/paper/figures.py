@@ -143,7 +143,7 @@ def _both_derivatives(where: str, campaign: Campaign, path: Path) -> str:
 
 def _control(campaign: Campaign, path: Path, label: str, learned: LiftedModel
              ) -> tuple[ClosedLoop, ...]:
-    """Draw the control by a learned lift beside those by linearisation and exact lift."""
+    """Draw the control by a learned lift, by linearisation and by the exact lift."""
     linear = _model(campaign, 'two_state', 'linear')
     loops = _loop(linear), two_state.exact_loop(1.0), _loop(learned)
     with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
@@ -245,8 +245,8 @@ def _boxes_of(where: tuple[str, ...], campaign: Campaign, path: Path) -> str:
                   for name in where])
     left = ', '.join(f'that of the {name} box by {max(0.0, loops[name].distance(model)):.2g}'
                      for name, (_, model) in lifts.items())
-    return ('Training boxes and the paths of the controlled system, which leave them by up to so '
-            f'many half-ranges: {left}.')
+    return ('Training boxes and the paths of the controlled system, which leave them by up to '
+            f'these half-ranges: {left}.')
 
 
 def _sensors(campaign: Campaign, path: Path) -> str:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is known exactly of the plants under control, to measure learned controllers by."""
+"""Exact results for the controlled plants, as references for learned controllers."""
 
 import numpy as np
 from scipy.integrate import quad

@@ -53,7 +53,7 @@ def training_samples(seed: int) -> DriftSamples:
 
 def random_steps_of(design: RandomStepDesign, episodes: int, duration: float, seed: int
                     ) -> DriftSamples:
-    """Simulate random coolant steps from T_ss, each episode of so many min, with rates."""
+    """Simulate random coolant steps from T_ss, with episodes of this length in min, and rates."""
     return sample_derivatives(SYSTEM, [
         random_steps(SYSTEM, design, duration, seed + number) for number in range(episodes)])
 
@@ -109,7 +109,7 @@ def judged(model: LiftedModel, held_out: DriftSamples, inside: DriftSamples,
 
 def run(seed: int) -> tuple[Metrics, Models]:
     """
-    Grow lifts of 2 to 5 coordinates and set them beside the baselines.
+    Grow lifts of 2 to 5 coordinates and compare them with the baselines.
 
     :return: figures named ``nz=<n>/<figure>``, ``linear/<figure>`` and ``edmd/<figure>``.
     """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lifts from what a sensor sees: sampled, noisy, of a plant that drifted, of half the state."""
+"""Lifts of sensor data: sampled, noisy, of a plant that drifted, of half the state."""
 
 from dataclasses import replace
 

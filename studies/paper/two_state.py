@@ -72,7 +72,7 @@ def _law(model: LiftedModel, x: Array, target: Target, weights: Weights) -> Feed
 
 def close_loop(model: LiftedModel, R: float, law: Callable[..., Feedback] = _law) -> ClosedLoop:
     """
-    Regulate the true system from (5, 5) to the origin, by the paper's law unless told otherwise.
+    Regulate the true system from (5, 5) to the origin, by the paper's law by default.
 
     The cost is the integral of x1^2 + x2^2 + R u^2.
     """

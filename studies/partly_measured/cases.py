@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The plants, what is measured of them, and what every controller is asked to do with them."""
+"""The plants, their measurements, and the task of every controller."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -43,7 +43,7 @@ class PartialCase:
     begin: dict[str, float]  #: where some states rest, and are to rest, before the step
     setpoint: dict[str, float]  #: where they are to go, in the model's order
     reached: float  #: offset from which a run counts as lost, in the unit of the last set-point
-    load: Array  #: (n_u,) what is added to the inputs in the end, which nobody is told
+    load: Array  #: (n_u,) unknown offset of the inputs in the end
     stepped_at: float  #: when the set-point steps, in s
     loaded_at: float  #: when the load begins, in s
     duration: float  #: of it all, in s
@@ -85,7 +85,7 @@ class PartialCase:
 
     @cached_property
     def outputs(self) -> Outputs:
-        """What is measured."""
+        """The measured outputs."""
         return Outputs(self.measured, tuple(self.system.state_units[i] for i in self.rows),
                        np.eye(self.system.n_x)[self.rows])
 
@@ -122,7 +122,7 @@ class PartialCase:
 
     @cached_property
     def cost_to_go(self) -> Array:
-        """What (n_x, n_x) the sampled regulator costs from a deviation about the set-point on."""
+        """Cost matrix (n_x, n_x) of the sampled regulator about the set-point."""
         x, u = self.goal(self.system)
         return solve_riccati(
             self.system.slope(x, u), self.system.input_matrix(x), np.diag(self.Q),
@@ -137,7 +137,7 @@ class PartialCase:
                     round((self.loaded_at - self.stepped_at) / self.period), 10)
 
     def tuning(self, model: LiftedModel, **others: Any) -> Tuning:
-        """Return what a controller of this package is tuned by; `others` replace that by name."""
+        """Return the tuning of a controller of this package; `others` replace values by name."""
         return Tuning.for_model(model, **{
             'state_weight': self.Q, 'input_weight': self.R, 'limits': self.limits,
             'controlled': tuple(self.setpoint), 'bumpless_transfer_time': 0.0,

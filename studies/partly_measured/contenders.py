@@ -22,7 +22,7 @@ _ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
 
 
 class Contender(Protocol):
-    """What answers a measurement of a case."""
+    """A controller that answers the measurements of a case."""
 
     def step(self, y: Array, setpoint: Array) -> Array:
         """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""

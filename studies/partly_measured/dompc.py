@@ -87,7 +87,7 @@ class DoMpcPlanner:
 
 
 class WithFilter:
-    """Its MPC on what the extended Kalman filter of this package says with the true model."""
+    """Its MPC with the extended Kalman filter of this package and the true model."""
 
     def __init__(self, case: PartialCase) -> None:
         self._case, self._planner, self._filter = case, DoMpcPlanner(case), true_filter(case)
@@ -165,7 +165,7 @@ def true_filter(case: PartialCase) -> ExtendedKalmanFilter:
 
 
 def _guess(case: PartialCase, y: Array) -> Array:
-    """Return what is known at first: the outputs, and of the rest the nominal point."""
+    """Return the initial estimate: the outputs, and the nominal point for the rest."""
     return case.outputs.state(y, case.system.nominal_state)
 
 

@@ -40,7 +40,7 @@ def figures_of(runs: Sequence[tuple[ComparedRun, ComparedFigures]]) -> dict[str,
 
 def table_of(summary: Mapping[str, Mapping[str, Mapping[str, Any]]],
              cases: Mapping[str, PartialCase]) -> str:
-    """Return the table of what :func:`figures_of` has by plant and controller."""
+    """Return the table of :func:`figures_of` by plant and controller."""
     rows = []
     for plant, contenders in summary.items():
         case = cases[plant]

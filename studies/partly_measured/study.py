@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The loop that every controller is run in, and what it is judged by."""
+"""The loop that every controller is run in, and the criteria."""
 
 from dataclasses import dataclass
 import itertools
@@ -23,7 +23,7 @@ _LATE = 1.0 / 3.0  # of a part, over which its offset is the mean
 
 @dataclass(frozen=True, eq=False)
 class ComparedRun:
-    """What a controller did."""
+    """The course of a controlled plant."""
 
     times: Array  #: (N,) in s
     states: Array  #: (N, n_x)
@@ -59,16 +59,16 @@ def run(case: PartialCase, contender: Contender, seed: int) -> ComparedRun:
 
 @dataclass(frozen=True)
 class ComparedFigures:
-    """What a run was worth."""
+    """Cost and errors of a run."""
 
     #: of the step of the set-point, over the least of all-knowing control from the same state
     cost: float
     #: mean distances from the set-point late before and after the step, the larger, and late under
     #: the load, largest over the states with a set-point in the unit of the last
     offsets: tuple[float, float]
-    farthest: float  #: largest distance under the load, likewise
+    farthest: float  #: the same of the largest distance under the load
     violation: float  #: largest excess over a limit of a state, in its unit
-    lost: bool  #: whether one of them was further than what counts as reached
+    lost: bool  #: whether one of them was further than the tolerance
 
 
 def least(case: PartialCase, x0: Array) -> OptimalTrajectory:

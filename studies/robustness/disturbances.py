@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What changed plants, lags, biases, saturation and noise do to the loop."""
+"""Effects of changed plants, lags, biases, saturation and noise on the loop."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ class Disturbed:
     """A loop that is disturbed or whose set-point steps."""
 
     name: str  #: for the tables
-    changes: Sequence[ScheduledChange]  #: what happens when, in s
+    changes: Sequence[ScheduledChange]  #: events with their times, in s
     reference: float = START  #: where the true temperature ought to go, in K
     system: ControlAffineSystem = REACTOR  #: the plant
     x0: Sequence[float] = (START,)  #: its state at the start
@@ -132,10 +132,10 @@ def late(known: float, share: float, system: ControlAffineSystem) -> Metrics:
 
 def noise_against_speed(bandwidth: float) -> Metrics:
     """
-    Measure what an observer's bandwidth in 1/min costs and brings.
+    Measure costs and benefits of an observer's bandwidth in 1/min.
 
     :return: standard deviations over half an hour with noise of 0.1 K at 1 Hz, `change` from one
-        second to the next; times (None for never) and what is left at the end after UA -20 %
+        second to the next; times (None for never) and the error at the end after UA -20 %
         (`fouled`) and after a step by -10 K (`step`).
     """
     noisy = loop.run_loop(

@@ -80,7 +80,7 @@ def on_plant(**changes: Any) -> evaluation.Change:
 
 
 def biased(bias: float, since: float = 0.0) -> evaluation.Sensor:
-    """Let the sensor err by so much from a time in s on, in state units."""
+    """Add an error of the sensor, in state units, from a time in s on."""
     return lambda y, seconds: y + (bias if seconds >= since else 0.0)
 
 

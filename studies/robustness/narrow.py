@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lifts of too narrow data, asked for more than they know, without fallback and with it."""
+"""Lifts of too narrow data used outside them, without fallback and with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,12 +37,12 @@ NARROWEST = '[3,6]x[3,8]'
 
 @dataclass(frozen=True)
 class Trial:
-    """What a lift of narrow data is asked for."""
+    """A task for a lift of narrow data."""
 
     name: str  #: for the tables
     temperature: float  #: of the reactor at the start, in K
     bandwidth: float = loop.BANDWIDTH  #: of the observer, in 1/min
-    changes: Sequence[evaluation.ScheduledChange] = ()  #: what happens when, in s
+    changes: Sequence[evaluation.ScheduledChange] = ()  #: events with their times, in s
 
     def run(self, controller: Controller) -> Simulation:
         """Drive the true reactor to its steady state."""
@@ -72,7 +72,7 @@ def reactor_courses() -> dict[tuple[str, str], Simulation]:
 
 
 def judge_reactor(course: Simulation, since: float = 0.0) -> Metrics:
-    """Say what became of a trial; it ran away above 350 K, and time counts from `since` s on."""
+    """Return the result of a trial; it ran away above 350 K, and time counts from `since` s on."""
     hottest = float(np.max(course.states))
     return {'hottest_kelvin': hottest, 'final_kelvin': float(course.states[-1, 0]),
             'seconds_to_0.2_kelvin': loop.settling(course, START, 0.2, since),
@@ -119,7 +119,7 @@ def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
 
 
 def judge_two_state(course: Simulation) -> Metrics:
-    """Say what became of the example; `left_after` are s until another law than the learned."""
+    """Return the result of the example; `left_after` are s until another law than the learned."""
     below = [level != 'sdre' for level in course.levels]
     return {'largest_x2': float(np.max(np.abs(course.states[:, 1]))),
             'final_distance': float(np.linalg.norm(course.states[-1])),

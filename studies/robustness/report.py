@@ -228,6 +228,6 @@ def _draw_narrow(found: Found, path: Path) -> Picture:
                          label=f'takes {level_words(level)}', **mark)
         legend(figure, axes[:1], 4)
     return Picture(path.name, (
-        'Lifts of narrow data (grey: the data) asked for more than they know. On the reactor the '
+        'Lifts of narrow data (grey: the data) used outside them. On the reactor the '
         'fallback keeps the loop from running away, and leads it back from the cold; the '
         'two-state example is unstable by itself and no constant input saves it.'))

@@ -43,7 +43,7 @@ _RETURN = 600.0  # s
 
 @dataclass(frozen=True)
 class Margins:
-    """What the loop bears at the plant's input before it oscillates without end."""
+    """Margins of the loop at the plant's input."""
 
     gain: float  #: factor of the gain
     phase: float  #: in degrees
@@ -196,7 +196,7 @@ def hottest_saved(coolant: float) -> float:
     Return the hottest start from which the coolant, moved as fast as it may, saves the reactor.
 
     Backwards in time from the unstable state under the coldest coolant, while the coolant rises
-    by 1 K a second to what is in force at the start, in K; by Runge and Kutta's method.
+    by 1 K a second to the initial one, in K; by Runge and Kutta's method.
     """
     seconds = coolant - COOLANT_RANGE[0]
     steps = max(1, round(seconds / _SHORT_STEP))
@@ -227,7 +227,7 @@ def two_state_end(start: tuple[float, float]) -> End:
 
 
 def back_from_safe(system: ControlAffineSystem, linear_model_margin: float) -> Metrics:
-    """Start at rest under the safe coolant, `outside` the trained range by so many half-ranges."""
+    """Start at rest under the safe coolant, by `outside` half-ranges from the trained range."""
     coldest = COOLANT_RANGE[0]
     rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
                             coldest, 320.0)])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What was measured lately, and which models predict it no worse than the present one."""
+"""Recent measurements, and which models predict them no worse than the current one."""
 
 from dataclasses import replace
 

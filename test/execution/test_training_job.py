@@ -126,9 +126,9 @@ def test_figures_of_signals_are_told_one_by_one() -> None:
             'accepted': True, 'noise: low': 0.5, 'input_gain: low: pump': 2.0}
     summary = {'accepted': True, 'model_class': 'free lift', 'model_file': 'new',
                'units': {'low': 'm', 'high': 'Pa'}, 'heldout_error': {'low': 0.25, 'high': 3.0},
-               'heldout_error_of_present_lift': {'low': 1.0, 'high': 3.0}}
+               'heldout_error_of_current_model': {'low': 1.0, 'high': 3.0}}
     words = training.outcome_text(summary)
     assert '0.25 m in low, 3 Pa in high, that' in words
     assert '1 m in low, 3 Pa in high' in words
-    summary['heldout_error_of_present_lift']['low'] = None
+    summary['heldout_error_of_current_model']['low'] = None
     assert 'infinite (diverges)' in training.outcome_text(summary)

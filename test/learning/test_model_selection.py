@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from koopman_ros.control import Controller, Tuning
 from koopman_ros.core.datasets import split_by_episode
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import (
@@ -17,11 +18,15 @@ from koopman_ros.learning import (
     evaluate,
     fit,
     IncrementalTraining,
+    learn_lift,
     model_selection,
     ModelCandidate,
     NeuralDrift,
+    simulate,
+    train,
     TrainingFailed,
 )
+from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.neural_drift import with_units_of
 from koopman_ros.learning.model_selection import plainest
 from koopman_ros.model import Box
@@ -54,6 +59,16 @@ def test_the_plainest_within_a_factor_of_two_is_taken(errors, refused, chosen):
     those = [contender(str(i), rx, 'refused' if i in refused else '')
              for i, rx in enumerate(errors)]
     assert plainest(those) is those[chosen]
+
+
+@pytest.mark.parametrize('swapped', [
+    lambda: train(bent_samples(), BENT, SMALL), lambda: compare(bent_samples(), BENT),
+    lambda: identify([], BENT), lambda: learn_lift(BENT, None, 3, seed=0, starts=1),
+    lambda: simulate(None, random_lift()),
+    lambda: Controller(Tuning.for_model(random_lift()), random_lift())])
+def test_swapped_arguments_are_named(swapped):
+    with pytest.raises(TypeError, match='check the order of the arguments'):
+        swapped()
 
 
 @pytest.fixture(scope='module')

@@ -157,7 +157,7 @@ def test_report(accepted):
     assert figures['free_runs']['record']['fit_percent']['temperature'] > 95.0
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
-    assert diverging.summary()['heldout_error_of_present_lift'] == {'temperature': None}
+    assert diverging.summary()['heldout_error_of_current_model'] == {'temperature': None}
 
 
 @pytest.mark.usefixtures('learned')
@@ -329,7 +329,7 @@ def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
     assert abs(drift[0]) < 0.01
     # compared with a linear model alone, in figures and on the page
     figures = retrained.summary()
-    assert figures['heldout_error_of_present_lift'] is None
+    assert figures['heldout_error_of_current_model'] is None
     assert figures['heldout_error']['temperature'] < 0.9 * figures[
         'heldout_error_of_linear_model']['temperature']
     assert 'current model' not in page_of(retrained)

@@ -277,14 +277,17 @@ def test_eigenvalues_come_slowest_first_and_every_mode_has_to_decay(A, slowest_f
 def test_a_printed_model_shows_its_ranges_rates_and_verdict():
     model = exact_two_state_model()
     model = replace(model, provenance=replace(
-        model.provenance, metrics={'rx': 0.25}, accepted=False, reasons=('too few loops',)),
+        model.provenance, metrics={'rx': 0.25, f'free_run_{model.states.names[0]}': 0.5},
+        accepted=False, reasons=('too few loops',)),
         dead_time=np.array([7.5]))
     lines = str(model).splitlines()
     for name, unit in zip(model.states.names, model.states.units, strict=True):
         assert sum(f'state {name}: trained from' in line and line.endswith(unit)
                    for line in lines) == 1
     assert f'{model.eigenvalues.real[0]:.4g} per {model.time_unit}' in str(model)
-    assert '  held-out rx: 0.25' in lines
+    assert '  held-out residual of the drift, relative: 0.25' in lines
+    assert any(line.startswith('  free-run error (RMS)') and line.endswith(': 0.5')
+               for line in lines)
     assert f'  dead time of {model.inputs.names[0]}: 7.5 s' in lines
     assert lines[-1] == '  acceptance: rejected (too few loops)'
 

@@ -239,7 +239,7 @@ def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
         'coolant_temperature.dead_time': 25.0})
     bench.measure(STEADY, last + 5.0)
     status = bench.status(lambda s: value(s, 'dead time [s]') == '25')
-    assert value(status, 'inputs before the start act for [s]') == '24'
+    assert value(status, 'effect of inputs before the start ends in [s]') == '24'
     assert value(status, 'dead time change') == 'dead time of coolant_temperature: 0 s -> 25 s'
 
 

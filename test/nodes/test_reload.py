@@ -173,7 +173,7 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
 
     assert bench.reload() == (
         True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
-        '53.85 degC; acceptance: never judged')
+        '53.85 degC; acceptance: not tested')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model rejected') == 'none'
 
@@ -182,7 +182,7 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
     done, about = bench.reload()
     assert done
     assert 'too large an error' in about
-    status = ros.wait_for_status(STATUS, lambda s: 'in force though it was rejected' in s.message)
+    status = ros.wait_for_status(STATUS, lambda s: 'was rejected' in s.message)
     assert (status.level, 'too large an error' in status.message) == (DiagnosticStatus.WARN, True)
     assert value(status, 'model acceptance') == 'rejected (too large an error)'
     assert change(load_rejected_model=False).successful
@@ -227,12 +227,12 @@ def test_model_that_predicts_what_was_measured_much_worse_is_refused(
     assert bench.set('reactor_nz3')[0]
     status = ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_nz3')
     assert re.fullmatch(r'predicts temperature of the last 400 s with an error of 0\.00\d+ K, '
-                        r'the model before with 0\.00\d+ K', value(status, 'model check'))
+                        r'the previous model with 0\.00\d+ K', value(status, 'model check'))
     assert bench.set(file)[0]
 
     save(replace(SHIPPED, B=-SHIPPED.B), file)
     why = (r'the current model is kept: the model predicts temperature of the last 400 s with an '
-           r'error of (\S+) K, the present one with (\S+) K, at most (\S+) K are allowed: train '
+           r'error of (\S+) K, the current one with (\S+) K, at most (\S+) K are allowed: train '
            r'it again with more data, or set model_check_factor = 0 to load it anyway')
     for done, reason in (bench.reload(), bench.set(f'{file.parent}/./{file.name}')):
         assert not done

@@ -40,7 +40,7 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
     assert shares[-1] == 100
     assert 'estimating: drift of degree' in printed
     assert re.search(r'the new model \(.+\) is accepted: its error on held-out data is 0\.\d+ '
-                     r'K, that of the present one \d\.\d+ K; written to '
+                     r'K, that of the current model \d\.\d+ K; written to '
                      rf'{tmp_path}/new\.safetensors',
                      printed)
     assert {'new.free_run.png', 'new.json', 'new.md', 'new.png', 'new.safetensors'} == {

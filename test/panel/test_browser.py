@@ -147,6 +147,38 @@ def confirmed(page: Page, yes: str, where: Locator, answer: str | re.Pattern[str
     expect(where.locator('.answer')).to_have_text(answer)
 
 
+# Words and numbers that are broken over two lines; paths may be.
+BROKEN = """() => {
+    const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
+    const range = document.createRange();
+    while (texts.nextNode()) {
+        const { data, parentElement } = texts.currentNode;
+        if (parentElement.checkVisibility() && !data.includes('/')) {
+            for (const word of data.matchAll(/([^\\s_-]|-(?=\\d))+/g)) {
+                range.setStart(texts.currentNode, word.index);
+                range.setEnd(texts.currentNode, word.index + word[0].length);
+                const tops = [...range.getClientRects()].filter(box => box.width > 1).map(
+                    box => box.top);
+                if (Math.max(...tops) - Math.min(...tops) > 9) {
+                    found.push(`${word[0]} in ${data}`);
+                }
+            }
+        }
+    }
+    return found;
+}"""
+WIDTHS = (1400, 1024, 375)
+
+
+def fits(page: Page) -> None:
+    """Assert that no page is wider than its window, and no word broken."""
+    for width in WIDTHS:
+        page.set_viewport_size({'width': width, 'height': 900})
+        page.wait_for_function(f'document.documentElement.scrollWidth <= {width}')
+        assert page.evaluate(BROKEN) == []
+    page.set_viewport_size(dict(zip(('width', 'height'), DESK, strict=True)))
+
+
 def activated(page: Page, button: str | re.Pattern[str], *shown: str, yes: str = 'Activate'
               ) -> None:
     """Activate a model; again if a busy machine did not read it in time."""
@@ -157,6 +189,7 @@ def activated(page: Page, button: str | re.Pattern[str], *shown: str, yes: str =
         press(model, button)
         for text in shown:
             expect(page.get_by_role('dialog')).to_contain_text(text)
+        fits(page)
         confirmed(page, yes, model, re.compile('^set$|is still being read after'))
         if model.locator('.answer').inner_text() == 'set':
             return
@@ -175,6 +208,13 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
     with site.page('/model') as page:
         recording, training = card(page, 'Recording'), card(page, 'Training')
         expect(recording).to_contain_text('not recording')
+        for where, name, why in (
+                (recording, 'Stop', 'no recording is running'),
+                (card(page, 'Experiment'), 'End', 'no experiment is running'),
+                (training, 'Cancel', 'no training is running')):
+            button = where.get_by_role('button', name=name)
+            expect(button).to_be_disabled()
+            expect(button).to_have_attribute('title', why)
         press(recording, 'Record')
         expect(recording).to_contain_text('recording to')
         experiment = card(page, 'Experiment')
@@ -527,12 +567,35 @@ FILLED = """() => {
 }"""
 
 
+@pytest.mark.parametrize('path', ['/trends', '/alarms', '/model', '/tuning', '/'])
+def test_pages_fit_their_windows(site: Site, path: str) -> None:
+    with site.page(path) as page:
+        page.wait_for_selector('#beat[data-beat]')
+        page.locator('.q-expansion-item .q-item:visible').evaluate_all(
+            'groups => groups.forEach(group => group.click())')
+        fits(page)
+
+
+# Whether all names of the pens lie within their chart.
+NAMED = """() => {
+    const canvas = document.querySelector('.nicegui-echart');
+    const chart = getElement(parseInt(canvas.id.slice(1))).chart;
+    const names = chart.getOption().legend.flatMap(own => own.data).map(
+        name => name.split(' [')[0]);
+    const drawn = chart.getZr().storage.getDisplayList(true);
+    return names.length > 4 && names.every(name => drawn.some(own => own.style?.text === name
+        && own.transform[4] + own.getBoundingRect().x + own.getBoundingRect().width
+            < chart.getWidth()));
+}"""
+
+
 def test_cards_fill_their_rows_and_a_simulated_plant_is_reset(site: Site) -> None:
     with site.page() as page:
         ready(page)
-        for width in (1400, 1024, 375):
+        for width in WIDTHS:
             page.set_viewport_size({'width': width, 'height': 900})
             page.wait_for_function(FILLED)
+            page.wait_for_function(NAMED)
         page.set_viewport_size(dict(zip(('width', 'height'), DESK, strict=True)))
         press(page.locator('.page'), 'Reset the simulated plant …')
         press(page.get_by_role('dialog'), 'Reset the simulated plant')

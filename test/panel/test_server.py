@@ -29,7 +29,7 @@ from websockets.typing import Origin
 from koopman_ros.panel import trend_chart
 from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
-from koopman_ros.panel.trend_chart import axis_ends, ink, zoomed
+from koopman_ros.panel.trend_chart import axis_ends, ink, legend_rows, zoomed
 from koopman_ros.panel.trend_page import time_of_day
 from support.browser import opened_browser, Pages
 from support.hostile import HostileSource, NOW, TEXTS
@@ -437,6 +437,12 @@ def test_an_axis_shows_a_share_of_the_range_of_its_signals(
     assert ends[0] <= low <= 46.03 < 46.1 <= high <= ends[1]
     assert high - low >= 2.0
     assert axis_ends([(30.0, 40.0), (35.0, 50.0)], ()) == {'min': 30.0, 'max': 50.0}
+
+
+@pytest.mark.parametrize(('lengths', 'rows'), [((), 1), ((11, 21), 1), ((11, 21, 21), 2),
+                                               ((27, 19), 2), ((40,) * 5, 5), ((60,), 2)])
+def test_names_of_pens_have_rows_in_a_narrow_chart(lengths: tuple[int, ...], rows: int) -> None:
+    assert legend_rows(['x' * length for length in lengths], 330) == rows
 
 
 def test_pens_of_a_chart_have_colours_of_their_own() -> None:

@@ -84,9 +84,9 @@ def test_times_may_be_a_period_a_unit_of_the_argument_or_an_index(options):
 
 
 @pytest.mark.parametrize(('columns', 'options', 'words'), [
-    ({'time': (1e9 * SECONDS).astype(np.int64)}, {}, r"can be no seconds: .*time='time \[ns\]'"),
-    ({'time': 1e9 * SECONDS}, {}, 'can be no seconds'),
-    ({'time': 1_772_352_000_123 + 500 * np.arange(N)}, {}, 'can be no seconds'),
+    ({'time': (1e9 * SECONDS).astype(np.int64)}, {}, r"cannot be seconds: .*time='time \[ns\]'"),
+    ({'time': 1e9 * SECONDS}, {}, 'cannot be seconds'),
+    ({'time': 1_772_352_000_123 + 500 * np.arange(N)}, {}, 'cannot be seconds'),
     ({}, {}, "no column 'time'.*or give the period of the rows in s"),
     ({'time': SECONDS}, {'time': 'hour'}, "no column 'hour'"),
     ({'time': SECONDS}, {'time': 'time', 'period': 1.0}, 'give one'),
@@ -194,7 +194,7 @@ def test_several_tables_are_episodes_of_one_record(tmp_path):
     ((frame(time=SECONDS), [], 'pump'), 'at least one of each'),
     ((frame(time=SECONDS), 'level', ['pump', 'level']), 'level is named twice'),
     ((frame(time=SECONDS), ' ', 'pump'), 'names no signal'),
-    ((np.zeros((9, 2)), 'level', 'pump'), 'a ndarray is no record'),
+    ((np.zeros((9, 2)), 'level', 'pump'), 'a ndarray is not a record'),
     ((frame(time=SECONDS), 'level', 'pump', 'valve'), 'linear names valve'),
 ])
 def test_refuses_signals_and_sources_that_are_none(arguments, words):
@@ -206,7 +206,7 @@ def test_refuses_signals_and_sources_that_are_none(arguments, words):
 @pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
 def test_refuses_other_files(tmp_path, file):
     (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
-    with pytest.raises(ValueError, match=r'is no record|version 7\.3'):
+    with pytest.raises(ValueError, match=r'is not a record|version 7\.3'):
         read(tmp_path / file, 'level', 'pump')
 
 

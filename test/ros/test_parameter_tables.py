@@ -378,7 +378,7 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
     plant = PlantTable(named)
     values = plant.snapshot({'constants.feed_temperature': 80.0})
     assert plant.measured_disturbances(values) == pytest.approx([353.15])
-    for given, words in (('spin [1]', 'no constant of reactor'), ('volume [K]', 'volume: ')):
+    for given, words in (('spin [1]', 'not a constant of reactor'), ('volume [K]', 'volume: ')):
         with pytest.raises(ConfigurationError, match=words):
             PlantTable({**named, 'disturbances_measured': (given,)})
 

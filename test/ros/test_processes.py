@@ -17,6 +17,7 @@ import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
 
+from koopman_ros import __version__
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.nodes import controller, plant, player, trainer
@@ -170,6 +171,8 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
 @pytest.mark.parametrize('name', TABLES)
 def test_help_and_unknown_arguments(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert answer(name, [name, '--ros-args', '-p', 'a:=1.0']) is None
+    assert answer(name, [name, '--version']) == 0
+    assert capsys.readouterr().out == f'{__version__}\n'
     assert answer(name, [name, '--help']) == 0
     said = capsys.readouterr().out
     assert said.startswith(f'usage: ros2 run koopman_ros {name} ')

@@ -221,7 +221,7 @@ class Law(ABC):
         return None
 
     def horizon(self, interval: float) -> float:
-        """Return how far it looks ahead in s, at samples every `interval` s; 0 by default."""
+        """Return its horizon in s, at samples every `interval` s; 0 by default."""
         return 0.0
 
     @abstractmethod

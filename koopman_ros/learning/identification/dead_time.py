@@ -50,8 +50,8 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     Each measured signal is simulated by linear models of rising order, their inputs moved by every
     number of samples in turn. The model with the least Bayesian information criterion (Schwarz
     1978) is taken. Where linear models do not explain the record, a dead time must also reduce the
-    error of the best model without by more than chance. A record whose models are all unstable, as
-    of a plant that only a controller holds, tells no dead time.
+    error of the best model without by more than chance. No dead time is found if all
+    models are unstable, e.g. from closed-loop data of an unstable plant.
 
     The models are fitted by the iteration of Steiglitz and McBride (1965): least squares of the
     equation error, filtered by the denominator that was found before, which ends where the error

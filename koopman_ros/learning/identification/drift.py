@@ -341,7 +341,7 @@ def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
     near = np.all(np.abs(xi) <= _SLIGHTLY_OUTSIDE)
     if not (near and np.all(np.abs(drift.scaled_rate(xi, v)) < 1e-9)):
         raise ValueError('no steady state was found within the range of the episodes: record '
-                         'around a state that the plant can hold')
+                         'around a steady state of the plant')
     return box.states.to_physical(xi), box.inputs.to_physical(v)
 
 

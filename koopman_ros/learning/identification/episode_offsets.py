@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A constant disturbance of each episode, as of days with different ambient temperatures."""
+"""A constant disturbance of each episode, e.g. of days with different ambient temperatures."""
 
 from __future__ import annotations
 

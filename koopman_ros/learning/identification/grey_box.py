@@ -94,7 +94,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
 
 def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equations]:
     """
-    Return the equations with the gain that foresees the next measurements of all episodes best.
+    Return the equations with the gain that predicts the next measurements of all episodes best.
 
     Of those of steady Kalman filters in the middle of the box, which are stable.
     """
@@ -109,8 +109,8 @@ def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equati
             with contextlib.suppress(ValueError):  # it diverges
                 tried.append((float(np.mean(record.innovations(one) ** 2)), noise, one))
     if not tried:
-        raise ValueError(f'with the initial constants, the {model.form} reproduce the episodes '
-                         'with no filter: give ranges closer to the true values')
+        raise ValueError(f'the {model.form} do not reproduce the episodes with the initial '
+                         'constants: give ranges closer to the true values')
     return min(tried, key=lambda one: one[:2])[2]
 
 
@@ -121,7 +121,7 @@ def _refined(record: SplitRecord, start: Predictor[Equations], monitor: Callable
 
     Without one the estimate is that of maximum likelihood where nothing but the sensors is noisy,
     and a gain would bias the estimate from closed-loop data. With one it follows a plant that is
-    disturbed, too. The one is taken that foresees the measurements better.
+    disturbed, too. The one that predicts the measurements better is taken.
 
     :return: the equations with the filter that goes through all episodes, and how they were found.
     """

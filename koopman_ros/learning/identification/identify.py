@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.arrays import expect, short_repr
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.core.plugins import contained, plugin_class, short_name
 from koopman_ros.execution import Backend, Serial, Tell
@@ -189,6 +189,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
         nothing fits.
     :raises Stopped: when `watch` requested it.
     """
+    expect(plant=(plant, PlantDescription))
     n_x, n_u = len(plant.state_names), len(plant.input_names)
     degrees = degrees or usual_degrees(n_x)
     parts = segments_of(episodes, n_x + n_u)

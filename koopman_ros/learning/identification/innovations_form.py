@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A drift with the gain of its filter, which foresees the next measurement: innovations form."""
+"""A drift with the gain of its filter, which predicts the next measurement: innovations form."""
 
 from __future__ import annotations
 

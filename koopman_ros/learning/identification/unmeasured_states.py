@@ -135,7 +135,7 @@ class _StructureCandidate:
 
 
 def _not_measured(count: int) -> str:
-    return f'{count} {"state" if count == 1 else "states"} not measured'
+    return f'{count} unmeasured {"state" if count == 1 else "states"}'
 
 
 class _Choice:
@@ -161,8 +161,8 @@ class _Choice:
         best = _plainest(before)
         more, deviation = _excess(*_blocks([one, best]))
         self.steps.append(
-            f'{one.text}; mean square {100.0 * abs(more):.3g} % '
-            f'{"more" if more > 0.0 else "less"} than with the best before (standard error '
+            f'{one.text}; mean squared error {100.0 * abs(more):.3g} % '
+            f'{"above" if more > 0.0 else "below"} the previous best (standard error '
             f'{100.0 * deviation:.2g} %)')
         return more < -_SIGMAS * deviation
 
@@ -264,7 +264,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             return time.process_time() > limit
 
         if monitor():
-            choice.steps.append(f'left out after {budget:.0f} s: {text}')
+            choice.steps.append(f'stopped after {budget:.0f} s: {text}')
         return monitor
 
     first, linear, n_y = _Search(record), None, len(plant.state_names)
@@ -557,7 +557,7 @@ class _Search:
     Candidates of polynomial drifts.
 
     :ivar deviation: (n_y,) standard deviations of the innovations of the last filter.
-    :ivar samples: longest piece that is simulated; 0 until a model tells the plant's memory.
+    :ivar samples: longest piece that is simulated; 0 until a model shows the plant's memory.
     """
 
     def __init__(self, record: SplitRecord) -> None:
@@ -618,7 +618,7 @@ class _Search:
         return Predictor(replace(drift, B=B, box=replace(drift.box, inputs=inputs)), linear.gain)
 
     def filtered(self, start: _Polynomial, monitor: Callable[..., bool]) -> _Polynomial | None:
-        """Return a filter that foresees the record better; None where there is none."""
+        """Return a filter that predicts the record better; None if there is none."""
         try:
             found, _ = self._refined(start, monitor)
             self.deviation = np.std(self.record.innovations(found), axis=0)

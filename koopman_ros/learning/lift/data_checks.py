@@ -121,7 +121,7 @@ def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box
         _ERRORS * spread, _MISFITS * np.abs(np.mean(nearest, axis=0))], axis=0)
     if not moves.any():
         return
-    nearby = 'excite the plant around a state that it can hold'
+    nearby = 'excite the plant around a steady state'
     with contextlib.suppress(ValueError):
         x_held, u_held = steady_point(fitted, box.states.center, box.inputs.center)
         apart = max(np.max(np.abs(one.to_deviation(held)), initial=0.0) for one, held in (

@@ -256,5 +256,5 @@ def _least_spanned_product(grown: TrainedLift, data: ScaledSamples) -> Tensor:
                     best, best_share = part, share
         if best is not None and best_share > 1e-6:
             return best / best_share ** 0.5
-    raise ValueError('no coordinate can be added: the present lift already spans the samples; use '
+    raise ValueError('no coordinate can be added: the lift already spans the samples; use '
                      'a smaller n_z or samples over a wider range')

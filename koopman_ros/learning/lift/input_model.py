@@ -33,7 +33,7 @@ class InputModel:
         Return the input model of a plant, in the coordinates of a box.
 
         :param x: (N, n_x) states, in state units, at which a function B(x) is fitted.
-        :raises ValueError: for a B of another shape, or a function that is no polynomial there.
+        :raises ValueError: for a B of another shape, or a function that is not a polynomial there.
         """
         n_u = len(box.inputs)
         if plant.B is None:

@@ -77,8 +77,8 @@ class Scaling:
         if not isinstance(network, NetworkObservables) or not len(network.V) or (
                 network.identity != recipe.identity):
             raise ValueError(
-                'the lift that is begun from is of another class: begin from one with '
-                f'{"" if recipe.identity else "no "}identity coordinates and others by a network')
+                'the initial lift is of another class: start from one with '
+                f'{"" if recipe.identity else "no "}identity coordinates, and others of a network')
         # deviations there are `stretch` times those here and `shift`
         stretch = own.scale / begin.states.scale
         shift = (own.center - begin.states.center) / begin.states.scale

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from koopman_ros import __version__
-from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.arrays import expect, short_repr
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.core.progress import progress_line
 from koopman_ros.evaluation.closed_loop_test import (
@@ -165,6 +165,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :raises WorkerLost: when workers of the backend are lost and none takes over.
     :raises SchedulerLost: when its scheduler is.
     """
+    expect(plant=(plant, PlantDescription), samples=(samples, DriftSamples))
     if starts < 1:
         raise ValueError(f'starts must be at least 1, got {starts}')
     rounds = recipe.rounds(samples.x.shape[1])

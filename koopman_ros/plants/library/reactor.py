@@ -32,7 +32,7 @@ class ReactorParameters(Constants):
     Source of the values: the CSTR of Seborg, Edgar and Mellichamp, *Process Dynamics and Control*,
     as in Henson and Seborg, *Nonlinear Process Control*; the paper, eq. 36, lists none.
 
-    :raises ValueError: when a value is no number or outside its range.
+    :raises ValueError: when a value is not a number or outside its range.
     """
 
     flow_rate: float = constant(

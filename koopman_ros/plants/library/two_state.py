@@ -18,7 +18,7 @@ class TwoStateExample(Constants):
     """
     Two states of which the square of one drives the other (paper, eq. 32).
 
-    :raises ValueError: when a rate is no number or outside its range.
+    :raises ValueError: when a rate is not a number or outside its range.
     """
 
     mu: float = constant(-0.1, '1/s', -1e6, 1e6, 'growth rate of the first state')
