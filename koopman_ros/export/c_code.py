@@ -50,7 +50,7 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
     :raises ExportError: for a law, an estimator or a model that the C code does not support.
     """
     _check(controller)
-    sizes, tables = _sizes(controller, interval), _tables(controller)
+    sizes, tables = _sizes(controller, interval), _tables(controller, interval)
     model = controller.model
     about = [f'A control loop of {model.provenance.plant}, exported by koopman_ros {__version__}.',
              *(f'{role}: {", ".join(f"{name} [{unit}]" for name, unit in signals)}'
@@ -105,8 +105,6 @@ def _check(controller: Controller) -> None:
             'disturbance_observer, measured_state or extended_kalman_filter')
     tuning = controller.tuning
     for what, given, remedy in (
-            ('measured disturbances', len(controller.model.disturbances),
-             'train a model without them'),
             ('safe_latch', tuning.safe_latch, 'set it to false'),
             ('report_on_change', tuning.sensor.report_on_change.any(), 'set it to 0')):
         if given:
@@ -124,7 +122,8 @@ def signals(controller: Controller) -> dict[str, list[tuple[str, str]]]:
     """Return names and units of the entries of each array, in their order."""
     return {role: list(zip(of.names, of.units, strict=True)) for role, of in (
         ('measured', controller.measured), ('set-points', controller.controlled),
-        ('inputs', controller.model.inputs), ('states', controller.model.states))}
+        ('inputs', controller.model.inputs), ('states', controller.model.states),
+        ('measured disturbances', controller.model.disturbances))}
 
 
 def _sizes(controller: Controller, interval: float) -> dict[str, int]:
@@ -132,15 +131,17 @@ def _sizes(controller: Controller, interval: float) -> dict[str, int]:
     kalman = isinstance(controller.best.estimator, ExtendedKalmanFilter)
     longest = float(np.max(controller.tuning.dead_times(model), initial=0.0))
     return {'NX': model.n_x, 'NU': model.n_u, 'NY': len(controller.measured.names),
-            'NC': len(controller.controlled), 'NP': 2 * model.n_x if kalman else 1,
+            'NC': len(controller.controlled), 'ND': max(1, len(model.disturbances)), 'NP': 2 * model.n_x if kalman else 1,
             'LAWS': len(controller.levels), 'QUEUE': math.ceil(longest / interval) + 2}
 
 
-def _tables(controller: Controller) -> dict[str, Any]:
+def _tables(controller: Controller, interval: float) -> dict[str, Any]:
     """Return the constants of the C code by name."""
     model, tuning, outputs = controller.model, controller.tuning, controller.measured
     best, n = controller.best, controller.model.n_x
     states, inputs, estimator = model.states, model.inputs, best.estimator
+    disturbances = model.disturbances
+    remembers = estimator.remembers
     lift, terms, loops = model.observables, model.input_terms, model.verified_loops
     states_first = np.eye(model.n_z, n) if model.identity else np.zeros((model.n_z, n))
     if isinstance(lift, PolynomialObservables):
@@ -157,20 +158,32 @@ def _tables(controller: Controller) -> dict[str, Any]:
     kalman = isinstance(estimator, ExtendedKalmanFilter)
     weights = best.law.weights
     dead = [round(seconds * 1e9) for seconds in tuning.dead_times(model).tolist()]
+    nr = model.n_z if closed(model) else n
+    nn, most_n, ny = nr + model.n_u, max(nr, n + model.n_u), len(outputs.C)
     return {
+        'MOST': max(nn * nn, 4 * n * n, model.n_z * n, (n + model.n_u) ** 2, n * (1 + 2 * n), 2 * n * ny, ny * ny, n * len(disturbances)),
+        **_sizes(controller, interval), 'ND': len(model.disturbances), 'NXU': n + model.n_u,
+        'STAGES': 4 if kalman else 2, 'WIDTH': 1 + 2 * n if kalman else 1,
+        'AHEAD': (0.0, 0.5, 0.5, 1.0) if kalman else (0.0, 1.0),
+        'PARTS': (1.0, 2.0, 2.0, 1.0) if kalman else (3.0, 3.0),
+        'STEP_RATE': (2.0 * np.max(np.abs(np.linalg.eigvals(model.linearised.A))) if kalman else 10.0 * model.linearised.fastest_rate) / model.seconds_per_time_unit,
+        'MOST_STEPS': 40.0 if kalman else 20.0,
+        'FARTHEST': np.sqrt(estimator._lost) if kalman else 10.0 * states.half_widths,
+        'RATE': model.A @ np.concatenate((states_first, output), axis=1),
+        'D_CENTER': disturbances.center, 'D_SCALE': disturbances.scale,
+        'D_LOWER': tuning.disturbances.lower, 'D_UPPER': tuning.disturbances.upper, 'D_RATE': tuning.disturbances.rate,
+        'BY_DISTURBANCE': np.zeros(0) if model.E is None else model.E,
         'NZ': model.n_z, 'N_PHI': count, 'N_PSI': n + count, 'N_PHI_': max(count, 1),
         'N_TERMS': 0 if terms is None else len(terms.coefficients),
         'N_TRAINING': 0 if trained is None else len(trained.states),
         'N_LOOPS': 0 if loops is None else len(loops.lost),
         'NETWORK': isinstance(lift, NetworkObservables), 'READ_OUT': model.readout is not None,
-        'CLOSED': closed(model), 'KALMAN': kalman, 'REMEMBERS': estimator.remembers,
+        'CLOSED': closed(model), 'KALMAN': kalman,
         'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == len(outputs.C),
         'TIME_UNIT': model.seconds_per_time_unit,
         'FASTEST_RATE': model.linearised.fastest_rate / model.seconds_per_time_unit,
-        'FASTEST_MODE': np.max(np.abs(np.linalg.eigvals(model.linearised.A)))
-        / model.seconds_per_time_unit,
-        'BANDWIDTH': tuning.observer_bandwidth,
+        'BANDWIDTH': tuning.observer_bandwidth if remembers else math.inf,
         'STUCK_TIMEOUT': tuning.sensor.stuck_sensor_timeout,
         'HOLD_TIMEOUT': tuning.hold_timeout, 'RECOVERY_TIME': tuning.recovery_time,
         'TRANSFER_TIME': tuning.bumpless_transfer_time, 'FILTER_TIME': tuning.setpoint_filter_time,
@@ -206,17 +219,19 @@ def _tables(controller: Controller) -> dict[str, Any]:
         'LOOP_STARTS': np.zeros(0) if loops is None else loops.starts,
         'LOOP_SETPOINTS': np.zeros(0) if loops is None else loops.setpoints,
         'LOOP_LOST': np.zeros(0, dtype=int) if loops is None else loops.lost.astype(int),
-        'MAX_DISTURBANCE': tuning.max_disturbance / inputs.scale,
-        **_kalman_tables(estimator)}
+        'MAX_DISTURBANCE': tuning.max_disturbance / inputs.scale if remembers else 0.0 * inputs.scale,
+        **_kalman_tables(estimator, n)}
 
 
-def _kalman_tables(estimator: Any) -> Mapping[str, ArrayLike]:
+def _kalman_tables(estimator: Any, n: int) -> Mapping[str, ArrayLike]:
     if isinstance(estimator, ExtendedKalmanFilter):
-        return {'H_OUTPUT': estimator._H, 'NOISE_VARIANCE': np.diag(estimator._R),
-                'INTENSITY': estimator._intensity, 'ONTO_DISTURBANCES': estimator._onto_directions,
-                'FIRST_COVARIANCE': estimator.initial_covariance, 'LOST_VARIANCE': estimator._lost}
-    return dict.fromkeys(('H_OUTPUT', 'NOISE_VARIANCE', 'INTENSITY', 'ONTO_DISTURBANCES',
-                          'FIRST_COVARIANCE', 'LOST_VARIANCE'), np.zeros(0))
+        H = estimator._H
+        return {'H_OUTPUT': np.hstack((H, np.zeros_like(H))), 'NOISE': estimator._R,
+                'INTENSITY': np.pad(estimator._intensity, ((n, 0), (n, 0))),
+                'ONTO_DISTURBANCES': estimator._onto_directions,
+                'FIRST_COVARIANCE': estimator.initial_covariance}
+    return {**dict.fromkeys(('H_OUTPUT', 'NOISE', 'INTENSITY', 'FIRST_COVARIANCE'), np.zeros(0)),
+            'ONTO_DISTURBANCES': np.eye(n)}
 
 
 def _table(name: str, value: Any) -> str:

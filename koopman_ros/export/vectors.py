@@ -32,6 +32,7 @@ class Call:
     measured: Array | None  #: (n_y,) None where nothing is received
     setpoint: Array  #: (n_c,)
     applied: Array  #: (n_u,)
+    disturbance: Array  #: (n_d,) at least one
     manual: bool
     manual_input: Array  #: (n_u,)
 
@@ -40,16 +41,19 @@ class Call:
         measured = np.full(len(controller.measured.names), np.nan) if self.measured is None else (
             self.measured)
         return [str(self.elapsed_ns), str(int(self.measured is not None)),
-                *(repr(float(value)) for value in (*measured, *self.setpoint, *self.applied)),
+                *(repr(float(value)) for value in (
+                    *measured, *self.setpoint, *self.applied, *self.disturbance)),
                 str(int(self.manual)), *(repr(float(value)) for value in self.manual_input)]
 
 
 def columns(controller: Controller) -> list[str]:
     """Return the names of the columns of a call and its answer."""
     inputs = controller.model.inputs.names
+    disturbances = controller.model.disturbances.names
     return ['elapsed_ns', 'received', *(f'measured {name}' for name in controller.measured.names),
             *(f'setpoint {name}' for name in controller.controlled.names),
-            *(f'applied {name}' for name in inputs), 'manual',
+            *(f'applied {name}' for name in inputs),
+            *(f'disturbance {name}' for name in disturbances or ('none',)), 'manual',
             *(f'manual {name}' for name in inputs), *(f'command {name}' for name in inputs),
             'level', 'status', 'cause']
 
@@ -67,7 +71,8 @@ def answered(controller: Controller, state: State, call: Call, now_ns: int
         state = replace(state, setpoint=setpoints.request(
             state.setpoint, call.setpoint, 0, state.time_ns))
     if call.measured is not None:
-        return controller.step(state, call.measured, now_ns, call.applied)
+        return controller.step(state, call.measured, now_ns, call.applied,
+                               disturbances=call.disturbance[:len(controller.model.disturbances)])
     state, command, report = controller.hold(state, now_ns)
     return state, controller.safe_input if command is None else command, report
 
@@ -133,9 +138,10 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
         elif fault == 'jump' and left % 4 == 0:
             seen[0] += 10.0 * (model.states.upper - model.states.lower)[0]
         manual = fault == 'manual'
+        disturbance = np.full(1, np.nan)
         call = Call(
             elapsed_ns, None if fault == 'silent' else seen, setpoint,
-            inputs.to_physical(acting) if fault == 'stiff' else none, manual,
+            inputs.to_physical(acting) if fault == 'stiff' else none, disturbance, manual,
             rng.uniform(inputs.lower, inputs.upper) if manual and left % 7 == 0 else none)
         state, command, report = answered(controller, state, call, now_ns)
         yield call, answer_row(controller, command, report, state.command is not None)

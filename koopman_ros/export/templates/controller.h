@@ -30,6 +30,7 @@ typedef struct {
     double measured[KOOPMAN_NY];
     double setpoint[KOOPMAN_NC];        /* NAN: no request, the one before stays */
     double applied[KOOPMAN_NU];         /* measured inputs; NAN: not measured */
+    double disturbance[KOOPMAN_ND];     /* measured disturbances; NAN: the one before stays */
     int manual;                         /* 1: command manual_input, and no law */
     double manual_input[KOOPMAN_NU];    /* NAN: the one before stays */
 } koopman_inputs;
@@ -50,7 +51,7 @@ typedef struct {
 } koopman_supervisor;
 
 typedef struct {
-    int known, certain;
+    int known;
     double x[KOOPMAN_NX], w[KOOPMAN_NX], P[KOOPMAN_NP * KOOPMAN_NP];
 } koopman_estimate;
 
@@ -63,6 +64,9 @@ typedef struct {
     double applied[KOOPMAN_QUEUE][KOOPMAN_NU];
     double requested[KOOPMAN_NC], setpoint[KOOPMAN_NC], ramped[KOOPMAN_NC];
     int64_t accepted_at, still_since[KOOPMAN_NY];
+    int unmeasured[KOOPMAN_ND];
+    int64_t disturbed_at[KOOPMAN_ND];
+    double disturbance[KOOPMAN_ND];
     double accepted[KOOPMAN_NY], travel[KOOPMAN_NY], still_w[KOOPMAN_NX];
     koopman_estimate estimate;
     koopman_supervisor supervisor;

@@ -30,6 +30,7 @@ int main(void)
         numbers(&text, KOOPMAN_NY, inputs.measured);
         numbers(&text, KOOPMAN_NC, inputs.setpoint);
         numbers(&text, KOOPMAN_NU, inputs.applied);
+        numbers(&text, KOOPMAN_ND, inputs.disturbance);
         numbers(&text, 1, &manual);
         inputs.manual = manual > 0.0;
         numbers(&text, KOOPMAN_NU, inputs.manual_input);
