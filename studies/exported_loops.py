@@ -48,7 +48,7 @@ _FLOOR = 1e-3
 # Seconds between samples of the bundled models, where not 1 s, and the plants of those that are
 # not named like one.
 _INTERVALS = {'pendulum': 0.02, 'two_state_example': 0.1, 'two_tanks': 0.5}
-_PLANTS = {'reactor_linear': 'reactor', 'reactor_nz3': 'reactor', 'reactor_nz4': 'reactor',
+_PLANTS = {'reactor_feed': 'reactor', 'reactor_linear': 'reactor', 'reactor_nz3': 'reactor', 'reactor_nz4': 'reactor',
            'two_state_saddle': 'two_state'}
 
 
@@ -94,8 +94,6 @@ def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answer
 def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
     """Yield name, loop and seconds between samples of each bundled model that can be exported."""
     for path in sorted((config_directory() / 'models').glob('*.safetensors')):
-        if len(load(path).disturbances):
-            continue
         name = path.stem
         parameters = config_directory() / 'plants' / f'{_PLANTS.get(name, name)}.yaml'
         yield name, loop(name, 'sdre', parameters)[1], _INTERVALS.get(name, 1.0)

@@ -7,12 +7,13 @@
 
 #include <math.h>
 #include <stddef.h>
+#include <string.h>
 
 @TABLES@
 
-#define OF_X NX, X_CENTER, X_SCALE
-#define OF_U NU, U_CENTER, U_SCALE
-#define OF_D ND, D_CENTER, D_SCALE
+#define OF_X NX, STATES_CENTER, STATES_SCALE
+#define OF_U NU, INPUTS_CENTER, INPUTS_SCALE
+#define OF_D ND, DISTURBANCES_CENTER, DISTURBANCES_SCALE
 #define NEVER INT64_MIN
 #define SECOND 1e9
 #define EACH(i, n) for (int i = 0; i < (n); i++)
@@ -167,19 +168,25 @@ static double distance(mat state) {
     if (!finite(x)) return INFINITY;
     EACH(i, NX)
         out = larger(out, larger(CORNERS[i] - x.a[i], x.a[i] - CORNERS[NX + i]) / HALF_WIDTH[i]);
-    EACH(k, N_TRAINING) nearest = smaller(nearest, apart(TRAINING + k * NX, x.a));
-    return N_TRAINING ? larger(out, nearest - FILL_DISTANCE) : out;
+    EACH(k, N_TRAINING) nearest = smaller(nearest, apart(TRAINING_STATES_STATES + k * NX, x.a));
+    return N_TRAINING ? larger(out, nearest - TRAINING_STATES_FILL_DISTANCE) : out;
 }
 
 /* Whether the law failed in the tested loop nearest to a state and a set-point */
 static int failed_near(mat x, mat x_ref) {
     double nearest[2] = {INFINITY, INFINITY};
     EACH(k, N_LOOPS) {
-        double start = apart(LOOP_STARTS + k * NX, x.a);
-        double *least = nearest + LOOP_LOST[k];
-        *least = smaller(*least, larger(start, apart(LOOP_SETPOINTS + k * NX, x_ref.a)));
+        double start = apart(VERIFIED_LOOPS_STARTS + k * NX, x.a);
+        double *least = nearest + VERIFIED_LOOPS_LOST[k];
+        *least = smaller(*least, larger(start, apart(VERIFIED_LOOPS_SETPOINTS + k * NX, x_ref.a)));
     }
     return nearest[1] < nearest[0];
+}
+
+static double dot(const double *x, const double *y) {
+    double sum = 0.0;
+    EACH(i, NX) sum += x[i] * y[i];
+    return sum;
 }
 
 /* Product of the powers of x, differentiated by x_i and x_j where these are not negative */
@@ -196,15 +203,17 @@ static double monomial(const int *powers, mat x, int i, int j) {
 
 /* The feature k of the lift (1, 1), its slope (1, NX) and its bend (NX, NX) */
 static mat feature(int k, mat x, mat *slope, mat *bend) {
+    const double *w = OBSERVABLES_W + k * NX;
     const int *powers = POWERS + k * NX;
-    mat value = zeros(1, 1), w = of(1, NX, NETWORK ? WEIGHT + k * NX : NULL);
-    double h = NETWORK ? tanh(BIAS[k] + mul(w, x).a[0]) : 0.0, s = 1.0 - h * h;
+    double h = NETWORK ? tanh(OBSERVABLES_B[k] + dot(w, x.a)) : 0.0, s = 1.0 - h * h;
+    mat value = zeros(1, 1);
     value.a[0] = NETWORK ? h - AT_ZERO[k] : monomial(powers, x, -1, -1);
-    *slope = scaled(s, w);
-    *bend = scaled(-2.0 * h * s, mul(transposed(w), w));
-    EACH(i, NETWORK ? 0 : NX) {
-        slope->a[i] = monomial(powers, x, i, -1);
-        EACH(j, NX) bend->a[i * NX + j] = monomial(powers, x, i, j);
+    *slope = zeros(1, NX);
+    *bend = zeros(NX, NX);
+    EACH(i, NX) {
+        slope->a[i] = NETWORK ? s * w[i] : monomial(powers, x, i, -1);
+        EACH(j, NX) bend->a[i * NX + j] =
+            NETWORK ? -2.0 * h * s * w[i] * w[j] : monomial(powers, x, i, j);
     }
     return value;
 }
@@ -242,11 +251,11 @@ static mat secants(int rows, const double *O, mat x, mat x_ref, mat w, mat *H) {
     EACH(k, N_PHI) {
         mat m = zeros(1, NX), h = m;
         if (NETWORK) {
-            mat v = of(1, NX, WEIGHT + k * NX);
-            double a = BIAS[k] + mul(v, x).a[0], b = BIAS[k] + mul(v, x_ref).a[0];
+            const double *v = OBSERVABLES_W + k * NX;
+            double a = OBSERVABLES_B[k] + dot(v, x.a), b = OBSERVABLES_B[k] + dot(v, x_ref.a);
             double d = a - b + copysign(1e-300, a - b);
-            m = scaled(tanh(d) / d * (1.0 - tanh(a) * tanh(b)), v);
-            h = scaled(-(tanh(a) + tanh(b)) * mul(m, w).a[0], v);
+            m = scaled(tanh(d) / d * (1.0 - tanh(a) * tanh(b)), of(1, NX, v));
+            h = scaled(-(tanh(a) + tanh(b)) * dot(m.a, w.a), of(1, NX, v));
         }
         EACH(node, NETWORK ? 0 : 5) {
             feature(k, between(x_ref, x, node), &slope, &bend);
@@ -264,7 +273,7 @@ static mat drift(int linear, mat x, mat *J) {
     mat N, AN, slope, bend, pre = of(NX, NX, PRE_FEEDBACK), bent = zeros(NX, NX);
     *J = of(NX, NX, SLOPE);
     if (linear) return mul(*J, x);
-    if (READ_OUT) return lift(NX, DRIFT, x, J);
+    if (READ_OUT) return lift(NX, MODEL_READOUT, x, J);
     /* f = N'^+ A N, and the derivative of N''N' f = N''A N by each state */
     mat rate = lift(NZ, RATE, x, &AN);
     lift(NZ, LIFT, x, &N);
@@ -282,10 +291,10 @@ static mat drift(int linear, mat x, mat *J) {
 
 /* B(x) (NX, NU), and the derivative J (NX, NX) of B(x) u */
 static mat input_matrix(int linear, mat x, mat u, mat *J) {
-    mat B = of(NX, NU, INPUT_MATRIX);
+    mat B = of(NX, NU, MODEL_B);
     *J = zeros(NX, NX);
     EACH(k, linear ? 0 : N_TERMS) {
-        mat term = of(NX, NU, TERMS + k * NX * NU), slope = zeros(1, NX);
+        mat term = of(NX, NU, INPUT_TERMS_COEFFICIENTS + k * NX * NU), slope = zeros(1, NX);
         EACH(i, NX) slope.a[i] = monomial(TERM_POWERS + k * NX, x, i, -1);
         *J = plus(*J, 1.0, mul(mul(term, u), slope));
         B = plus(B, monomial(TERM_POWERS + k * NX, x, -1, -1), term);
@@ -316,7 +325,7 @@ static mat input_secant(mat x, mat x_ref, mat u) {
 /* The mean of the drift's derivative (NX, NX) between two states */
 static mat averaged(mat x, mat x_ref) {
     mat mean = zeros(NX, NX), J;
-    if (READ_OUT) return secants(NX, DRIFT, x, x_ref, x, &J);
+    if (READ_OUT) return secants(NX, MODEL_READOUT, x, x_ref, x, &J);
     EACH(node, 5) {
         drift(0, between(x_ref, x, node), &J);
         mean = plus(mean, SHARES[node], J);
@@ -405,7 +414,7 @@ static int riccati(mat A, mat B, double h, mat *K) {
     /* the equation less P on both sides, whose terms shrink with the interval */
     mat rest = plus(plus(plus(plus(Q, 1.0, square), 1.0, PA), 1.0, transposed(PA)), -1.0, feedback);
     double terms = size(Q) + 2.0 * size(PA) + size(square) + size(feedback);
-    if (!(size(rest) / terms <= MAX_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
+    if (!(size(rest) / terms <= MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
     return contracts(scaled(1.0 / MAX_GAIN / MAX_GAIN, mul(*K, transposed(*K)))) ? KOOPMAN_OK
         : KOOPMAN_GAIN_TOO_LARGE;
 }
@@ -422,38 +431,51 @@ static int decays(mat slope, mat action, double h) {
                           diagonal(NX, 1.0)));
 }
 
-/* --- Control laws --- */
+/* --- The control law --- */
 
-typedef struct {
-    mat x, u, forcing;                      /* forcing: B(x) u + w */
-} target_t;
+/* A command within its range, and within its rate of one before */
+static mat limited(mat u, const double *previous, double seconds) {
+    EACH(i, NU) {
+        double reach = isinf(LIMITS_RATE[i]) ? INFINITY : LIMITS_RATE[i] * larger(0.0, seconds);
+        u.a[i] = within(u.a[i], LIMITS_LOWER[i], LIMITS_UPPER[i]);
+        if (previous) u.a[i] = within(u.a[i], previous[i] - reach, previous[i] + reach);
+    }
+    return u;
+}
 
-/* u = u_ref - K e by the law of a model, in deviations; returns its status. */
-static int law(int linear, mat x, const target_t *to, double h, mat *u) {
-    mat J, K, M, e, slope, D = zeros(NX, NX), B = input_matrix(linear, x, to->u, &J);
+/* The law u = u_ref - K e of a model towards a target (x_ref, u_ref): a command in its units,
+ * within its range; returns a status. */
+static int law(int linear, const koopman_estimate *estimate, mat target, double interval, mat *u) {
+    mat x = of(NX, 1, estimate->x), x_ref = block(target, 0, 0, NX, 1);
+    mat u_ref = block(target, NX, 0, NU, 1), D = zeros(NX, NX), J, K, M, e, slope;
+    mat B = input_matrix(linear, x, u_ref, &J), B_ref = input_matrix(linear, x_ref, u_ref, &J);
+    double h = interval / TIME_UNIT;
     int status = KOOPMAN_NOT_STABILISABLE;
-    if (!linear) D = input_secant(x, to->x, to->u);
+    if (!linear) D = input_secant(x, x_ref, u_ref);
     if (CLOSED && !linear) {
         /* re-centred: e = N(x) - N(x_ref), e' = (A + H C) e + N' B v */
-        mat N, N_ref, H, A = of(NZ, NZ, DYNAMICS), loop = A, pre = of(NX, NX, PRE_FEEDBACK);
-        M = secants(NZ, LIFT, x, to->x, plus(to->forcing, -1.0, mul(pre, to->x)), &H);
-        e = plus(lift(NZ, LIFT, x, &N), -1.0, lift(NZ, LIFT, to->x, &N_ref));
+        mat N, N_ref, H, A = of(NZ, NZ, MODEL_A), loop = A, pre = of(NX, NX, PRE_FEEDBACK);
+        mat forcing = plus(of(NX, 1, estimate->w), 1.0, mul(B_ref, u_ref));
+        M = secants(NZ, LIFT, x, x_ref, plus(forcing, -1.0, mul(pre, x_ref)), &H);
+        e = plus(lift(NZ, LIFT, x, &N), -1.0, lift(NZ, LIFT, x_ref, &N_ref));
         H = plus(H, 1.0, mul(N, plus(D, -1.0, pre)));
         put(&loop, 0, 0, plus(block(A, 0, 0, NZ, NX), 1.0, H));
         status = riccati(loop, mul(N, B), h, &K);
-        slope = READ_OUT ? plus(averaged(x, to->x), 1.0, D)
+        slope = READ_OUT ? plus(averaged(x, x_ref), 1.0, D)
             : mul(inverse(N), plus(mul(A, M), 1.0, H));
     }
     if (status != KOOPMAN_OK) {
-        slope = linear ? of(NX, NX, SLOPE) : plus(averaged(x, to->x), 1.0, D);
+        slope = linear ? of(NX, NX, SLOPE) : plus(averaged(x, x_ref), 1.0, D);
         M = diagonal(NX, 1.0);
-        e = plus(x, -1.0, to->x);
+        e = plus(x, -1.0, x_ref);
         status = riccati(slope, B, h, &K);
     }
     if (status != KOOPMAN_OK) return status;
-    *u = plus(to->u, -1.0, mul(K, e));
-    return decays(slope, scaled(-1.0, mul(B, mul(K, M))), h) ? KOOPMAN_OK
-        : KOOPMAN_PREDICTED_UNSTABLE;
+    if (!decays(slope, scaled(-1.0, mul(B, mul(K, M))), h)) return KOOPMAN_PREDICTED_UNSTABLE;
+    *u = physical(OF_U, plus(u_ref, -1.0, mul(K, e)));
+    if (!finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
+    *u = limited(*u, NULL, 0.0);
+    return KOOPMAN_OK;
 }
 
 /* --- Steady states --- */
@@ -509,35 +531,32 @@ static void bring_within(int linear, mat w, double *reach, mat anchor, double sl
     }
 }
 
-/* The steady state of a set-point (NC), in its units, under a disturbance; returns 0 for none. */
-static int find_target(int linear, const double *setpoint, mat w, mat start, target_t *target) {
-    mat y = start, J, none = zeros(NXU, 1), u;
+/* Find the steady state y = (x, u) of a set-point (NC), in its units, under a disturbance; y is
+ * where to begin. Returns 0 where there is none. */
+static int find_target(int linear, const double *setpoint, mat w, mat *y) {
+    mat none = zeros(NXU, 1), J, u;
     double reach[NXU];
     int inside = 1;
     EACH(k, NXU) reach[k] = 1.0;
     EACH(i, NC) {
         int k = CONTROLLED[i];
-        y.a[k] = (setpoint[i] - X_CENTER[k]) / X_SCALE[k];
+        y->a[k] = (setpoint[i] - STATES_CENTER[k]) / STATES_SCALE[k];
         reach[k] = 0.0;
     }
-    target->x = block(y, 0, 0, NX, 1);
     if (CONTROLS_ALL) {
-        mat f = rate_under(linear, target->x, zeros(NU, 1), w, &J);
-        put(&y, NX, 0, scaled(-1.0, mul(inverse(block(J, 0, NX, NX, NU)), f)));
+        mat f = rate_under(linear, block(*y, 0, 0, NX, 1), zeros(NU, 1), w, &J);
+        put(y, NX, 0, scaled(-1.0, mul(inverse(block(J, 0, NX, NX, NU)), f)));
     } else {
-        if (!equilibrium(linear, w, reach, none, &y)) return 0;
-        bring_within(linear, w, reach, none, 0.0, INFINITY, NU - NC, &y);
+        if (!equilibrium(linear, w, reach, none, y)) return 0;
+        bring_within(linear, w, reach, none, 0.0, INFINITY, NU - NC, y);
     }
-    u = physical(OF_U, block(y, NX, 0, NU, 1));
-    EACH(i, NU) inside = inside && u.a[i] >= U_LOWER[i] && u.a[i] <= U_UPPER[i];
+    u = physical(OF_U, block(*y, NX, 0, NU, 1));
+    EACH(i, NU) inside = inside && u.a[i] >= LIMITS_LOWER[i] && u.a[i] <= LIMITS_UPPER[i];
     if (NU > 1 && NC <= NU && !inside) {
         EACH(k, NXU) reach[k] = 1e3;
         EACH(i, NC) reach[CONTROLLED[i]] = 1.0;
-        bring_within(linear, w, reach, y, 1e-6, 2.0, NU, &y);
+        bring_within(linear, w, reach, *y, 1e-6, 2.0, NU, y);
     }
-    target->x = block(y, 0, 0, NX, 1);
-    target->u = block(y, NX, 0, NU, 1);
-    target->forcing = plus(w, 1.0, mul(input_matrix(linear, target->x, target->u, &J), target->u));
     return 1;
 }
 
@@ -592,7 +611,7 @@ static int predicted(int linear, koopman_estimate *e, const double *input, doubl
 /* Take the outputs of a state into account, so many seconds after the last ones. */
 static void correct(koopman_estimate *e, mat x, double seconds) {
     mat error = plus(x, -1.0, of(NX, 1, e->x)), gain = zeros(2 * NX, NX);
-    double p = exp(-BANDWIDTH * seconds);
+    double p = exp(-OBSERVER_BANDWIDTH * seconds);
     if (KALMAN) {
         mat P = of(NP, NP, e->P), H = of(NY, NP, H_OUTPUT), R = of(NY, NY, NOISE), HP = mul(H, P);
         mat K = transposed(solve(plus(mul(HP, transposed(H)), 1.0, R), HP));
@@ -665,17 +684,13 @@ static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double 
     return end;
 }
 
-/* Append an input in place of those from its time on; drop those that no longer act. */
+/* Append an input in place of those from its time on. */
 static void enqueue(koopman_state *s, int64_t time, const double *u) {
-    int begin = 0;
     while (s->queued > 0 && s->applied_at[s->queued - 1] >= time) s->queued--;
-    if (!LONGEST_DEAD_TIME) begin = s->queued;
-    else if (s->queued > 0) begin = applied_by(s, time - LONGEST_DEAD_TIME);
-    if (s->queued - begin == QUEUE) begin++;
-    s->queued -= begin;
-    EACH(k, s->queued) {
-        s->applied_at[k] = s->applied_at[k + begin];
-        EACH(i, NU) s->applied[k][i] = s->applied[k + begin][i];
+    if (s->queued == QUEUE) {
+        memmove(s->applied_at, s->applied_at + 1, sizeof s->applied_at - sizeof *s->applied_at);
+        memmove(s->applied, s->applied + 1, sizeof s->applied - sizeof *s->applied);
+        s->queued--;
     }
     s->applied_at[s->queued] = time;
     store(of(NU, 1, u), s->applied[s->queued++]);
@@ -683,22 +698,40 @@ static void enqueue(koopman_state *s, int64_t time, const double *u) {
 
 /* The rate that is due to the measured disturbances */
 static mat feed_forward(const koopman_state *s) {
-    return mul(of(NX, ND, BY_DISTURBANCE), deviation(OF_D, s->disturbance));
+    return mul(of(NX, ND, MODEL_E), deviation(OF_D, s->disturbance));
+}
+
+/* Predict an estimate from one time to another; returns 0 where it is lost. Pieces of the time that
+ * are shorter than a share of the fastest time constant are taken together, by their mean; inputs
+ * with a dead time up to `acts` are held. */
+static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end, double share,
+                       int64_t acts, mat held, koopman_estimate *e) {
+    double time = 0.0, u[NU];
+    mat sum = zeros(NU, 1);
+    for (int64_t next; begin < end; begin = next) {
+        next = piece(s, begin, end, u);
+        double seconds = (double)(next - begin) / SECOND, count;
+        EACH(i, NU) sum.a[i] += seconds * (DEAD_TIME[i] <= acts ? held.a[i] : u[i]);
+        time += seconds;
+        if (time * FASTEST_RATE < share && next < end) continue;
+        count = share > 0.0 ? larger(1.0, ceil(time * FASTEST_RATE)) : 1.0;
+        sum = scaled(1.0 / time, sum);
+        EACH(k, count) if (!predicted(linear, e, sum.a, time / count)) return 0;
+        sum = zeros(NU, 1);
+        time = 0.0;
+    }
+    return 1;
 }
 
 /* Predict an estimate up to now, where there is one; as uncertain as at first where it is lost. */
 static void predict(const koopman_state *s, double elapsed, koopman_estimate *e) {
     koopman_estimate before = *e;
-    double u[NU];
+    int linear = LINEAR[model_level(&s->supervisor)];
     if (!e->known || !(elapsed > 0.0)) return;
     add(NX, 1.0, feed_forward(s).a, e->w);
-    for (int64_t begin = s->commanded_at, end; begin < s->now; begin = end) {
-        end = piece(s, begin, s->now, u);
-        if (predicted(LINEAR[model_level(&s->supervisor)], e, u, (double)(end - begin) / SECOND))
-            continue;
+    if (!over_pieces(s, linear, s->commanded_at, s->now, 0.0, -1, zeros(NU, 1), e)) {
         *e = before;
         store(of(NP, NP, FIRST_COVARIANCE), e->P);
-        break;
     }
     store(of(NX, 1, before.w), e->w);
 }
@@ -708,7 +741,7 @@ static void predict(const koopman_state *s, double elapsed, koopman_estimate *e)
 /* The state of a measurement (NY); what that leaves open is as estimated, or in a steady state. */
 static mat position(const koopman_estimate *e, const double *y) {
     mat C = of(NY, NX, OUTPUTS), onto = of(NX, NY, FROM_OUTPUTS), rest = of(NY, 1, y), found;
-    mat state = e->known ? physical(OF_X, of(NX, 1, e->x)) : of(NX, 1, X_CENTER);
+    mat state = e->known ? physical(OF_X, of(NX, 1, e->x)) : of(NX, 1, STATES_CENTER);
     double reach[NXU];
     if (DETERMINED) return mul(onto, rest);
     state = plus(state, 1.0, mul(onto, plus(rest, -1.0, mul(C, state))));
@@ -734,8 +767,8 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
     }
     EACH(i, first ? 0 : NY) {
         change[i] = fabs(y[i] - before->accepted[i]);
-        worst = larger(worst, change[i] / (MAX_STEP[i] + MAX_RATE[i] * seconds));
-        *moved = *moved || (before->jumped && change[i] > MAX_STEP[i]);
+        worst = larger(worst, change[i] / (SENSOR_JUMP[i] + SENSOR_RATE[i] * seconds));
+        *moved = *moved || (before->jumped && change[i] > SENSOR_JUMP[i]);
         still = still || change[i] == 0.0;
     }
     s->jumped = worst > 1.0;
@@ -748,15 +781,15 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
         /* elsewhere the model's motion is worth little */
         store(of(NX, 1, before->still_w), moves.w);
         predict(before, elapsed, &moves);
-        EACH(i, NX) moves.x[i] = (moves.x[i] - before->estimate.x[i]) * X_SCALE[i];
+        EACH(i, NX) moves.x[i] = (moves.x[i] - before->estimate.x[i]) * STATES_SCALE[i];
         travel = mul(of(NY, NX, OUTPUTS), of(NX, 1, moves.x));
     }
     EACH(i, NY) {
         int stays = still && change[i] == 0.0;
         if (!stays) s->still_since[i] = s->now;
         s->travel[i] = stays ? s->travel[i] + travel.a[i] : 0.0;
-        stuck = stuck || (fabs(s->travel[i]) > 0.5 * MAX_STEP[i] && STUCK_TIMEOUT > 0.0
-                          && since(s, s->still_since[i]) > STUCK_TIMEOUT);
+        stuck = stuck || (fabs(s->travel[i]) > 0.5 * SENSOR_JUMP[i] && SENSOR_STUCK_SENSOR_TIMEOUT > 0.0
+                          && since(s, s->still_since[i]) > SENSOR_STUCK_SENSOR_TIMEOUT);
     }
     return stuck ? KOOPMAN_FROZEN : KOOPMAN_OK;
 }
@@ -769,24 +802,24 @@ static void disturbed(koopman_state *s, const double *d) {
     EACH(i, ND) {
         int never = s->disturbed_at[i] == NEVER;
         double seconds = since(s, s->disturbed_at[i]), step = d[i] - s->disturbance[i];
-        int lost = s->unmeasured[i] && BANDWIDTH > 0.0 && (never || seconds * BANDWIDTH > 1.0);
-        s->unmeasured[i] = !(d[i] >= D_LOWER[i] && d[i] <= D_UPPER[i])
-            || (seconds > 0.0 && fabs(step) > D_RATE[i] * seconds);
+        int lost = s->unmeasured[i] && OBSERVER_BANDWIDTH > 0.0 && (never || seconds * OBSERVER_BANDWIDTH > 1.0);
+        s->unmeasured[i] = !(d[i] >= DISTURBANCES_LOWER[i] && d[i] <= DISTURBANCES_UPPER[i])
+            || (seconds > 0.0 && fabs(step) > DISTURBANCES_RATE[i] * seconds);
         if (s->unmeasured[i]) continue;
         s->disturbance[i] = d[i];
         s->disturbed_at[i] = s->now;
-        change.a[i] = lost ? step / D_SCALE[i] : 0.0;
+        change.a[i] = lost ? step / DISTURBANCES_SCALE[i] : 0.0;
         any = any || change.a[i] != 0.0;
     }
     if (!any || !s->estimate.known) return;
-    store(as_disturbance(plus(w, -1.0, mul(of(NX, ND, BY_DISTURBANCE), change))), s->estimate.w);
+    store(as_disturbance(plus(w, -1.0, mul(of(NX, ND, MODEL_E), change))), s->estimate.w);
 }
 
 /* Take into account that the last command was not followed, where applied inputs are measured. */
 static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
     EACH(i, finite(of(NU, 1, applied)) ? NU : 0)
-        last[i] = within(s->command[i], applied[i] - TOLERANCE[i], applied[i] + TOLERANCE[i]);
+        last[i] = within(s->command[i], applied[i] - TRACKING_TOLERANCE[i], applied[i] + TRACKING_TOLERANCE[i]);
 }
 
 /* Check a measurement and take it into account: the state that it stands for, in its units, and
@@ -812,7 +845,7 @@ static int observe(koopman_state *s, const double *y, double elapsed, double *ou
         u = deviation(OF_U, held);
         restart(linear, e, x, s->commanded ? &u : NULL, feed_forward(s));
     } else if (moved || !(elapsed > 0.0) || *outside > MARGIN[LAWS - 1]
-               || (silent * BANDWIDTH > 2.0 && silent > 1.5 * s->interval)) {
+               || (silent * OBSERVER_BANDWIDTH > 2.0 && silent > 1.5 * s->interval)) {
         restart(linear, e, x, NULL, x);
     } else {
         correct(e, x, elapsed);
@@ -860,59 +893,18 @@ static request_t allowed(const koopman_supervisor *s, double outside) {
     return (request_t){0, 0, KOOPMAN_OK, KOOPMAN_OK};
 }
 
-/* A command within its range, and within its rate of one before */
-static mat limited(mat u, const double *previous, double seconds) {
-    EACH(i, NU) {
-        double reach = isinf(RATE_LIMIT[i]) ? INFINITY : RATE_LIMIT[i] * larger(0.0, seconds);
-        u.a[i] = within(u.a[i], U_LOWER[i], U_UPPER[i]);
-        if (previous) u.a[i] = within(u.a[i], previous[i] - reach, previous[i] + reach);
-    }
-    return u;
-}
-
-/* Evaluate a law, in units within range; returns its status. */
-static int evaluate(int linear, const koopman_estimate *e, const target_t *target, double interval,
-                    mat *u) {
-    int status = law(linear, of(NX, 1, e->x), target, interval / TIME_UNIT, u);
-    if (status != KOOPMAN_OK) return status;
-    if (!finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
-    *u = limited(physical(OF_U, *u), NULL, 0.0);
-    return KOOPMAN_OK;
-}
-
-/* Predict an estimate from one time to another, short pieces by their mean; returns 0 where it is
- * lost. Inputs with a dead time up to `acts` are held. */
-static int ahead(const koopman_state *s, int linear, int64_t begin, int64_t end, int64_t acts,
-                 mat held, koopman_estimate *e) {
-    double time = 0.0, u[NU];
-    mat sum = zeros(NU, 1);
-    for (int64_t next; begin < end; begin = next) {
-        next = piece(s, begin, end, u);
-        double seconds = (double)(next - begin) / SECOND, count;
-        EACH(i, NU) sum.a[i] += seconds * (DEAD_TIME[i] <= acts ? held.a[i] : u[i]);
-        time += seconds;
-        if (time * FASTEST_RATE < 0.1 && next < end) continue;
-        count = larger(1.0, ceil(time * FASTEST_RATE));
-        sum = scaled(1.0 / time, sum);
-        EACH(k, count) if (!predicted(linear, e, sum.a, time / count)) return 0;
-        sum = zeros(NU, 1);
-        time = 0.0;
-    }
-    return 1;
-}
-
 /* Evaluate the law for each input at the state predicted for the time at which it acts; the faster
  * inputs follow the law until then. */
 static int evaluate_ahead(const koopman_state *s, int linear, koopman_estimate *e,
-                          const target_t *target, double interval, mat *u) {
+                          mat target, double interval, mat *u) {
     const double span = (double)(LONGEST_DEAD_TIME - SHORTEST_DEAD_TIME);
     double count = interval > 0.0 ? smaller(20.0, ceil(span / SECOND / interval)) : 1.0;
     mat held = zeros(NU, 1), later;
     int status;
-    if (!s->queued) return evaluate(linear, e, target, interval, u);
-    if (!ahead(s, linear, s->now, s->now + SHORTEST_DEAD_TIME, -1, held, e))
+    if (!s->queued) return law(linear, e, target, interval, u);
+    if (!over_pieces(s, linear, s->now, s->now + SHORTEST_DEAD_TIME, 0.1, -1, held, e))
         return KOOPMAN_NOT_PREDICTED;
-    status = evaluate(linear, e, target, interval, u);
+    status = law(linear, e, target, interval, u);
     held = *u;
     for (int64_t begin = SHORTEST_DEAD_TIME, end; begin < LONGEST_DEAD_TIME; begin = end) {
         if (status != KOOPMAN_OK) return status;
@@ -922,9 +914,9 @@ static int evaluate_ahead(const koopman_state *s, int linear, koopman_estimate *
             int64_t edge = (int64_t)rint(k * (span / count) + (double)SHORTEST_DEAD_TIME);
             if (edge > begin && edge < end) end = edge;
         }
-        if (!ahead(s, linear, s->now + begin, s->now + end, begin, held, e))
+        if (!over_pieces(s, linear, s->now + begin, s->now + end, 0.1, begin, held, e))
             return KOOPMAN_NOT_PREDICTED;
-        status = evaluate(linear, e, target, (double)(end - begin) / SECOND, &later);
+        status = law(linear, e, target, (double)(end - begin) / SECOND, &later);
         EACH(i, NU) if (DEAD_TIME[i] == end) u->a[i] = later.a[i];
         held = limited(later, held.a, (double)(end - begin) / SECOND);
     }
@@ -958,7 +950,7 @@ static void recover(koopman_state *s, int fault, double outside) {
 
 /* Let the offset of a bumpless transfer fade with d (1 + t/T) exp(-t/T). */
 static void fade(koopman_state *s, double seconds) {
-    double share = seconds / TRANSFER_TIME, offset = 0.0, feed = 0.0;
+    double share = seconds / BUMPLESS_TRANSFER_TIME, offset = 0.0, feed = 0.0;
     EACH(i, NU) {
         s->offset[i] = exp(-share) * (s->offset[i] + share * s->feed[i]);
         s->feed[i] *= exp(-share);
@@ -973,14 +965,9 @@ static mat automatic(koopman_state *s, int fault, double outside, double elapsed
 {
     const koopman_supervisor before = s->supervisor;
     request_t to = allowed(&before, outside);
-    mat u = zeros(NU, 1), start = zeros(NXU, 1);
-    target_t target = {start, u, start};
+    mat u = zeros(NU, 1), target;
     int targeted = 0, from = model_level(&before), level;
     if (fault != KOOPMAN_OK) to = (request_t){KOOPMAN_HOLD, 1, fault, fault};
-    if (s->targeted) {
-        put(&start, 0, 0, deviation(OF_X, s->target));
-        put(&start, NX, 0, deviation(OF_U, s->target + NX));
-    }
     for (;;) {
         s->supervisor = supervised(&before, to, s->now);
         level = s->supervisor.level;
@@ -989,9 +976,10 @@ static mat automatic(koopman_state *s, int fault, double outside, double elapsed
         int status = KOOPMAN_NO_STEADY_STATE, linear = LINEAR[level], lost;
         transfer(&e, from, level);
         add(NX, 1.0, feed_forward(s).a, e.w);
-        targeted = find_target(linear, s->setpoint, of(NX, 1, e.w), start, &target);
-        lost = level + 1 < LAWS && !linear && failed_near(of(NX, 1, e.x), target.x);
-        if (targeted) status = evaluate_ahead(s, linear, &e, &target, interval, &u);
+        target = of(NXU, 1, s->target);
+        targeted = find_target(linear, s->setpoint, of(NX, 1, e.w), &target);
+        lost = level + 1 < LAWS && !linear && failed_near(of(NX, 1, e.x), target);
+        if (targeted) status = evaluate_ahead(s, linear, &e, target, interval, &u);
         if (status != KOOPMAN_OK)
             to = (request_t){level + 1, 0, KOOPMAN_LAW_FAILED, status};
         else if (lost)
@@ -1000,13 +988,9 @@ static mat automatic(koopman_state *s, int fault, double outside, double elapsed
     }
     recover(s, fault, outside);
     transfer(&s->estimate, from, model_level(&s->supervisor));
-    if (targeted && !CONTROLS_ALL) {
-        store(physical(OF_X, target.x), s->target);
-        store(physical(OF_U, target.u), s->target + NX);
-        s->targeted = 1;
-    }
+    if (targeted && !CONTROLS_ALL) store(target, s->target);
     if (level < LAWS) {
-        if (s->law != level && s->commanded && TRANSFER_TIME > 0.0) {
+        if (s->law != level && s->commanded && BUMPLESS_TRANSFER_TIME > 0.0) {
             EACH(i, NU) s->offset[i] = s->feed[i] = s->command[i] - u.a[i];
             s->transferring = 1;
         } else if (s->transferring) {
@@ -1025,15 +1009,8 @@ static mat automatic(koopman_state *s, int fault, double outside, double elapsed
 /* Command, after a measurement that is accepted or has a fault, or without one. */
 static void command(koopman_state *s, int fault, double outside, double elapsed, double interval,
                     double counted) {
-    mat u;
-    if (!s->commanded) store(of(NU, 1, U_CENTER), s->command);
-    if (s->manual) {
-        u = of(NU, 1, s->manual_known ? s->manual_input : s->command);
-        s->law = -1;
-        s->transferring = 0;
-    } else {
-        u = automatic(s, fault, outside, elapsed, interval);
-    }
+    if (!s->commanded) store(of(NU, 1, INPUTS_CENTER), s->command);
+    mat u = automatic(s, fault, outside, elapsed, interval);
     store(limited(u, s->commanded ? s->command : NULL, counted), s->command);
     s->commanded = 1;
     s->commanded_at = s->now;
@@ -1046,40 +1023,28 @@ static void advance(koopman_state *s, mat state, double seconds) {
         int k = CONTROLLED[i];
         double *active = s->setpoint + i, *ramped = s->ramped + i;
         double reach = isinf(SETPOINT_RAMP[i]) ? INFINITY : SETPOINT_RAMP[i] * seconds;
-        if (!s->active) *active = *ramped = within(state.a[k], X_LOWER[k], X_UPPER[k]);
+        if (!s->active) *active = *ramped = within(state.a[k], STATES_LOWER[k], STATES_UPPER[k]);
         if (isnan(s->requested[i])) s->requested[i] = *active;
         *ramped = within(s->requested[i], *ramped - reach, *ramped + reach);
-        if (FILTER_TIME > 0.0) *active -= expm1(-seconds / FILTER_TIME) * (*ramped - *active);
+        if (SETPOINT_FILTER_TIME > 0.0) *active -= expm1(-seconds / SETPOINT_FILTER_TIME) * (*ramped - *active);
         else *active = *ramped;
     }
     s->active = 1;
 }
 
-/* Take requests of the operator; returns 1 where the set-point is refused. */
-static int requests(koopman_state *s, const koopman_inputs *inputs) {
-    int refused = 0;
-    if (!inputs->manual != !s->manual) {
-        s->manual = !s->manual;
-        s->manual_known = s->recovering = 0;
-        transfer(&s->estimate, model_level(&s->supervisor), 0);
-        s->supervisor = (koopman_supervisor){-1, -1, KOOPMAN_OK, KOOPMAN_OK, NEVER, NEVER};
-    }
-    if (s->manual && finite(of(NU, 1, inputs->manual_input))) {
-        store(of(NU, 1, inputs->manual_input), s->manual_input);
-        s->manual_known = 1;
-    }
-    EACH(i, NC) refused = refused || inputs->setpoint[i] < X_LOWER[CONTROLLED[i]]
-        || inputs->setpoint[i] > X_UPPER[CONTROLLED[i]];
-    EACH(i, refused ? 0 : NC)
-        if (!isnan(inputs->setpoint[i])) s->requested[i] = inputs->setpoint[i];
-    return refused;
+/* Request a set-point; returns 1 where it is refused. */
+static int request(koopman_state *s, const double *setpoint) {
+    EACH(i, NC) if (setpoint[i] < STATES_LOWER[CONTROLLED[i]]
+                    || setpoint[i] > STATES_UPPER[CONTROLLED[i]]) return 1;
+    EACH(i, NC) if (!isnan(setpoint[i])) s->requested[i] = setpoint[i];
+    return 0;
 }
 
 void koopman_init(koopman_state *s, const double *applied) {
     *s = (koopman_state){0};
     s->measured_at = s->commanded_at = s->accepted_at = NEVER;
     EACH(i, ND) s->disturbed_at[i] = NEVER;
-    store(of(ND, 1, D_CENTER), s->disturbance);
+    store(of(ND, 1, DISTURBANCES_CENTER), s->disturbance);
     s->law = -1;
     s->interval = INFINITY;
     s->supervisor = (koopman_supervisor){-1, -1, KOOPMAN_OK, KOOPMAN_OK, NEVER, NEVER};
@@ -1093,7 +1058,7 @@ void koopman_init(koopman_state *s, const double *applied) {
 void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_outputs *outputs) {
     int fault = KOOPMAN_OK, received = inputs->received;
     if (inputs->elapsed_ns > 0) s->now += inputs->elapsed_ns;
-    outputs->setpoint_refused = requests(s, inputs);
+    outputs->setpoint_refused = request(s, inputs->setpoint);
     if (received ? !s->commanded || s->measured_at != s->now : s->commanded) {
         double usual = isinf(s->interval) ? 0.0 : s->interval, gap = since(s, s->measured_at);
         double elapsed = since(s, s->commanded_at), outside = NAN, counted = 0.0;
@@ -1121,16 +1086,15 @@ void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_output
             *s = before;
             if (received) s->measured_at = s->now;
             s->law = -1;
-            s->transferring = s->recovering = s->targeted = s->estimate.known = 0;
-            fault = KOOPMAN_CALCULATION_FAILED;
-            command(s, fault, NAN, elapsed, interval, counted);
+            s->transferring = s->recovering = s->estimate.known = 0;
+            store(zeros(NXU, 1), s->target);
+            command(s, KOOPMAN_CALCULATION_FAILED, NAN, elapsed, interval, counted);
         }
     }
     if (s->commanded) {
-        outputs->level = s->manual ? KOOPMAN_MANUAL : s->supervisor.level < 0 ? 0
-            : s->supervisor.level;
-        outputs->status = s->manual ? fault : s->supervisor.status;
-        outputs->cause = s->manual ? fault : s->supervisor.cause;
+        outputs->level = s->supervisor.level;
+        outputs->status = s->supervisor.status;
+        outputs->cause = s->supervisor.cause;
     } else {
         outputs->level = KOOPMAN_SAFE;
         outputs->status = outputs->cause = KOOPMAN_NO_MEASUREMENT;

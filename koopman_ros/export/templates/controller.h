@@ -16,7 +16,7 @@ extern "C" {
 
 /* The control level that acts; the levels of the laws are numbered from the best one, 0. */
 enum {
-    KOOPMAN_HOLD = KOOPMAN_LAWS, KOOPMAN_SAFE, KOOPMAN_MANUAL
+    KOOPMAN_HOLD = KOOPMAN_LAWS, KOOPMAN_SAFE
 };
 
 enum {
@@ -31,8 +31,6 @@ typedef struct {
     double setpoint[KOOPMAN_NC];        /* NAN: no request, the one before stays */
     double applied[KOOPMAN_NU];         /* measured inputs; NAN: not measured */
     double disturbance[KOOPMAN_ND];     /* measured disturbances; NAN: the one before stays */
-    int manual;                         /* 1: command manual_input, and no law */
-    double manual_input[KOOPMAN_NU];    /* NAN: the one before stays */
 } koopman_inputs;
 
 typedef struct {
@@ -57,8 +55,8 @@ typedef struct {
 
 typedef struct {
     int64_t now, measured_at, commanded_at;
-    int commanded, law, manual, manual_known, jumped, active, transferring, targeted;
-    double interval, command[KOOPMAN_NU], manual_input[KOOPMAN_NU];
+    int commanded, law, jumped, active, transferring;
+    double interval, command[KOOPMAN_NU];
     int queued;
     int64_t applied_at[KOOPMAN_QUEUE];
     double applied[KOOPMAN_QUEUE][KOOPMAN_NU];
