@@ -81,6 +81,7 @@ def loop(model: str, law: str, parameters: Path | None = None
 
 def write(loaded: LoadedModel, controller: Controller, sample_period: float, output: Path) -> None:
     """Write the files of a loop into a folder."""
+    code = {**c_code(controller, sample_period), 'example.c': template('example.c')}
     table, origin = io.StringIO(), loaded.model.provenance
     csv.writer(table, lineterminator='\n').writerows([columns(controller), *(
         [*call.row(controller), *answer]
@@ -91,9 +92,8 @@ def write(loaded: LoadedModel, controller: Controller, sample_period: float, out
         'LEVELS': ', '.join(controller.levels), 'PERIOD': f'{sample_period:g}',
         'SIGNALS': '\n'.join(f'| {role} | {", ".join(f"{name} [{unit}]" for name, unit in of)} |'
                              for role, of in signals(controller).items())}
-    readme = re.sub('@([A-Z]+)@', lambda found: facts[found[1]], template('README.md'))
-    code = c_code(controller, sample_period)
+    code['README.md'] = re.sub('@([A-Z]+)@', lambda found: facts[found[1]], template('README.md'))
+    code['test_vectors.csv'] = table.getvalue()
     output.mkdir(parents=True, exist_ok=True)
-    for name, text in {**code, 'example.c': template('example.c'), 'README.md': readme,
-                       'test_vectors.csv': table.getvalue()}.items():
+    for name, text in code.items():
         (output / name).write_text(text)
