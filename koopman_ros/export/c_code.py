@@ -190,8 +190,8 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'PARTS': (1.0, 2.0, 2.0, 1.0) if kalman else (3.0, 3.0),
         # one that measures the state takes all of a measurement, and knows no disturbance
         'OBSERVER_BANDWIDTH': tuning.observer_bandwidth if estimator.remembers else math.inf,
-        'MAX_DISTURBANCE': tuning.max_disturbance / model.inputs.scale if estimator.remembers else (
-            np.zeros(m)),
+        'MAX_DISTURBANCE': np.where(
+            estimator.remembers, tuning.max_disturbance / model.inputs.scale, 0.0),
         **({'H_OUTPUT': np.hstack((estimator._H, 0.0 * estimator._H)), 'NOISE': estimator._R,
             'INTENSITY': np.pad(estimator._intensity, ((n, 0), (n, 0))),
             'ONTO_DISTURBANCES': estimator._onto_directions,

@@ -312,25 +312,21 @@ static mat rate_under(int linear, mat x, mat u, mat w, mat *J) {
     return plus(plus(f, 1.0, mul(B, u)), 1.0, w);
 }
 
-/* D (NX, NX) with (B(x) - B(x_ref)) u = D (x - x_ref) */
-static mat input_secant(mat x, mat x_ref, mat u) {
-    mat D = zeros(NX, NX), J;
-    EACH(node, 5) {
-        input_matrix(0, between(x_ref, x, node), u, &J);
-        D = plus(D, SHARES[node], J);
-    }
-    return D;
-}
-
-/* The mean of the drift's derivative (NX, NX) between two states */
-static mat averaged(mat x, mat x_ref) {
+/* The slope A (NX, NX) of e' = A e + B v, e = x - x_ref: the means between two states of the
+ * derivatives of the drift and, D, of B(x) u */
+static mat averaged(mat x, mat x_ref, mat u, mat *D) {
     mat mean = zeros(NX, NX), J;
-    if (READ_OUT) return secants(NX, MODEL_READOUT, x, x_ref, x, &J);
+    *D = mean;
     EACH(node, 5) {
-        drift(0, between(x_ref, x, node), &J);
+        mat at = between(x_ref, x, node);
+        input_matrix(0, at, u, &J);
+        *D = plus(*D, SHARES[node], J);
+        if (READ_OUT) continue;
+        drift(0, at, &J);
         mean = plus(mean, SHARES[node], J);
     }
-    return mean;
+    if (READ_OUT) mean = secants(NX, MODEL_READOUT, x, x_ref, x, &J);
+    return plus(mean, 1.0, *D);
 }
 
 /* --- The sampled Riccati equation --- */
@@ -412,7 +408,8 @@ static int riccati(mat A, mat B, double h, mat *K) {
     *K = solve(plus(R, held, mul(transposed(push), PB)), right);
     mat feedback = mul(transposed(right), *K);
     /* the equation less P on both sides, whose terms shrink with the interval */
-    mat rest = plus(plus(plus(plus(Q, 1.0, square), 1.0, PA), 1.0, transposed(PA)), -1.0, feedback);
+    mat rest = plus(plus(Q, 1.0, square), -1.0, feedback);
+    rest = plus(plus(rest, 1.0, PA), 1.0, transposed(PA));
     double terms = size(Q) + 2.0 * size(PA) + size(square) + size(feedback);
     if (!(size(rest) / terms <= MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
     return contracts(scaled(1.0 / MAX_GAIN / MAX_GAIN, mul(*K, transposed(*K)))) ? KOOPMAN_OK
@@ -447,25 +444,25 @@ static mat limited(mat u, const double *previous, double seconds) {
  * within its range; returns a status. */
 static int law(int linear, const koopman_estimate *estimate, mat target, double interval, mat *u) {
     mat x = of(NX, 1, estimate->x), x_ref = block(target, 0, 0, NX, 1);
-    mat u_ref = block(target, NX, 0, NU, 1), D = zeros(NX, NX), J, K, M, e, slope;
-    mat B = input_matrix(linear, x, u_ref, &J), B_ref = input_matrix(linear, x_ref, u_ref, &J);
+    mat u_ref = block(target, NX, 0, NU, 1), slope = of(NX, NX, SLOPE), D, J, K, M, e;
+    mat B = input_matrix(linear, x, u_ref, &J);
     double h = interval / TIME_UNIT;
     int status = KOOPMAN_NOT_STABILISABLE;
-    if (!linear) D = input_secant(x, x_ref, u_ref);
+    if (!linear) slope = averaged(x, x_ref, u_ref, &D);
     if (CLOSED && !linear) {
         /* re-centred: e = N(x) - N(x_ref), e' = (A + H C) e + N' B v */
         mat N, N_ref, H, A = of(NZ, NZ, MODEL_A), loop = A, pre = of(NX, NX, PRE_FEEDBACK);
+        mat B_ref = input_matrix(0, x_ref, u_ref, &J);
         mat forcing = plus(of(NX, 1, estimate->w), 1.0, mul(B_ref, u_ref));
         M = secants(NZ, LIFT, x, x_ref, plus(forcing, -1.0, mul(pre, x_ref)), &H);
         e = plus(lift(NZ, LIFT, x, &N), -1.0, lift(NZ, LIFT, x_ref, &N_ref));
         H = plus(H, 1.0, mul(N, plus(D, -1.0, pre)));
         put(&loop, 0, 0, plus(block(A, 0, 0, NZ, NX), 1.0, H));
         status = riccati(loop, mul(N, B), h, &K);
-        slope = READ_OUT ? plus(averaged(x, x_ref), 1.0, D)
-            : mul(inverse(N), plus(mul(A, M), 1.0, H));
+        if (status == KOOPMAN_OK && !READ_OUT)
+            slope = mul(inverse(N), plus(mul(A, M), 1.0, H));
     }
     if (status != KOOPMAN_OK) {
-        slope = linear ? of(NX, NX, SLOPE) : plus(averaged(x, x_ref), 1.0, D);
         M = diagonal(NX, 1.0);
         e = plus(x, -1.0, x_ref);
         status = riccati(slope, B, h, &K);
@@ -481,7 +478,7 @@ static int law(int linear, const koopman_estimate *estimate, mat target, double 
 /* --- Steady states --- */
 
 /* Solve f(x) + B(x) u + w = 0 for y = (x, u) by Gauss-Newton steps, each to the solution nearest
- * to an anchor in units of reach, of which 0 keeps a number of y; returns 0 where there is none. */
+ * to an anchor in units of reach, 0 for a number that stays; returns 0 where there is none. */
 static int equilibrium(int linear, mat w, const double *reach, mat anchor, mat *y) {
     mat J, rate = rate_under(linear, block(*y, 0, 0, NX, 1), block(*y, NX, 0, NU, 1), w, &J);
     EACH(count, 30) {
@@ -579,7 +576,7 @@ static int usable(const koopman_estimate *e) {
 }
 
 /* Predict an estimate under an input, in its units, for some seconds; returns 0 where it is lost.
- * `all` is the state and, with a Kalman filter, its derivatives by what state and disturbance were. */
+ * `all` is x and, for a Kalman filter, its derivatives by what x and w were. */
 static int predicted(int linear, koopman_estimate *e, const double *input, double seconds) {
     double count = larger(1.0, ceil(seconds * STEP_RATE)), h = seconds / TIME_UNIT / count;
     mat all = zeros(NX, WIDTH), rate = all, J, F = diagonal(NP, 1.0);
@@ -701,11 +698,11 @@ static mat feed_forward(const koopman_state *s) {
     return mul(of(NX, ND, MODEL_E), deviation(OF_D, s->disturbance));
 }
 
-/* Predict an estimate from one time to another; returns 0 where it is lost. Pieces of the time that
- * are shorter than a share of the fastest time constant are taken together, by their mean; inputs
- * with a dead time up to `acts` are held. */
-static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end, double share,
-                       int64_t acts, mat held, koopman_estimate *e) {
+/* Predict an estimate from one time to another; returns 0 where it is lost. Pieces shorter than a
+ * share of the fastest time constant act by their mean; inputs with a dead time up to `acts` are
+ * held. */
+static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end,
+                       double share, int64_t acts, mat held, koopman_estimate *e) {
     double time = 0.0, u[NU];
     mat sum = zeros(NU, 1);
     for (int64_t next; begin < end; begin = next) {
@@ -758,6 +755,7 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
                  double outside, int *moved) {
     koopman_estimate moves = before->estimate;
     double seconds = since(s, before->accepted_at), worst = 0.0, change[NY];
+    const double timeout = SENSOR_STUCK_SENSOR_TIMEOUT;
     mat travel = zeros(NY, 1);
     int first = before->accepted_at == NEVER, still = 0, stuck = 0;
     *moved = 0;
@@ -788,8 +786,8 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
         int stays = still && change[i] == 0.0;
         if (!stays) s->still_since[i] = s->now;
         s->travel[i] = stays ? s->travel[i] + travel.a[i] : 0.0;
-        stuck = stuck || (fabs(s->travel[i]) > 0.5 * SENSOR_JUMP[i] && SENSOR_STUCK_SENSOR_TIMEOUT > 0.0
-                          && since(s, s->still_since[i]) > SENSOR_STUCK_SENSOR_TIMEOUT);
+        stuck = stuck || (fabs(s->travel[i]) > 0.5 * SENSOR_JUMP[i] && timeout > 0.0
+                          && since(s, s->still_since[i]) > timeout);
     }
     return stuck ? KOOPMAN_FROZEN : KOOPMAN_OK;
 }
@@ -800,9 +798,9 @@ static void disturbed(koopman_state *s, const double *d) {
     mat change = zeros(ND, 1), w = of(NX, 1, s->estimate.w);
     int any = 0;
     EACH(i, ND) {
-        int never = s->disturbed_at[i] == NEVER;
         double seconds = since(s, s->disturbed_at[i]), step = d[i] - s->disturbance[i];
-        int lost = s->unmeasured[i] && OBSERVER_BANDWIDTH > 0.0 && (never || seconds * OBSERVER_BANDWIDTH > 1.0);
+        double silent = s->disturbed_at[i] == NEVER ? INFINITY : seconds;
+        int lost = s->unmeasured[i] && silent * OBSERVER_BANDWIDTH > 1.0;
         s->unmeasured[i] = !(d[i] >= DISTURBANCES_LOWER[i] && d[i] <= DISTURBANCES_UPPER[i])
             || (seconds > 0.0 && fabs(step) > DISTURBANCES_RATE[i] * seconds);
         if (s->unmeasured[i]) continue;
@@ -819,7 +817,8 @@ static void disturbed(koopman_state *s, const double *d) {
 static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
     EACH(i, finite(of(NU, 1, applied)) ? NU : 0)
-        last[i] = within(s->command[i], applied[i] - TRACKING_TOLERANCE[i], applied[i] + TRACKING_TOLERANCE[i]);
+        last[i] = within(s->command[i], applied[i] - TRACKING_TOLERANCE[i],
+                         applied[i] + TRACKING_TOLERANCE[i]);
 }
 
 /* Check a measurement and take it into account: the state that it stands for, in its units, and
@@ -1021,13 +1020,13 @@ static void command(koopman_state *s, int fault, double outside, double elapsed,
 static void advance(koopman_state *s, mat state, double seconds) {
     EACH(i, NC) {
         int k = CONTROLLED[i];
-        double *active = s->setpoint + i, *ramped = s->ramped + i;
+        double *active = s->setpoint + i, *ramped = s->ramped + i, share;
         double reach = isinf(SETPOINT_RAMP[i]) ? INFINITY : SETPOINT_RAMP[i] * seconds;
         if (!s->active) *active = *ramped = within(state.a[k], STATES_LOWER[k], STATES_UPPER[k]);
         if (isnan(s->requested[i])) s->requested[i] = *active;
         *ramped = within(s->requested[i], *ramped - reach, *ramped + reach);
-        if (SETPOINT_FILTER_TIME > 0.0) *active -= expm1(-seconds / SETPOINT_FILTER_TIME) * (*ramped - *active);
-        else *active = *ramped;
+        share = SETPOINT_FILTER_TIME > 0.0 ? -expm1(-seconds / SETPOINT_FILTER_TIME) : 1.0;
+        *active += share * (*ramped - *active);
     }
     s->active = 1;
 }
@@ -1045,9 +1044,11 @@ void koopman_init(koopman_state *s, const double *applied) {
     s->measured_at = s->commanded_at = s->accepted_at = NEVER;
     EACH(i, ND) s->disturbed_at[i] = NEVER;
     store(of(ND, 1, DISTURBANCES_CENTER), s->disturbance);
+    store(of(NU, 1, SAFE), s->command);
     s->law = -1;
     s->interval = INFINITY;
-    s->supervisor = (koopman_supervisor){-1, -1, KOOPMAN_OK, KOOPMAN_OK, NEVER, NEVER};
+    s->supervisor = (koopman_supervisor){-1, -1, KOOPMAN_NO_MEASUREMENT, KOOPMAN_NO_MEASUREMENT,
+                                         NEVER, NEVER};
     EACH(i, NC) s->requested[i] = NAN;
     if (!applied || !finite(of(NU, 1, applied))) return;
     store(limited(of(NU, 1, applied), NULL, 0.0), s->command);
@@ -1091,15 +1092,10 @@ void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_output
             command(s, KOOPMAN_CALCULATION_FAILED, NAN, elapsed, interval, counted);
         }
     }
-    if (s->commanded) {
-        outputs->level = s->supervisor.level;
-        outputs->status = s->supervisor.status;
-        outputs->cause = s->supervisor.cause;
-    } else {
-        outputs->level = KOOPMAN_SAFE;
-        outputs->status = outputs->cause = KOOPMAN_NO_MEASUREMENT;
-    }
-    store(of(NU, 1, s->commanded ? s->command : SAFE), outputs->command);
+    outputs->level = s->commanded ? s->supervisor.level : KOOPMAN_SAFE;
+    outputs->status = s->supervisor.status;
+    outputs->cause = s->supervisor.cause;
+    store(of(NU, 1, s->command), outputs->command);
     store(physical(OF_X, of(NX, 1, s->estimate.x)), outputs->state);
     EACH(i, s->estimate.known ? 0 : NX) outputs->state[i] = NAN;
     EACH(i, NC) outputs->setpoint[i] = s->active ? s->setpoint[i] : NAN;
