@@ -177,8 +177,8 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'N_TRAINING': 0 if trained is None else len(trained.states),
         'N_LOOPS': 0 if loops is None else len(loops.lost), 'LAWS': len(controller.levels),
         'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
-        'MOST': max(order, 2 * n, n + m, n_y) ** 2 + n * max(model.n_z, 1 + len(
-            model.disturbances)),
+        'MOST': max(max(order, n + m, n_y, 2 * n * kalman) ** 2, n * max(
+            model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
         'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
         'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == n_y, 'TIME_UNIT': unit,

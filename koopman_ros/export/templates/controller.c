@@ -312,21 +312,25 @@ static mat rate_under(int linear, mat x, mat u, mat w, mat *J) {
     return plus(plus(f, 1.0, mul(B, u)), 1.0, w);
 }
 
-/* The slope A (NX, NX) of e' = A e + B v, e = x - x_ref: the means between two states of the
- * derivatives of the drift and, D, of B(x) u */
-static mat averaged(mat x, mat x_ref, mat u, mat *D) {
+/* D (NX, NX) with (B(x) - B(x_ref)) u = D (x - x_ref) */
+static mat input_secant(mat x, mat x_ref, mat u) {
+    mat D = zeros(NX, NX), J;
+    EACH(node, N_TERMS ? 5 : 0) {
+        input_matrix(0, between(x_ref, x, node), u, &J);
+        D = plus(D, SHARES[node], J);
+    }
+    return D;
+}
+
+/* The mean of the drift's derivative (NX, NX) between two states */
+static mat averaged(mat x, mat x_ref) {
     mat mean = zeros(NX, NX), J;
-    *D = mean;
+    if (READ_OUT) return secants(NX, MODEL_READOUT, x, x_ref, x, &J);
     EACH(node, 5) {
-        mat at = between(x_ref, x, node);
-        input_matrix(0, at, u, &J);
-        *D = plus(*D, SHARES[node], J);
-        if (READ_OUT) continue;
-        drift(0, at, &J);
+        drift(0, between(x_ref, x, node), &J);
         mean = plus(mean, SHARES[node], J);
     }
-    if (READ_OUT) mean = secants(NX, MODEL_READOUT, x, x_ref, x, &J);
-    return plus(mean, 1.0, *D);
+    return mean;
 }
 
 /* --- The sampled Riccati equation --- */
@@ -375,37 +379,34 @@ static int doubled(mat D, mat G, mat *H) {
     return 0;
 }
 
-/* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
- * continuous one where h is 0; the first NX states are weighted. Returns a status. */
-static int riccati(mat A, mat B, double h, mat *K) {
-    int n = A.n, N = n + NU, held = h > 0.0;
-    mat F = zeros(N, N), W = F;
-    if (!finite(A) || !finite(B)) return KOOPMAN_NOT_STABILISABLE;
-    put(&F, 0, 0, A);
-    put(&F, 0, n, B);
-    EACH(i, NX) W.a[i * N + i] = STATE_WEIGHT[i];
-    EACH(i, NU) W.a[(n + i) * N + n + i] = INPUT_WEIGHT[i];
-    if (held) over_interval(h, &F, &W);
-    mat step = block(F, 0, 0, n, n), push = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
-    mat cross = block(W, n, 0, NU, n), R = block(W, n, n, NU, NU);
-    /* without the cross term */
-    mat G = mul(push, solve(R, transposed(push))), by_cross = solve(R, cross);
-    mat D = plus(step, -1.0, mul(push, by_cross));
-    mat P = plus(Q, -1.0, mul(transposed(cross), by_cross));
-    if (!held) {
-        /* a discrete equation with the same solution, by a Cayley transform beyond all modes */
-        double far = size(A) + sqrt(size(G) * size(Q));
-        mat less = plus(A, -1.0, diagonal(n, far)), back = solve(less, diagonal(n, 1.0));
-        mat X = mul(back, G), Y = plus(transposed(less), 1.0, mul(Q, X));
-        Y = solve(Y, diagonal(n, 2.0 * far));
-        D = transposed(Y);
-        G = mul(X, Y);
-        P = mul(mul(Y, Q), back);
-    }
-    if (!doubled(D, G, &P)) return KOOPMAN_NOT_STABILISABLE;
-    mat PA = mul(P, step), PB = mul(P, push), square = scaled(held, mul(transposed(step), PA));
-    mat right = plus(plus(cross, 1.0, transposed(PB)), held, mul(transposed(PB), step));
-    *K = solve(plus(R, held, mul(transposed(push), PB)), right);
+/* D, G and P of the discrete equation that `doubled` solves, of a plant F over an interval with the
+ * weights W, or of one in continuous time. */
+static void reduced(mat F, mat W, int held, mat *D, mat *G, mat *P) {
+    int n = F.n - NU;
+    mat A = block(F, 0, 0, n, n), B = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
+    mat R = block(W, n, n, NU, NU), cross = block(W, n, 0, NU, n), by_cross = solve(R, cross);
+    *G = mul(B, solve(R, transposed(B)));
+    *D = plus(A, -1.0, mul(B, by_cross));
+    *P = plus(Q, -1.0, mul(transposed(cross), by_cross));
+    if (held) return;
+    /* by a Cayley transform beyond all modes, which leaves the solution as it is */
+    double far = size(A) + sqrt(size(*G) * size(Q));
+    mat less = plus(A, -1.0, diagonal(n, far)), back = solve(less, diagonal(n, 1.0));
+    mat X = mul(back, *G), Y = plus(transposed(less), 1.0, mul(Q, X));
+    Y = solve(Y, diagonal(n, 2.0 * far));
+    *D = transposed(Y);
+    *G = mul(X, Y);
+    *P = mul(mul(Y, Q), back);
+}
+
+/* The gain K (NU, n) of a solution P; returns a status. */
+static int gain_of(mat F, mat W, int held, mat P, mat *K) {
+    int n = F.n - NU;
+    mat A = block(F, 0, 0, n, n), B = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
+    mat PA = mul(P, A), PB = mul(P, B), square = scaled(held, mul(transposed(A), PA));
+    mat right = plus(block(W, n, 0, NU, n), 1.0, transposed(PB));
+    right = plus(right, held, mul(transposed(PB), A));
+    *K = solve(plus(block(W, n, n, NU, NU), held, mul(transposed(B), PB)), right);
     mat feedback = mul(transposed(right), *K);
     /* the equation less P on both sides, whose terms shrink with the interval */
     mat rest = plus(plus(Q, 1.0, square), -1.0, feedback);
@@ -416,16 +417,30 @@ static int riccati(mat A, mat B, double h, mat *K) {
         : KOOPMAN_GAIN_TOO_LARGE;
 }
 
-/* Whether e' = slope e + action e(last sample) decays, or e' = (slope + action) e where h is 0 */
-static int decays(mat slope, mat action, double h) {
-    int held = h > 0.0;
-    mat F = zeros(2 * NX, 2 * NX), W = F;
-    put(&F, 0, 0, held ? slope : plus(slope, 1.0, action));
-    if (held) put(&F, 0, NX, action);
-    if (!finite(F)) return 0;
-    over_interval(held ? h : 1.0, &F, &W);
-    return contracts(plus(plus(block(F, 0, 0, NX, NX), 1.0, block(F, 0, NX, NX, NX)), 1.0,
-                          diagonal(NX, 1.0)));
+/* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
+ * continuous one where h is 0; the first NX states are weighted. Returns a status. */
+static int riccati(mat A, mat B, double h, mat *K) {
+    int n = A.n, N = n + NU, held = h > 0.0;
+    mat F = zeros(N, N), W = F, D, G, P;
+    if (!finite(A) || !finite(B)) return KOOPMAN_NOT_STABILISABLE;
+    put(&F, 0, 0, A);
+    put(&F, 0, n, B);
+    EACH(i, NX) W.a[i * N + i] = STATE_WEIGHT[i];
+    EACH(i, NU) W.a[(n + i) * N + n + i] = INPUT_WEIGHT[i];
+    if (held) over_interval(h, &F, &W);
+    reduced(F, W, held, &D, &G, &P);
+    return doubled(D, G, &P) ? gain_of(F, W, held, P, K) : KOOPMAN_NOT_STABILISABLE;
+}
+
+/* Whether e' = slope e - B K e(last sample) decays, or e' = (slope - B K) e where h is 0 */
+static int decays(mat slope, mat B, mat K, double h) {
+    mat F = zeros(NXU, NXU), W = F;
+    put(&F, 0, 0, h > 0.0 ? slope : plus(slope, -1.0, mul(B, K)));
+    if (h > 0.0) put(&F, 0, NX, B);
+    if (!finite(F) || !finite(K)) return 0;
+    over_interval(h > 0.0 ? h : 1.0, &F, &W);
+    return contracts(plus(plus(diagonal(NX, 1.0), 1.0, block(F, 0, 0, NX, NX)), -1.0,
+                          mul(block(F, 0, NX, NX, NU), K)));
 }
 
 /* --- The control law --- */
@@ -440,35 +455,42 @@ static mat limited(mat u, const double *previous, double seconds) {
     return u;
 }
 
+/* Of the re-centred law: e = N(x) - N(x_ref), M with e = M (x - x_ref), and loop and push of
+ * e' = (A + H C) e + N' B v; returns its slope in terms of x. */
+static mat recentred(mat x, mat x_ref, mat u_ref, mat w, mat *loop, mat *push, mat *e, mat *M) {
+    mat N, N_ref, H, J, A = of(NZ, NZ, MODEL_A), pre = of(NX, NX, PRE_FEEDBACK);
+    mat D = input_secant(x, x_ref, u_ref), B_ref = input_matrix(0, x_ref, u_ref, &J);
+    w = plus(plus(w, 1.0, mul(B_ref, u_ref)), -1.0, mul(pre, x_ref));
+    *M = secants(NZ, LIFT, x, x_ref, w, &H);
+    *e = plus(lift(NZ, LIFT, x, &N), -1.0, lift(NZ, LIFT, x_ref, &N_ref));
+    H = plus(H, 1.0, mul(N, plus(D, -1.0, pre)));
+    *loop = A;
+    put(loop, 0, 0, plus(block(A, 0, 0, NZ, NX), 1.0, H));
+    *push = mul(N, input_matrix(0, x, u_ref, &J));
+    if (READ_OUT) return plus(averaged(x, x_ref), 1.0, D);
+    return mul(inverse(N), plus(mul(A, *M), 1.0, H));
+}
+
 /* The law u = u_ref - K e of a model towards a target (x_ref, u_ref): a command in its units,
  * within its range; returns a status. */
 static int law(int linear, const koopman_estimate *estimate, mat target, double interval, mat *u) {
     mat x = of(NX, 1, estimate->x), x_ref = block(target, 0, 0, NX, 1);
-    mat u_ref = block(target, NX, 0, NU, 1), slope = of(NX, NX, SLOPE), D, J, K, M, e;
-    mat B = input_matrix(linear, x, u_ref, &J);
+    mat u_ref = block(target, NX, 0, NU, 1), slope = of(NX, NX, SLOPE), J, K, M, e, loop, push;
     double h = interval / TIME_UNIT;
     int status = KOOPMAN_NOT_STABILISABLE;
-    if (!linear) slope = averaged(x, x_ref, u_ref, &D);
     if (CLOSED && !linear) {
-        /* re-centred: e = N(x) - N(x_ref), e' = (A + H C) e + N' B v */
-        mat N, N_ref, H, A = of(NZ, NZ, MODEL_A), loop = A, pre = of(NX, NX, PRE_FEEDBACK);
-        mat B_ref = input_matrix(0, x_ref, u_ref, &J);
-        mat forcing = plus(of(NX, 1, estimate->w), 1.0, mul(B_ref, u_ref));
-        M = secants(NZ, LIFT, x, x_ref, plus(forcing, -1.0, mul(pre, x_ref)), &H);
-        e = plus(lift(NZ, LIFT, x, &N), -1.0, lift(NZ, LIFT, x_ref, &N_ref));
-        H = plus(H, 1.0, mul(N, plus(D, -1.0, pre)));
-        put(&loop, 0, 0, plus(block(A, 0, 0, NZ, NX), 1.0, H));
-        status = riccati(loop, mul(N, B), h, &K);
-        if (status == KOOPMAN_OK && !READ_OUT)
-            slope = mul(inverse(N), plus(mul(A, M), 1.0, H));
+        slope = recentred(x, x_ref, u_ref, of(NX, 1, estimate->w), &loop, &push, &e, &M);
+        status = riccati(loop, push, h, &K);
     }
+    push = input_matrix(linear, x, u_ref, &J);
     if (status != KOOPMAN_OK) {
+        if (!linear) slope = plus(averaged(x, x_ref), 1.0, input_secant(x, x_ref, u_ref));
         M = diagonal(NX, 1.0);
         e = plus(x, -1.0, x_ref);
-        status = riccati(slope, B, h, &K);
+        status = riccati(slope, push, h, &K);
     }
     if (status != KOOPMAN_OK) return status;
-    if (!decays(slope, scaled(-1.0, mul(B, mul(K, M))), h)) return KOOPMAN_PREDICTED_UNSTABLE;
+    if (!decays(slope, push, mul(K, M), h)) return KOOPMAN_PREDICTED_UNSTABLE;
     *u = physical(OF_U, plus(u_ref, -1.0, mul(K, e)));
     if (!finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
     *u = limited(*u, NULL, 0.0);
