@@ -35,7 +35,7 @@ setup(
     maintainer_email='no-mailbox@koopman-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
-    package_data={PACKAGE: ['py.typed', 'export/*.c', 'export/templates/*']},
+    package_data={PACKAGE: ['py.typed', 'export/templates/*']},
     data_files=_data_files(),
     python_requires='>=3.11',
     zip_safe=True,

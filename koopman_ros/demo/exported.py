@@ -51,7 +51,8 @@ class ExportedLoop:
             round((row.seconds - self._last) * NANOSECONDS),
             np.array([row.measured[name] for name in controller.measured.names]),
             self._setpoint if row.seconds >= self._step_time else np.full_like(
-                self._setpoint, np.nan), none, False, none)
+                self._setpoint, np.nan), none,
+            np.full(len(controller.model.disturbances), np.nan))
         self._last = row.seconds
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -64,5 +65,9 @@ class ExportedLoop:
     def close(self) -> dict[str, float]:
         """End the process; return the largest difference of each input from the controller's."""
         self._process.communicate()
-        largest = np.max(self._differences, axis=0)
-        return dict(zip(self._controller.model.inputs.names, largest.tolist(), strict=True))
+        return self.largest()
+
+    def largest(self) -> dict[str, float]:
+        """Return the largest difference of each input from the controller's, in its unit."""
+        return dict(zip(self._controller.model.inputs.names, np.max(
+            self._differences, axis=0).tolist(), strict=True))

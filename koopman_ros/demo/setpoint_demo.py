@@ -192,8 +192,12 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
             panel.step(run.command_seconds, shown(run.commanded[signal], unit), where='post',
                        **learned)
             if code is not None:
-                panel.step(code.seconds, shown(np.array(code.commands)[:, j], unit), where='post',
-                           color='tab:orange', linestyle=':', label='exported C code')
+                panel.plot(code.seconds, shown(np.array(code.commands)[:, j], unit), 'o',
+                           color='tab:orange', fillstyle='none', markevery=len(code.seconds) // 50,
+                           label='exported C code')
+                panel.text(0.99, 0.06, f'C code at most {code.largest()[signal]:.1e} [{unit}] from '
+                           'the learned controller', transform=panel.transAxes, ha='right',
+                           fontsize=8)
             for name, course in courses.items():
                 values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=high),
                                  low, high)
@@ -201,7 +205,7 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
         panels[0].set_title(title, fontsize=9)
         panels[-1].set(xlabel='plant time [s]', xlim=(0.0, run.seconds[-1]))
-        legend(figure, panels, 6)
+        legend(figure, panels, 6 if code is None else 4)
 
 
 def run_with_panel(plant: str, port: int, output: Path, speed: float) -> dict[str, object]:

@@ -9,15 +9,16 @@ expressions: a network and its derivatives take thirty lines of C for any model,
 CasADi.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
 from importlib.resources import files
 import math
 from pathlib import Path
+import re
 import subprocess
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from koopman_ros import __version__
 from koopman_ros.control import Controller
@@ -36,6 +37,15 @@ CODES = tuple(StatusCode[name] for name in (
     'LAW_FAILED', 'HELD_TOO_LONG', 'RECOVERING', 'LOST_HERE', 'NOT_STABILISABLE',
     'RICCATI_INACCURATE', 'GAIN_TOO_LARGE', 'PREDICTED_UNSTABLE', 'COMMAND_NOT_FINITE',
     'CALCULATION_FAILED', 'NOT_PREDICTED', 'NO_STEADY_STATE'))
+# Fields of model and tuning that the templates do not name: their effect is in other tables, or
+# they have none in C. Any other one that is set is refused.
+_WITHOUT_TABLE = frozenset("""
+    MODEL_PROVENANCE MODEL_TIME_UNIT MODEL_PRE_FEEDBACK MODEL_DEAD_TIME OBSERVABLES_V
+    OBSERVABLES_IDENTITY OBSERVABLES_EXPONENTS STATES_NAMES STATES_UNITS INPUTS_NAMES INPUTS_UNITS
+    INPUTS_LOWER INPUTS_UPPER DISTURBANCES_NAMES DISTURBANCES_UNITS DISTURBANCES_TIMEOUT ESTIMATOR
+    MEASUREMENT_NOISE DISTURBANCE_NOISE INITIAL_ERROR UNCERTAIN_NOISE_FACTOR ANALYSIS_NOISE
+    FALLBACK_ORDER LEARNED_MODEL_MARGIN LINEAR_MODEL_MARGIN SAFE_VALUE SENSOR_DEADBAND PLUGINS
+    """.split())
 
 
 class ExportError(ValueError):
@@ -49,29 +59,26 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
     :param interval: shortest time between two calls in s, for which inputs under way are kept.
     :raises ExportError: for a law, an estimator or a model that the C code does not support.
     """
-    _check(controller)
-    sizes, tables = _sizes(controller, interval), _tables(controller)
-    model = controller.model
-    about = [f'A control loop of {model.provenance.plant}, exported by koopman_ros {__version__}.',
-             *(f'{role}: {", ".join(f"{name} [{unit}]" for name, unit in signals)}'
-               for role, signals in signals(controller).items())]
+    texts = {name: template(name) for name in ('controller.h', 'controller.c')}
+    tables = _fields(controller, texts['controller.c']) | _tables(controller, interval)
+    about = [f'A control loop of {controller.model.provenance.plant}, exported by koopman_ros '
+             f'{__version__}.', *(f'{role}: {", ".join(f"{name} [{unit}]" for name, unit in of)}'
+                                  for role, of in signals(controller).items())]
+    # C has no arrays of no entries
+    sizes = {name: max(1, tables[name]) for name in (
+        'NX', 'NU', 'NY', 'NC', 'ND', 'NP', 'LAWS', 'QUEUE')}
     parts = {
         'ABOUT': '\n'.join(f' * {line}' for line in about),
         'SIZES': '\n'.join(f'#define KOOPMAN_{name} {value}' for name, value in sizes.items()),
         'CODES': ',\n'.join(['    KOOPMAN_OK', *(f'    KOOPMAN_{code.name}' for code in CODES)]),
         'TABLES': '\n'.join(_table(name, value) for name, value in tables.items())}
-    found = {}
-    for name in ('controller.h', 'controller.c'):
-        text = (files(__package__) / 'templates' / name).read_text()
-        for part, value in parts.items():
-            text = text.replace(f'@{part}@', value)
-        found[name] = text
-    return found
+    return {name: re.sub('@([A-Z]+)@', lambda found: parts[found[1]], text)
+            for name, text in texts.items()}
 
 
-def example() -> str:
-    """Return the program ``example.c``, which reads calls and prints answers."""
-    return (files(__package__) / 'templates' / 'example.c').read_text()
+def template(name: str) -> str:
+    """Return the text of a template."""
+    return (files(__package__) / 'templates' / name).read_text()
 
 
 def compiled_example(controller: Controller, interval: float, folder: Path, compiler: str,
@@ -82,7 +89,8 @@ def compiled_example(controller: Controller, interval: float, folder: Path, comp
     :raises subprocess.CalledProcessError: where the code does not compile.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in {**c_code(controller, interval), 'example.c': example()}.items():
+    code = {**c_code(controller, interval), 'example.c': template('example.c')}
+    for name, text in code.items():
         (folder / name).write_text(text)
     program = folder / 'example'
     subprocess.run([compiler, *flags, folder / 'controller.c', folder / 'example.c', '-lm', '-o',
@@ -90,133 +98,125 @@ def compiled_example(controller: Controller, interval: float, folder: Path, comp
     return program
 
 
-def _check(controller: Controller) -> None:
-    """Raise an error for an unsupported part."""
+def signals(controller: Controller) -> dict[str, list[tuple[str, str]]]:
+    """Return names and units of the entries of each array, in their order."""
+    model = controller.model
+    return {role: list(zip(of.names, of.units, strict=True)) for role, of in (
+        ('measured', controller.measured), ('set-points', controller.controlled),
+        ('inputs', model.inputs), ('measured disturbances', model.disturbances),
+        ('states', model.states))}
+
+
+def _fields(controller: Controller, code: str) -> dict[str, Any]:
+    """Return the fields of model and tuning that the code names; ExportError for others."""
+    model, estimator = controller.model, controller.best.estimator
     for name in controller.levels:
         if name not in _LAWS:
             raise ExportError(
                 f'the law {name} cannot be exported, only {" and ".join(_LAWS)}: '
                 + ('for C code of a receding-horizon law use acados' if name == 'mpc' else
                    'remove it from fallback_order'))
-    estimator = controller.best.estimator
     if type(estimator) not in (DisturbanceObserver, MeasuredState, ExtendedKalmanFilter):
         raise ExportError(
             f'the estimator {type(estimator).__name__} cannot be exported: set estimator to '
             'disturbance_observer, measured_state or extended_kalman_filter')
-    tuning = controller.tuning
-    for what, given, remedy in (
-            ('measured disturbances', len(controller.model.disturbances),
-             'train a model without them'),
-            ('safe_latch', tuning.safe_latch, 'set it to false'),
-            ('report_on_change', tuning.sensor.report_on_change.any(), 'set it to 0')):
-        if given:
-            raise ExportError(f'{what} cannot be exported: {remedy}')
-    lift = controller.model.observables
-    for what, degree in (
-            ('lift', lift.degree if isinstance(lift, PolynomialObservables) else 0),
-            ('input matrix', controller.model.input_matrix_degree)):
-        if degree > _MAX_DEGREE:
-            raise ExportError(f'the {what} has degree {degree}, at most {_MAX_DEGREE} can be '
-                              'exported: train a model of a lower degree')
+    degree = max(getattr(model.observables, 'degree', 0), model.input_matrix_degree)
+    if degree > _MAX_DEGREE:
+        raise ExportError(f'a polynomial of degree {degree} cannot be exported: train a model of '
+                          f'at most {_MAX_DEGREE}')
+    found = {}
+    for remedy, values in (('train a model without it', _walk(model, 'MODEL_')),
+                           ('set it to 0 or false', _walk(controller.tuning, ''))):
+        for name, value in values:
+            if re.search(rf'\b{name}\b', code):
+                found[name] = np.zeros(0) if value is None else value
+            elif name not in _WITHOUT_TABLE and value is not None and np.any(value):
+                raise ExportError(f'{name.lower()} cannot be exported: {remedy}')
+    return found
 
 
-def signals(controller: Controller) -> dict[str, list[tuple[str, str]]]:
-    """Return names and units of the entries of each array, in their order."""
-    return {role: list(zip(of.names, of.units, strict=True)) for role, of in (
-        ('measured', controller.measured), ('set-points', controller.controlled),
-        ('inputs', controller.model.inputs), ('states', controller.model.states))}
+def _walk(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield the fields of a dataclass and of those in it, named by both."""
+    for field in fields(value):
+        inner = getattr(value, field.name)
+        if is_dataclass(inner) and field.name != 'provenance':
+            yield from _walk(inner, f'{field.name}_')
+        else:
+            yield f'{prefix}{field.name}'.upper(), inner
 
 
-def _sizes(controller: Controller, interval: float) -> dict[str, int]:
-    model = controller.model
-    kalman = isinstance(controller.best.estimator, ExtendedKalmanFilter)
-    longest = float(np.max(controller.tuning.dead_times(model), initial=0.0))
-    return {'NX': model.n_x, 'NU': model.n_u, 'NY': len(controller.measured.names),
-            'NC': len(controller.controlled), 'NP': 2 * model.n_x if kalman else 1,
-            'LAWS': len(controller.levels), 'QUEUE': math.ceil(longest / interval) + 2}
-
-
-def _tables(controller: Controller) -> dict[str, Any]:
-    """Return the constants of the C code by name."""
-    model, tuning, outputs = controller.model, controller.tuning, controller.measured
-    best, n = controller.best, controller.model.n_x
-    states, inputs, estimator = model.states, model.inputs, best.estimator
-    lift, terms, loops = model.observables, model.input_terms, model.verified_loops
-    states_first = np.eye(model.n_z, n) if model.identity else np.zeros((model.n_z, n))
-    if isinstance(lift, PolynomialObservables):
-        powers, count = lift.exponents[n:], model.n_z - n
-        output = np.eye(model.n_z)[:, n:]
-        hidden = np.zeros((0, n)), np.zeros(0), np.zeros(0)
+def _tables(controller: Controller, interval: float) -> dict[str, Any]:
+    """Return the constants of the C code that are no fields by name."""
+    model, tuning, best, outputs = (
+        controller.model, controller.tuning, controller.best, controller.measured)
+    n, m, n_y, estimator, lift = model.n_x, model.n_u, len(outputs.C), best.estimator, (
+        model.observables)
+    kalman, network = isinstance(estimator, ExtendedKalmanFilter), isinstance(
+        lift, NetworkObservables)
+    if network:
+        psi = np.vstack((np.zeros((model.n_z - len(lift.V), len(lift.W))), lift.V))
+        psi = np.hstack((np.eye(model.n_z, n) * model.identity, psi))
     else:
-        assert isinstance(lift, NetworkObservables)
-        powers, count = np.zeros((0, n), dtype=int), len(lift.W)
-        output = np.concatenate((np.zeros((model.n_z - len(lift.V), count)), lift.V))
-        hidden = lift.W, lift.b, lift.value_at_zero
-    trained = model.training_states
-    linear = [level.law.extrapolates for level in controller.levels.values()]
-    kalman = isinstance(estimator, ExtendedKalmanFilter)
-    weights = best.law.weights
+        psi = np.eye(model.n_z)
+    terms, trained, loops = model.input_terms, model.training_states, model.verified_loops
+    order = (model.n_z if closed(model) else n) + m
+    linear, unit = model.linearised, model.seconds_per_time_unit
+    fastest = np.max(np.abs(np.linalg.eigvals(linear.A))) if kalman else linear.fastest_rate
     dead = [round(seconds * 1e9) for seconds in tuning.dead_times(model).tolist()]
-    return {
-        'NZ': model.n_z, 'N_PHI': count, 'N_PSI': n + count, 'N_PHI_': max(count, 1),
+    none = np.zeros(0)
+    optional = dict.fromkeys((
+        *(f'VERIFIED_LOOPS_{name}' for name in ('STARTS', 'SETPOINTS', 'LOST') if loops is None),
+        *(f'OBSERVABLES_{name}' for name in 'WB' if not network),
+        *['TRAINING_STATES_STATES'] * (trained is None),
+        *['INPUT_TERMS_COEFFICIENTS'] * (terms is None)), none)
+    return optional | {
+        'NX': n, 'NU': m, 'NY': n_y, 'NC': len(controller.controlled), 'NZ': model.n_z,
+        'ND': len(model.disturbances), 'NP': 2 * n if kalman else 1, 'NXU': n + m,
+        'WIDTH': 1 + 2 * n if kalman else 1, 'N_PSI': psi.shape[1], 'N_PHI': psi.shape[1] - n,
         'N_TERMS': 0 if terms is None else len(terms.coefficients),
         'N_TRAINING': 0 if trained is None else len(trained.states),
-        'N_LOOPS': 0 if loops is None else len(loops.lost),
-        'NETWORK': isinstance(lift, NetworkObservables), 'READ_OUT': model.readout is not None,
-        'CLOSED': closed(model), 'KALMAN': kalman, 'REMEMBERS': estimator.remembers,
-        'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
-        'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == len(outputs.C),
-        'TIME_UNIT': model.seconds_per_time_unit,
-        'FASTEST_RATE': model.linearised.fastest_rate / model.seconds_per_time_unit,
-        'FASTEST_MODE': np.max(np.abs(np.linalg.eigvals(model.linearised.A)))
-        / model.seconds_per_time_unit,
-        'BANDWIDTH': tuning.observer_bandwidth,
-        'STUCK_TIMEOUT': tuning.sensor.stuck_sensor_timeout,
-        'HOLD_TIMEOUT': tuning.hold_timeout, 'RECOVERY_TIME': tuning.recovery_time,
-        'TRANSFER_TIME': tuning.bumpless_transfer_time, 'FILTER_TIME': tuning.setpoint_filter_time,
-        'MAX_GAIN': tuning.max_gain, 'MAX_RESIDUAL': tuning.max_riccati_residual,
-        'FILL_DISTANCE': 0.0 if trained is None else trained.fill_distance,
-        'LONGEST_DEAD_TIME': max(dead), 'SHORTEST_DEAD_TIME': min(dead),
-        'X_CENTER': states.center, 'X_SCALE': states.scale, 'X_LOWER': states.lower,
-        'X_UPPER': states.upper, 'HALF_WIDTH': states.half_widths, 'CORNERS': states.corners,
-        'U_CENTER': inputs.center, 'U_SCALE': inputs.scale,
-        'U_LOWER': tuning.limits.lower, 'U_UPPER': tuning.limits.upper,
-        'LOWER_V': inputs.to_deviation(tuning.limits.lower),
-        'UPPER_V': inputs.to_deviation(tuning.limits.upper),
-        'RATE_LIMIT': tuning.limits.rate, 'TOLERANCE': tuning.tracking_tolerance,
+        'N_LOOPS': 0 if loops is None else len(loops.lost), 'LAWS': len(controller.levels),
+        'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
+        'MOST': max(max(order, n + m, n_y, 2 * n * kalman) ** 2, n * max(
+            model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
+        'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
+        'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
+        'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == n_y, 'TIME_UNIT': unit,
+        'FASTEST_RATE': linear.fastest_rate / unit,
+        # of an estimator: steps a time constant and at most, and those of its integration
+        'STEP_RATE': (2.0 if kalman else 10.0) * fastest / unit,
+        'MOST_STEPS': 40.0 if kalman else 20.0, 'STAGES': 4 if kalman else 2,
+        'AHEAD': (0.0, 0.5, 0.5, 1.0) if kalman else (0.0, 1.0),
+        'PARTS': (1.0, 2.0, 2.0, 1.0) if kalman else (3.0, 3.0),
+        # one that measures the state takes all of a measurement, and knows no disturbance
+        'OBSERVER_BANDWIDTH': tuning.observer_bandwidth if estimator.remembers else math.inf,
+        'MAX_DISTURBANCE': np.where(
+            estimator.remembers, tuning.max_disturbance / model.inputs.scale, 0.0),
+        **({'H_OUTPUT': np.hstack((estimator._H, 0.0 * estimator._H)), 'NOISE': estimator._R,
+            'INTENSITY': np.pad(estimator._intensity, ((n, 0), (n, 0))),
+            'ONTO_DISTURBANCES': estimator._onto_directions,
+            'FIRST_COVARIANCE': estimator.initial_covariance,
+            'FARTHEST': np.sqrt(estimator._lost)} if kalman else
+           {**dict.fromkeys(('H_OUTPUT', 'NOISE', 'INTENSITY', 'FIRST_COVARIANCE'), none),
+            'ONTO_DISTURBANCES': np.eye(n), 'FARTHEST': 10.0 * model.states.half_widths}),
+        'HALF_WIDTH': model.states.half_widths, 'CORNERS': model.states.corners,
+        'TRAINING_STATES_FILL_DISTANCE': 0.0 if trained is None else trained.fill_distance,
+        'LOWER_V': model.inputs.to_deviation(tuning.limits.lower),
+        'UPPER_V': model.inputs.to_deviation(tuning.limits.upper),
         'SAFE': controller.safe_input, 'NOMINAL': controller.nominal_input,
-        'DEAD_TIME': dead, 'CONTROLLED': [states.names.index(name) for name in best.controlled],
-        'SETPOINT_RAMP': tuning.setpoint_ramp, 'LINEAR': np.array(linear, dtype=int),
-        'MARGIN': controller.order.margins,
-        'SENSOR_LOWER': tuning.sensor.lower, 'SENSOR_UPPER': tuning.sensor.upper,
-        'MAX_STEP': tuning.sensor.jump, 'MAX_RATE': tuning.sensor.rate,
+        'DEAD_TIME': np.array(dead, dtype=np.int64), 'LONGEST_DEAD_TIME': max(dead),
+        'SHORTEST_DEAD_TIME': min(dead), 'MARGIN': controller.order.margins,
+        'CONTROLLED': [model.states.names.index(name) for name in best.controlled],
+        'LINEAR': [int(level.law.extrapolates) for level in controller.levels.values()],
         'OUTPUTS': outputs.C, 'FROM_OUTPUTS': np.linalg.pinv(outputs.C),
-        'MEASURED': np.any(outputs.C != 0.0, axis=0).astype(int),
-        'STATE_WEIGHT': np.diag(weights.Q), 'INPUT_WEIGHT': np.diag(weights.R),
-        'WEIGHT': hidden[0], 'BIAS': hidden[1], 'AT_ZERO': hidden[2], 'POWERS': powers,
-        'LIFT': np.concatenate((states_first, output), axis=1),
-        'DRIFT': np.zeros((n, 0)) if model.readout is None else model.readout,
-        'DYNAMICS': model.A, 'INPUT_MATRIX': model.B, 'INPUT_INVERSE': model.input_inverse(),
-        'SLOPE': model.linearised.A, 'PRE_FEEDBACK': model.pre_feedback_slope,
-        'TERMS': np.zeros(0) if terms is None else terms.coefficients,
-        'TERM_POWERS': np.zeros(0, dtype=int) if terms is None else (
-            PolynomialObservables.total_degree(n, terms.degree).exponents),
-        'NODES': NODES, 'SHARES': WEIGHTS,
-        'TRAINING': np.zeros(0) if trained is None else trained.states,
-        'LOOP_STARTS': np.zeros(0) if loops is None else loops.starts,
-        'LOOP_SETPOINTS': np.zeros(0) if loops is None else loops.setpoints,
-        'LOOP_LOST': np.zeros(0, dtype=int) if loops is None else loops.lost.astype(int),
-        'MAX_DISTURBANCE': tuning.max_disturbance / inputs.scale,
-        **_kalman_tables(estimator)}
-
-
-def _kalman_tables(estimator: Any) -> Mapping[str, ArrayLike]:
-    if isinstance(estimator, ExtendedKalmanFilter):
-        return {'H_OUTPUT': estimator._H, 'NOISE_VARIANCE': np.diag(estimator._R),
-                'INTENSITY': estimator._intensity, 'ONTO_DISTURBANCES': estimator._onto_directions,
-                'FIRST_COVARIANCE': estimator.initial_covariance, 'LOST_VARIANCE': estimator._lost}
-    return dict.fromkeys(('H_OUTPUT', 'NOISE_VARIANCE', 'INTENSITY', 'ONTO_DISTURBANCES',
-                          'FIRST_COVARIANCE', 'LOST_VARIANCE'), np.zeros(0))
+        'MEASURED': np.any(outputs.C != 0.0, axis=0), 'STATE_WEIGHT': np.diag(best.law.weights.Q),
+        'INPUT_WEIGHT': np.diag(best.law.weights.R),
+        'AT_ZERO': lift.value_at_zero if network else none,
+        'POWERS': none if network else lift.exponents[n:], 'LIFT': psi, 'RATE': model.A @ psi,
+        'INPUT_INVERSE': model.input_inverse(), 'SLOPE': linear.A,
+        'PRE_FEEDBACK': model.pre_feedback_slope, 'NODES': NODES, 'SHARES': WEIGHTS,
+        'TERM_POWERS': none if terms is None else PolynomialObservables.total_degree(
+            n, terms.degree).exponents}
 
 
 def _table(name: str, value: Any) -> str:
@@ -224,7 +224,9 @@ def _table(name: str, value: Any) -> str:
     if np.ndim(value) == 0:
         return f'#define {name} {_number(value)}'
     flat = np.ravel(value)
-    kind = 'int64_t' if name == 'DEAD_TIME' else 'int' if flat.dtype.kind == 'i' else 'double'
+    kind = 'int64_t' if name == 'DEAD_TIME' else 'double' if flat.dtype.kind == 'f' else 'int'
+    if name.endswith('POWERS') or name.endswith('LOST'):
+        kind = 'int'
     entries = ', '.join(map(_number, flat)) or '0'
     return f'static const {kind} {name}[] = {{{entries}}};'
 

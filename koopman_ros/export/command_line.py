@@ -8,18 +8,15 @@ Writes controller.c, controller.h, example.c, test_vectors.csv and README.md.
 """
 
 import argparse
-from collections.abc import Callable, Mapping
 import csv
-from importlib.resources import files
 import io
 from pathlib import Path
+import re
 import sys
-from typing import Any
 
 from koopman_ros import __version__
 from koopman_ros.control import Controller
-from koopman_ros.export import cortex_m4
-from koopman_ros.export.c_code import c_code, example, ExportError, signals
+from koopman_ros.export.c_code import c_code, ExportError, signals, template
 from koopman_ros.export.vectors import columns, vectors
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.model_checks import load_suitable, LoadedModel
@@ -32,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Export, and return the exit code."""
     parser = argparse.ArgumentParser(
         'export_c', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add: Callable[..., Any] = parser.add_argument
+    add = parser.add_argument
     add('--version', action='version', version=__version__)
     add('model', help='name of a bundled model, or path of a .safetensors file')
     add('--law', default='sdre', choices=('sdre', 'linear'), help='highest control law; those '
@@ -84,38 +81,19 @@ def loop(model: str, law: str, parameters: Path | None = None
 
 def write(loaded: LoadedModel, controller: Controller, sample_period: float, output: Path) -> None:
     """Write the files of a loop into a folder."""
-    code = c_code(controller, sample_period)
+    code = {**c_code(controller, sample_period), 'example.c': template('example.c')}
+    table, origin = io.StringIO(), loaded.model.provenance
+    csv.writer(table, lineterminator='\n').writerows([columns(controller), *(
+        [*call.row(controller), *answer]
+        for call, answer in vectors(controller, _VECTORS, sample_period))])
+    facts = {
+        'TITLE': f'Control loop of {origin.plant}', 'VERSION': __version__, 'MODEL': loaded.name,
+        'DIGEST': loaded.digest, 'ACCEPTANCE': origin.acceptance,
+        'LEVELS': ', '.join(controller.levels), 'PERIOD': f'{sample_period:g}',
+        'SIGNALS': '\n'.join(f'| {role} | {", ".join(f"{name} [{unit}]" for name, unit in of)} |'
+                             for role, of in signals(controller).items())}
+    code['README.md'] = re.sub('@([A-Z]+)@', lambda found: facts[found[1]], template('README.md'))
+    code['test_vectors.csv'] = table.getvalue()
     output.mkdir(parents=True, exist_ok=True)
-    rows = [[*call.row(controller), *answer]
-            for call, answer in vectors(controller, _VECTORS, sample_period)]
-    table = io.StringIO()
-    csv.writer(table, lineterminator='\n').writerows([columns(controller), *rows])
-    code |= {'test_vectors.csv': table.getvalue(), 'example.c': example()}
     for name, text in code.items():
         (output / name).write_text(text)
-    readme = (files(__package__) / 'templates' / 'README.md').read_text()
-    for name, text in _facts(loaded, controller, sample_period, output,
-                             table.getvalue()).items():
-        readme = readme.replace(f'@{name}@', text)
-    (output / 'README.md').write_text(readme)
-
-
-def _facts(loaded: LoadedModel, controller: Controller, sample_period: float, output: Path,
-           calls: str) -> Mapping[str, str]:
-    origin = loaded.model.provenance
-    if cortex_m4.installed():
-        needs = cortex_m4.run(output, calls)
-        cortex = (f'On an ARM Cortex-M4F ({cortex_m4.COMPILER} -O2, QEMU): {needs.code} bytes of '
-                  f'code and constants, {needs.state} bytes of state, {needs.stack} bytes of '
-                  f'stack and {needs.instructions} instructions a step at most over the test '
-                  'vectors.')
-    else:
-        cortex = (f'Not measured on an ARM Cortex-M4F: install {cortex_m4.COMPILER} and '
-                  f'{cortex_m4.EMULATOR}, and export again.')
-    return {'TITLE': f'Control loop of {origin.plant}', 'VERSION': __version__,
-            'MODEL': loaded.name, 'DIGEST': loaded.digest, 'ACCEPTANCE': origin.acceptance,
-            'SIGNALS': '\n'.join(
-                f'| {role} | {", ".join(f"{name} [{unit}]" for name, unit in of)} |'
-                for role, of in signals(controller).items()),
-            'LEVELS': ', '.join(controller.levels), 'PERIOD': f'{sample_period:g}',
-            'CORTEX': cortex}

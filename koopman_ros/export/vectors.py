@@ -11,7 +11,7 @@ import numpy as np
 
 from koopman_ros.control import Controller
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.state import Mode, State, StepReport
+from koopman_ros.control.state import State, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.status import StatusCode
@@ -21,7 +21,7 @@ from koopman_ros.export.c_code import CODES
 # Largest integration step of the simulated plant, as a share of the fastest time constant.
 _STEP = 0.2
 # Faults, or none, that last longer than others.
-_LONG = ('', 'silent', 'stuck', 'pushed')
+_LONG = ('', 'silent', 'stuck', 'pushed', 'lost')
 
 
 @dataclass(frozen=True)
@@ -32,42 +32,37 @@ class Call:
     measured: Array | None  #: (n_y,) None where nothing is received
     setpoint: Array  #: (n_c,)
     applied: Array  #: (n_u,)
-    manual: bool
-    manual_input: Array  #: (n_u,)
+    disturbance: Array  #: (n_d,)
 
     def row(self, controller: Controller) -> list[str]:
         """Return the inputs as a row of a table."""
-        measured = np.full(len(controller.measured.names), np.nan) if self.measured is None else (
-            self.measured)
+        none = np.full(len(controller.measured.names), np.nan)
+        values = np.concatenate((
+            none if self.measured is None else self.measured, self.setpoint, self.applied,
+            self.disturbance if len(self.disturbance) else [np.nan]))
         return [str(self.elapsed_ns), str(int(self.measured is not None)),
-                *(repr(float(value)) for value in (*measured, *self.setpoint, *self.applied)),
-                str(int(self.manual)), *(repr(float(value)) for value in self.manual_input)]
+                *map(repr, values.tolist())]
 
 
 def columns(controller: Controller) -> list[str]:
     """Return the names of the columns of a call and its answer."""
-    inputs = controller.model.inputs.names
-    return ['elapsed_ns', 'received', *(f'measured {name}' for name in controller.measured.names),
-            *(f'setpoint {name}' for name in controller.controlled.names),
-            *(f'applied {name}' for name in inputs), 'manual',
-            *(f'manual {name}' for name in inputs), *(f'command {name}' for name in inputs),
-            'level', 'status', 'cause']
+    model = controller.model
+    return ['elapsed_ns', 'received', *(f'{role} {name}' for role, names in (
+        ('measured', controller.measured.names), ('setpoint', controller.controlled.names),
+        ('applied', model.inputs.names), ('disturbance', model.disturbances.names or ['none']),
+        ('command', model.inputs.names)) for name in names), 'level', 'status', 'cause']
 
 
 def answered(controller: Controller, state: State, call: Call, now_ns: int
              ) -> tuple[State, Array, StepReport]:
     """Return the controller's answer to a call at a time in ns."""
-    state = controller.set_mode(state, Mode.MANUAL if call.manual else Mode.AUTOMATIC)
-    if call.manual and np.isfinite(call.manual_input).all():
-        state, _ = controller.request_manual_input(state, call.manual_input)
-    given = ~np.isnan(call.setpoint)
-    inside = (call.setpoint >= controller.controlled.lower) & (
-        call.setpoint <= controller.controlled.upper)
-    if inside[given].all():
+    given, box = ~np.isnan(call.setpoint), controller.controlled
+    if ((call.setpoint >= box.lower) & (call.setpoint <= box.upper))[given].all():
         state = replace(state, setpoint=setpoints.request(
             state.setpoint, call.setpoint, 0, state.time_ns))
     if call.measured is not None:
-        return controller.step(state, call.measured, now_ns, call.applied)
+        return controller.step(state, call.measured, now_ns, call.applied,
+                               disturbances=call.disturbance)
     state, command, report = controller.hold(state, now_ns)
     return state, controller.safe_input if command is None else command, report
 
@@ -93,9 +88,9 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
     """
     Yield calls with the answers of the controller.
 
-    Its own model is the plant, under steps of the set-point, a disturbance, noise, manual mode and
-    faults: a lost or repeated sample, NaN, a jump, a stuck sensor, an actuator that does not
-    follow.
+    Its own model is the plant, under steps of the set-point, a disturbance, noise, measured
+    disturbances and faults: a lost or repeated sample, NaN, a jump, a stuck sensor, an actuator
+    that does not follow.
 
     :param interval: between samples in s.
     """
@@ -104,12 +99,13 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
     x, w, state = np.zeros(model.n_x), np.zeros(model.n_x), State()
     now_ns, command = NANOSECONDS, controller.nominal_input
     box, inputs, none = controller.controlled, model.inputs, np.full(model.n_u, np.nan)
-    setpoint, manual, fault, left, y = np.full(len(box), np.nan), False, '', 0, np.zeros(0)
+    setpoint, fault, left, y = np.full(len(box), np.nan), '', 0, np.zeros(0)
+    signals, d = model.disturbances, model.disturbances.center
     noise = 1e-4 * np.abs(outputs.C) @ (model.states.upper - model.states.lower)
     for _ in range(count):
         if left == 0:
-            fault = str(rng.choice(['', 'silent', 'nan', 'jump', 'stuck', 'manual', 'stiff',
-                                    'repeated', 'pushed'], p=[0.6, *[0.05] * 8]))
+            fault = str(rng.choice(['', 'silent', 'nan', 'jump', 'stuck', 'stiff', 'repeated',
+                                    'pushed', 'lost'], p=[0.6, *[0.05] * 8]))
             left = int(rng.integers(1, 30 if fault in _LONG else 10))
             if rng.random() < 0.2:
                 # a plant that has left its model does not come back by itself
@@ -117,12 +113,14 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
             w = rng.normal(size=model.n_x) * (0.5 if fault == 'pushed' else 0.02) * np.max(
                 np.abs(model.B), initial=0.0)
         left -= 1
-        repeated = (fault == 'repeated' and left % 3 == 1) or (manual and fault != 'manual')
-        elapsed_ns = 0 if repeated else round(
+        elapsed_ns = 0 if fault == 'repeated' and left % 3 == 1 else round(
             interval * NANOSECONDS * float(rng.choice([1.0, 1.0, 1.02, 1.3])))
         now_ns += elapsed_ns
         acting = np.full(model.n_u, 0.3) if fault == 'stiff' else inputs.to_deviation(command)
-        x = _moved(controller, x, acting, w, elapsed_ns / NANOSECONDS)
+        x = _moved(controller, x, acting, w + (
+            model.disturbance_rate(d) if len(d) else 0.0), elapsed_ns / NANOSECONDS)
+        if rng.random() < 0.1:
+            d = rng.uniform(signals.lower, signals.upper)
         if rng.random() < 0.02:
             setpoint = rng.uniform(box.lower, box.upper) * rng.choice([1.0, 1.0, 10.0])
         if fault != 'stuck' or not len(y):
@@ -132,11 +130,10 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
             seen[rng.integers(len(y))] = rng.choice([math.nan, math.inf, 1e300])
         elif fault == 'jump' and left % 4 == 0:
             seen[0] += 10.0 * (model.states.upper - model.states.lower)[0]
-        manual = fault == 'manual'
         call = Call(
             elapsed_ns, None if fault == 'silent' else seen, setpoint,
-            inputs.to_physical(acting) if fault == 'stiff' else none, manual,
-            rng.uniform(inputs.lower, inputs.upper) if manual and left % 7 == 0 else none)
+            inputs.to_physical(acting) if fault == 'stiff' else none,
+            np.where(fault == 'lost', np.nan, d))
         state, command, report = answered(controller, state, call, now_ns)
         yield call, answer_row(controller, command, report, state.command is not None)
 

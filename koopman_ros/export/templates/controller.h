@@ -16,7 +16,7 @@ extern "C" {
 
 /* The control level that acts; the levels of the laws are numbered from the best one, 0. */
 enum {
-    KOOPMAN_HOLD = KOOPMAN_LAWS, KOOPMAN_SAFE, KOOPMAN_MANUAL
+    KOOPMAN_HOLD = KOOPMAN_LAWS, KOOPMAN_SAFE
 };
 
 enum {
@@ -30,8 +30,7 @@ typedef struct {
     double measured[KOOPMAN_NY];
     double setpoint[KOOPMAN_NC];        /* NAN: no request, the one before stays */
     double applied[KOOPMAN_NU];         /* measured inputs; NAN: not measured */
-    int manual;                         /* 1: command manual_input, and no law */
-    double manual_input[KOOPMAN_NU];    /* NAN: the one before stays */
+    double disturbance[KOOPMAN_ND];     /* measured disturbances; NAN: the one before stays */
 } koopman_inputs;
 
 typedef struct {
@@ -50,19 +49,22 @@ typedef struct {
 } koopman_supervisor;
 
 typedef struct {
-    int known, certain;
+    int known;
     double x[KOOPMAN_NX], w[KOOPMAN_NX], P[KOOPMAN_NP * KOOPMAN_NP];
 } koopman_estimate;
 
 typedef struct {
     int64_t now, measured_at, commanded_at;
-    int commanded, law, manual, manual_known, jumped, active, transferring, targeted;
-    double interval, command[KOOPMAN_NU], manual_input[KOOPMAN_NU];
+    int commanded, law, jumped, active, transferring;
+    double interval, command[KOOPMAN_NU];
     int queued;
     int64_t applied_at[KOOPMAN_QUEUE];
     double applied[KOOPMAN_QUEUE][KOOPMAN_NU];
     double requested[KOOPMAN_NC], setpoint[KOOPMAN_NC], ramped[KOOPMAN_NC];
     int64_t accepted_at, still_since[KOOPMAN_NY];
+    int unmeasured[KOOPMAN_ND];
+    int64_t disturbed_at[KOOPMAN_ND];
+    double disturbance[KOOPMAN_ND];
     double accepted[KOOPMAN_NY], travel[KOOPMAN_NY], still_w[KOOPMAN_NX];
     koopman_estimate estimate;
     koopman_supervisor supervisor;

@@ -18,7 +18,7 @@ int main(void)
     static koopman_inputs inputs;
     koopman_outputs outputs;
     char line[4096], *text;
-    double start[2], manual;
+    double start[2];
 
     koopman_init(&state, NULL);
     while (fgets(line, sizeof line, stdin)) {
@@ -30,9 +30,7 @@ int main(void)
         numbers(&text, KOOPMAN_NY, inputs.measured);
         numbers(&text, KOOPMAN_NC, inputs.setpoint);
         numbers(&text, KOOPMAN_NU, inputs.applied);
-        numbers(&text, 1, &manual);
-        inputs.manual = manual > 0.0;
-        numbers(&text, KOOPMAN_NU, inputs.manual_input);
+        numbers(&text, KOOPMAN_ND, inputs.disturbance);
         koopman_step(&state, &inputs, &outputs);
         for (int i = 0; i < KOOPMAN_NU; i++) printf("%.17g,", outputs.command[i]);
         printf("%d,%d,%d\n", outputs.level, outputs.status, outputs.cause);

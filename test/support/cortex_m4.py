@@ -4,9 +4,7 @@
 """The exported code on an ARM Cortex-M4F: size, stack and instructions, under QEMU."""
 
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
-import shutil
 import subprocess
 import tempfile
 
@@ -25,11 +23,6 @@ class CortexM4:
     answers: str  #: rows, as those of the example
 
 
-def installed() -> bool:
-    """Whether compiler and emulator are there."""
-    return all(map(shutil.which, (COMPILER, EMULATOR)))
-
-
 def run(folder: Path, calls: str, timeout: float = 300.0) -> CortexM4:
     """
     Compile an exported folder, and run its example.
@@ -37,8 +30,8 @@ def run(folder: Path, calls: str, timeout: float = 300.0) -> CortexM4:
     :param calls: rows of ``test_vectors.csv``.
     :raises subprocess.CalledProcessError: where the code does not compile.
     """
-    with tempfile.TemporaryDirectory() as place, as_file(
-            files(__package__) / 'cortex_m4.c') as startup:
+    startup = Path(__file__).with_suffix('.c')
+    with tempfile.TemporaryDirectory() as place:
         program, code = Path(place) / 'program.elf', Path(place) / 'controller.o'
 
         def compiled(*arguments: object) -> None:

@@ -8,7 +8,7 @@
 
 #include <stdio.h>
 
-#define STACK 65536
+#define STACK 131072
 #define TIMER ((volatile uint32_t *)0xE000E010u)
 
 extern void _start(void);
