@@ -94,15 +94,14 @@ def test_a_model_that_diverges_says_so(tmp_path):
 
 @pytest.mark.parametrize(('slope', 'words'), [
     (A, ''), (A * [[1.0, 1.0], [1.4, 1.0]], 'above that of the best linear model'),
-    # fits 0.4 and 2.0 % below
-    (A * [[1.0, 1.0], [1.13, 1.0]], ''),
-    (A * [[1.0, 1.0], [1.14, 1.0]], 'by more than 1 % of the motion'),
+    # fits 0.6 and 1.4 % below
+    (A * [[1.0, 1.0], [1.103, 1.0]], ''),
+    (A * [[1.0, 1.0], [1.107, 1.0]], 'by more than 1 % of the motion'),
     (30.0 * np.eye(2), 'error of its free run, inf m in position')])
 def test_a_model_is_refused_whose_free_run_is_worse_than_that_of_the_linear_model(slope, words):
     test = read(table(), 'position [m]', 'force [N]')
-    found = Identified(drift(), '', drift(A * [[1.0, 1.0], [1.1, 1.0]]), (), np.ones(2), (), (), 1)
-    reasons = _failed_test({'test': simulate(lifted(slope=slope), test, init=5)}, found, test,
-                           test)
+    reasons = _failed_test(*(simulate(lifted(slope=one), test) for one in (
+        slope, A * [[1.0, 1.0], [1.1, 1.0]])), test)
     assert len(reasons) == bool(words)
     assert words in ''.join(reasons)
 
