@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -74,19 +75,6 @@ class Thresholds:
             raise ValueError(f'condition = {self.condition} must be above 1')
 
 
-@dataclass(frozen=True)
-class DisplacedDrift:
-    """A drift under constant disturbances."""
-
-    drift: Drift  #: without them
-    inputs: Array  #: (n_u,) added to the inputs, in input units
-    offset: Array  #: (n_x,) added to the rate, in state units per time unit
-
-    def __call__(self, x: Array, u: Array) -> Array:
-        """Evaluate the rate (M, n_x)."""
-        return self.drift.rate(x, u + self.inputs) + self.offset
-
-
 class HeldOut:
     """The held-out part of a record, and the requirements on a model there."""
 
@@ -144,7 +132,7 @@ class HeldOut:
         def checked(k: int) -> tuple[Drift, ClosedLoopTest, str]:
             drift, rate, words = drifts[k], drifts[k].rate, ''
             if displaced and k % 2:
-                rate = DisplacedDrift(drift, *displaced[k // 2 % 2])
+                rate = partial(_displaced, drift, *displaced[k // 2 % 2])
                 words = ' with its disturbances at the ends of their ranges'
             return drift, self.law_check(model, loops, lambda share: watch(
                 (k + share) / len(drifts)), backend, rate=rate, seed=1 + k), words
@@ -197,6 +185,11 @@ class HeldOut:
         if not law_check.accepted:
             reasons.append(uncontrolled('the estimated drift', law_check))
         return tuple(filter(None, reasons))
+
+
+def _displaced(drift: Drift, inputs: Array, offset: Array, x: Array, u: Array) -> Array:
+    """Evaluate the rate (M, n_x) of a drift with constant additions to its inputs and rates."""
+    return drift.rate(x, u + inputs) + offset
 
 
 def uncontrolled(drift: str, check: ClosedLoopTest) -> str:
