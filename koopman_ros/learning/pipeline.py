@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 import glob
 import hashlib
@@ -283,8 +283,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     others = {name: _free_runs(replace(found, drift=drift), recorded, test, usual)
               for name, drift in ((DRIFT, found.drift), (LINEAR_MODEL, found.linear))}
     decision = replace(decision, reasons=(
-        *decision.reasons, *([] if test is None else _failed_test(
-            runs['test'], others[LINEAR_MODEL]['test'], test))), warnings=(
+        *decision.reasons, *_failed_runs(runs, others)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
@@ -370,13 +369,19 @@ def _free_runs(model: AnyModel, recorded: Record, test: Record | None, usual: Ar
     return runs
 
 
-def _failed_test(own: FreeRun, linear: FreeRun, test: Record) -> tuple[str, ...]:
-    """Say that a free run of the test record is clearly worse than the best linear model's."""
-    if not own.diverged and not np.mean(linear.fit) > np.mean(own.fit) + _LESS_FIT:
-        return ()
-    return (f'on {", ".join(test.sources) or "the test record"} the error of its free run, '
-            f'{own.error_text()}, is above that of the best linear model, {linear.error_text()}, '
-            f'by more than {_LESS_FIT:g} % of the motion',)
+def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, FreeRun]]
+                 ) -> Iterator[str]:
+    """Say that a free run diverges, or is clearly worse on the test record than a linear one."""
+    for name, own in runs.items():
+        linear, test = others[LINEAR_MODEL][name], name == 'test'
+        # that of an unstable plant diverges by any model
+        if own.diverged and (test or not others[DRIFT][name].diverged):
+            yield (f'its free run of the {"test " * test}record diverges: from {own.leaves:.4g} '
+                   f'{own.plant.time_unit} on it errs by more than the measured range')
+        elif test and np.mean(linear.fit) > np.mean(own.fit) + _LESS_FIT:
+            yield (f'the error of its free run of the test record, {own.error_text()}, is above '
+                   f'that of the best linear model, {linear.error_text()}, by more than '
+                   f'{_LESS_FIT:g} % of the motion')
 
 
 def _checked(task: TrainingTask) -> Thresholds:
