@@ -63,7 +63,9 @@ def test_a_file_is_learned_tested_and_reported(folder, capsys):
         'day.test.png', *others}
     runs = summary['free_runs']
     assert [runs[name]['fit_percent']['level'] > 99.0 for name in ('record', 'test')] == [True] * 2
-    assert '| test | level |' in (folder / 'day.md').read_text()
+    assert {(model, name) for model, some in summary['free_runs_of'].items() for name in some} == {
+        (model, name) for model in ('estimated drift', 'best linear model') for name in runs}
+    assert '| test | level | best linear model |' in (folder / 'day.md').read_text()
 
 
 def test_a_dead_time_is_found_and_belongs_to_the_model(folder):

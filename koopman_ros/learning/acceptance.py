@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -94,19 +95,19 @@ class HeldOut:
         return self.rmse(lifted_rate(model, self._seconds))
 
     def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
-                  backend: Backend | None = None, *, drift: Drift | None = None, seed: int = 0
+                  backend: Backend | None = None, *, rate: Rate | None = None, seed: int = 0
                   ) -> ClosedLoopTest:
         """
         Close a model's loop on the estimated drift; Stopped where `watch` ended it.
 
-        :param drift: the drift to take instead.
+        :param rate: that to take instead.
         """
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
         model = replace(model, dead_time=self._seconds * self._found.dead_time)
         found = evaluate_closed_loops(
-            model, (drift or self._found.drift).rate, loops=loops, seed=seed, watch=watch,
+            model, rate or self._found.drift.rate, loops=loops, seed=seed, watch=watch,
             interval=period * self._seconds, noise=np.nan_to_num(self._found.noise),
             backend=backend, disturbances=self._found.disturbances)
         if found is None:
@@ -114,16 +115,43 @@ class HeldOut:
         return found
 
     def further_checks(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
-                       backend: Backend | None) -> tuple[tuple[Drift, ClosedLoopTest], ...]:
-        """Close the loop from other starts, on this drift and on each alternative."""
+                       backend: Backend | None
+                       ) -> tuple[tuple[Drift, ClosedLoopTest, str], ...]:
+        """
+        Close the loop from other starts, on this drift and on each alternative.
+
+        Every second round has constant disturbances: the offsets of an episode and of the one
+        most unlike it, measured disturbances at their lower and upper ends.
+
+        :return: the drifts, the loops, and the disturbances in words.
+        """
         drifts = [self._found.drift, *self._found.alternatives[:_MOST_ALTERNATIVES]]
         drifts += [self._found.drift] * (_ROUNDS - len(drifts))
+        displaced = self._displacements(model)
 
-        def checked(k: int) -> ClosedLoopTest:
-            return self.law_check(model, loops, lambda share: watch((k + share) / len(drifts)),
-                                  backend, drift=drifts[k], seed=1 + k)
+        def checked(k: int) -> tuple[Drift, ClosedLoopTest, str]:
+            drift, rate, words = drifts[k], drifts[k].rate, ''
+            if displaced and k % 2:
+                rate = partial(_displaced, drift, *displaced[k // 2 % 2])
+                words = ' with its disturbances at the ends of their ranges'
+            return drift, self.law_check(model, loops, lambda share: watch(
+                (k + share) / len(drifts)), backend, rate=rate, seed=1 + k), words
 
-        return tuple((drift, checked(k)) for k, drift in enumerate(drifts))
+        return tuple(checked(k) for k in range(len(drifts)))
+
+    def _displacements(self, model: LiftedModel) -> list[tuple[Array, Array]]:
+        """Return changes of the inputs (n_u,) and of the rates (n_x,) at two ends; or none."""
+        inputs, offsets = self._found.drift.box.inputs, self._found.offsets
+        measured = np.isin(inputs.names, self._found.disturbances)
+        if not (measured.any() or len(offsets)):
+            return []
+        rates = np.zeros((2, len(self.scale)))
+        if len(offsets):
+            scaled = offsets / self.scale
+            first = int(np.argmax(np.sum(scaled ** 2, axis=1)))
+            rates = offsets[[first, int(np.argmin(scaled @ scaled[first]))]]
+        return [(np.where(measured, end - model.inputs.center, 0.0), rate)
+                for end, rate in zip((inputs.lower, inputs.upper), rates, strict=True)]
 
     def better(self, rmse: Array) -> dict[str, Rate]:
         """Return the drifts by form that do not err more than a model that errs so (n_x,)."""
@@ -159,6 +187,11 @@ class HeldOut:
         return tuple(filter(None, reasons))
 
 
+def _displaced(drift: Drift, inputs: Array, offset: Array, x: Array, u: Array) -> Array:
+    """Evaluate the rate (M, n_x) of a drift with constant additions to its inputs and rates."""
+    return drift.rate(x, u + inputs) + offset
+
+
 def uncontrolled(drift: str, check: ClosedLoopTest) -> str:
     """Say that a law does not control a drift, and what to try."""
     return (f'its law does not control {drift}: {check}; set model_class to best, or record more '
@@ -177,9 +210,9 @@ class AcceptanceResult:
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
-    #: more of them, of which none took part in a choice, on this and alternative drifts; none of a
-    #: model that is refused without them
-    further_checks: tuple[tuple[Drift, ClosedLoopTest], ...] = ()
+    #: more of them, of which none took part in a choice, on this and alternative drifts, with the
+    #: disturbances in words; none of a model that is refused without them
+    further_checks: tuple[tuple[Drift, ClosedLoopTest, str], ...] = ()
     operating_points: tuple[OperatingPoint, ...] = ()  #: with the eigenvalues of the model
 
     __repr__ = short_repr
@@ -187,8 +220,8 @@ class AcceptanceResult:
     @property
     def statement(self) -> str:
         """The share of failed loops on all drifts, with its confidence."""
-        checks = [check for _, check in self.further_checks] or [self.law_check]
-        return statement(checks, len({id(drift) for drift, _ in self.further_checks}))
+        checks = [check for _, check, _ in self.further_checks] or [self.law_check]
+        return statement(checks, len({id(drift) for drift, *_ in self.further_checks}))
 
     @property
     def accepted(self) -> bool:
@@ -224,9 +257,10 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
         reasons = (*filter(None, [beside]), *reasons)
     further = () if reasons else held_out.further_checks(model, loops, watch, backend)
     reasons = (*reasons, *dict.fromkeys(
-        uncontrolled(f'a {drift.form} that explains the record equally well', check)
-        for drift, check in further if check.loops and not check.accepted))
-    points = operating_points(model, law_check.setpoints)
+        uncontrolled(f'a {drift.form} that explains the record equally well{words}', check)
+        for drift, check, words in further if check.loops and not check.accepted))
+    points = operating_points(model, np.vstack([
+        law_check.setpoints, *(check.setpoints for _, check, _ in further)]))
     reasons = (*reasons, *filter(None, [unfounded_instability(
         model, found, points, held_out.better(rmse))]))
     warnings = _warnings(found, model, drift_rmse,

@@ -80,6 +80,18 @@ class FreeRun:
         """Whether an episode cannot be simulated to its end."""
         return not np.all(np.isfinite(self.rmse))
 
+    @property
+    def leaves(self) -> float:
+        """First time at which the simulation errs by more than the measured range, or NaN."""
+        n_y = len(self.names)
+        measured = np.concatenate([episode.x for episode in self.episodes])
+        most = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
+        for episode, path in zip(self.episodes, self.paths, strict=True):
+            near = (np.abs(path[:, :n_y] - episode.x) <= most) | np.isnan(episode.x)
+            if not near.all():
+                return float(episode.time[np.argmin(near.all(axis=1))])
+        return np.nan
+
     def draw(self, path: str | os.PathLike[str]) -> None:
         """
         Draw measurements, simulation and inputs of the first episodes, as PNG.

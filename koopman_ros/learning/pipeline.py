@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 import glob
 import hashlib
@@ -30,7 +30,7 @@ from koopman_ros.learning.acceptance import (
 )
 from koopman_ros.learning.downsampling import coverage
 from koopman_ros.learning.drift_sampling import alternative_models, compare_classes
-from koopman_ros.learning.free_run import FREE_RUN, FreeRun, simulate
+from koopman_ros.learning.free_run import AnyModel, FREE_RUN, FreeRun, simulate
 from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
@@ -68,6 +68,7 @@ _STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
            'decide': (0.9, 1.0)}
 # Shares of deciding in which the closed loops are run, and further ones, too.
 _JUDGED, _WRITING = 0.8, 0.9
+DRIFT, LINEAR_MODEL = 'estimated drift', 'best linear model'  #: compared with the new model
 # % of the motion: errors on another day scatter by more than smaller differences say.
 _LESS_FIT = 1.0
 
@@ -96,6 +97,8 @@ class Retrained:
     reduction: Reduction | None = None  #: the part of a long record that is used
     #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
     free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
+    #: likewise by model: of the drift that it was learned from, of the best linear model
+    compared_runs: Mapping[str, Mapping[str, FreeRun]] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -183,10 +186,15 @@ class Retrained:
                 'closed_loop_cost_over_linear': check.median_ratio,
                 'worst_closed_loop_cost_over_linear': check.worst_ratio,
             }
-        figures['free_runs'] = {name: {
-            'error': dict(zip(run.names, map(float, run.rmse), strict=True)),
-            'fit_percent': dict(zip(run.names, map(float, run.fit), strict=True))}
-            for name, run in self.free_runs.items()}
+
+        def of_runs(runs: Mapping[str, FreeRun]) -> dict[str, object]:
+            return {name: {'error': dict(zip(run.names, map(float, run.rmse), strict=True)),
+                           'fit_percent': dict(zip(run.names, map(float, run.fit), strict=True))}
+                    for name, run in runs.items()}
+
+        figures['free_runs'] = of_runs(self.free_runs)
+        figures['free_runs_of'] = {name: of_runs(runs)
+                                   for name, runs in self.compared_runs.items()}
         finite_figures: dict[str, object] = finite(figures)
         return finite_figures
 
@@ -270,11 +278,12 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     learned = learned.with_model(replace(learned.model, dead_time=dead_time))
-    runs = {'record': simulate(learned, recorded)}
-    if test is not None:
-        runs['test'] = simulate(learned, test, usual=runs['record'].rmse)
+    usual = found.free_run if len(found.free_run) else None
+    runs = _free_runs(learned, recorded, test, usual)
+    others = {name: _free_runs(replace(found, drift=drift), recorded, test, usual)
+              for name, drift in ((DRIFT, found.drift), (LINEAR_MODEL, found.linear))}
     decision = replace(decision, reasons=(
-        *decision.reasons, *_failed_test(runs, found, recorded, test)), warnings=(
+        *decision.reasons, *_failed_runs(runs, others)), warnings=(
         *decision.warnings, *uncovered_setpoints(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
@@ -287,7 +296,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
                    reasons=decision.reasons, model_file=str(path), free_runs=runs,
-                   alternative_files=_save_alternatives(Path(task.output), [
+                   compared_runs=others, alternative_files=_save_alternatives(Path(task.output), [
                        replace(one, dead_time=dead_time)
                        for one in alternative_models(found, plant)]))
 
@@ -351,19 +360,28 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
         episodes, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
 
 
-def _failed_test(runs: Mapping[str, FreeRun], found: Identified, recorded: Record,
-                 test: Record | None) -> tuple[str, ...]:
-    """Say that a free run of the test record is clearly worse than the best linear model's."""
-    if test is None:
-        return ()
-    own = runs['test']
-    best = replace(found, drift=found.linear)
-    linear = simulate(best, test, usual=simulate(best, recorded).rmse)
-    if not own.diverged and not np.mean(linear.fit) > np.mean(own.fit) + _LESS_FIT:
-        return ()
-    return (f'on {", ".join(test.sources) or "the test record"} the error of its free run, '
-            f'{own.error_text()}, is above that of the best linear model, {linear.error_text()}, '
-            f'by more than {_LESS_FIT:g} % of the motion',)
+def _free_runs(model: AnyModel, recorded: Record, test: Record | None, usual: Array | None
+               ) -> dict[str, FreeRun]:
+    """Simulate the record, with an offset of each episode like the drift, and the test record."""
+    runs = {'record': simulate(model, recorded, usual=usual)}
+    if test is not None:
+        runs['test'] = simulate(model, test, usual=runs['record'].rmse)
+    return runs
+
+
+def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, FreeRun]]
+                 ) -> Iterator[str]:
+    """Say that a free run diverges, or is clearly worse on the test record than a linear one."""
+    for name, own in runs.items():
+        linear, test = others[LINEAR_MODEL][name], name == 'test'
+        # that of an unstable plant diverges by any model
+        if own.diverged and (test or not others[DRIFT][name].diverged):
+            yield (f'its free run of the {"test " * test}record diverges: from {own.leaves:.4g} '
+                   f'{own.plant.time_unit} on it errs by more than the measured range')
+        elif test and np.mean(linear.fit) > np.mean(own.fit) + _LESS_FIT:
+            yield (f'the error of its free run of the test record, {own.error_text()}, is above '
+                   f'that of the best linear model, {linear.error_text()}, by more than '
+                   f'{_LESS_FIT:g} % of the motion')
 
 
 def _checked(task: TrainingTask) -> Thresholds:

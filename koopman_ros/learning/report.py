@@ -130,10 +130,12 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield '## Free run'
     yield ('Simulations by the inputs alone, from starts fitted to the first samples of each '
            'episode. The fit is the explained share of the motion.')
-    yield table(('record', 'state', 'error', 'fit [%]'), (
-        (name, state, f'{rmse:.5g} {unit}', f'{fit:.1f}')
-        for name, run in retrained.free_runs.items() for state, unit, rmse, fit in zip(
-            run.names, run.units, run.rmse, run.fit, strict=True)), (2, 3))
+    yield table(('record', 'state', 'simulation by', 'error', 'fit [%]'), (
+        (name, state, model, f'{rmse:.5g} {unit}', f'{fit:.1f}')
+        for model, runs in {'the new model': retrained.free_runs,
+                            **retrained.compared_runs}.items()
+        for name, run in runs.items() for state, unit, rmse, fit in zip(
+            run.names, run.units, run.rmse, run.fit, strict=True)), (3, 4))
     eigenvalues = ', '.join(f'{value:.3g}' for value in learned.model.eigenvalues)
     own = learned.model.states
     yield 'Set-points are accepted within ' + ', '.join(

@@ -246,8 +246,10 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         yield MODEL, now.model_rejected
     if report.measurement.outside > 0.0:
         outside = _untrained(states.only(tuple(now.signals.states)), now.measured)
-        yield MODEL, (f'{outside or "the state is far from the training data"}: '
-                      'the model extrapolates')
+        # within the ranges, a state is among the data as far as the nonlinear laws act
+        if outside or report.measurement.outside > now.controller.order.margins[0]:
+            yield MODEL, (f'{outside or "the state is far from the training data"}: '
+                          'the model extrapolates')
     if oldest and abs(age) > oldest:
         yield MEASUREMENTS, (
             f'measurements are {age:.1f} s old on receipt, max_measurement_age allows '

@@ -72,6 +72,20 @@ def test_loops_have_dead_time_noise_and_period_of_the_record(found, trained, no_
     assert others['interval'] == pytest.approx(1.0)
 
 
+def test_every_second_round_has_the_disturbances_of_the_record_at_their_ends(
+        found, trained, no_loops):
+    drift, inputs, x = found.drift, found.drift.box.inputs, found.drift.box.states.center[None]
+    decision = evaluate_model(replace(
+        found, offsets=np.array([[0.3], [0.1], [-0.4]]), disturbances=inputs.names), trained,
+        None, Thresholds())
+    assert [bool(words) for *_, words in decision.further_checks] == [False, True] * 2
+    assert decision.statement.startswith('0 of 36 loops failed: ')
+    nominal = trained.model.inputs.center
+    expected = [drift.rate(x, u[None])[0, 0] + offset for u, offset in (
+        (nominal, 0.0), (inputs.lower, -0.4), (nominal, 0.0), (inputs.upper, 0.3))]
+    assert [rate(x, nominal[None])[0, 0] for _, rate, _ in no_loops[1:]] == pytest.approx(expected)
+
+
 @pytest.mark.parametrize(('unit', 'seconds'), [('s', 1.0), ('min', 60.0)])
 def test_rate_of_a_lift_in_units(unit, seconds):
     lift = replace(random_lift(n_u=2), time_unit=unit)
@@ -179,7 +193,7 @@ def test_the_law_is_tried_on_all_drifts_that_explain_the_record(found, trained, 
     assert (decision.reasons, decision.warnings) == ((), ())
     assert decision.statement.startswith('0 of 32 loops failed on 3 models that explain the rec')
     # with starts of their own, that of a choice among classes, too
-    starts = [decision.law_check, *(check for _, check in decision.further_checks)]
+    starts = [decision.law_check, *(check for _, check, _ in decision.further_checks)]
     assert len(np.unique(np.concatenate([one.starts[:, 0] for one in starts]))) == 5 * 8
     decision = judged(replace(drift), replace(drift, B=-drift.B))
     (reason,) = decision.reasons

@@ -233,6 +233,20 @@ def test_another_law_is_a_warning_and_no_law_an_error(depth: int, severity: Seve
     assert statuses(context(own, state, lower))['control'].level is severity
 
 
+@pytest.mark.parametrize(('degrees', 'outside', 'words'), [
+    (45.0, 0.07, ''), (45.0, 0.11, 'far from the training data'),
+    (54.5, 0.06, 'outside the trained range'), (45.0, 0.0, '')])
+def test_a_state_within_the_ranges_is_far_from_the_data_beyond_the_margin(
+        degrees: float, outside: float, words: str) -> None:
+    own, state, report = measured(Mode.AUTOMATIC)
+    now = context(own, state, replace(
+        report, measurement=replace(report.measurement, outside=outside)))
+    now.measured = np.array([degrees + 273.15])
+    found = statuses(now)['model']
+    assert found.level is (Severity.WARN if words else Severity.OK)
+    assert words in found.message
+
+
 def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
     own, state, report = measured(Mode.AUTOMATIC)
     assert statuses(context(own, state, report))['model'].level is Severity.OK

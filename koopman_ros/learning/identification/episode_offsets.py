@@ -12,6 +12,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.learning.identification.alternatives import TransformedDrift
 from koopman_ros.learning.identification.drift import Drift, DriftModel
 from koopman_ros.learning.identification.identify import Identified
 from koopman_ros.learning.identification.network_drift import NetworkDrift
@@ -45,16 +46,19 @@ def without_episode_inputs(found: Identified, n_u: int) -> Identified:
 
     def first(one: Drift) -> Drift:
         inputs = one.box.inputs
+        box = replace(one.box, inputs=inputs.only(inputs.names[:n_u]))
+        if isinstance(one, TransformedDrift):
+            return replace(one, drift=first(one.drift), box=box)
         assert isinstance(one, DriftModel | NetworkDrift)
-        return replace(one, B=one.B[:, :n_u], box=replace(
-            one.box, inputs=inputs.only(inputs.names[:n_u])))
+        return replace(one, B=one.B[:, :n_u], box=box)
 
     fitted, held_out = (tuple(replace(one, u=one.u[:, :n_u], linear=one.linear[:n_u])
                               for one in some) for some in (found.fitted, found.held_out))
     linear = first(found.linear)
     assert isinstance(linear, DriftModel)
     return replace(found, drift=first(drift), linear=linear, fitted=fitted, held_out=held_out,
-                   offsets=offsets, dead_time=found.dead_time[:n_u])
+                   alternatives=tuple(map(first, found.alternatives)), offsets=offsets,
+                   dead_time=found.dead_time[:n_u])
 
 
 def _levels(episodes: int) -> Array:

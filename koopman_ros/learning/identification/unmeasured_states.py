@@ -346,13 +346,13 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             able = [one for one in able if one is not best]
             if not able:
                 raise
-    result = record.identified(predictor, best.label, [one.score for one in choice.candidates],
-                               stage('linear model', np.inf))
+    result = replace(
+        record.identified(predictor, best.label, [one.score for one in choice.candidates],
+                          stage('linear model', np.inf)),
+        alternatives=in_coordinates_of(predictor, _equals(best, able), record))
     if best.offsets:
         result = without_episode_inputs(result, len(plant.input_names))
     return replace(result, warnings=warnings, steps=choice.ended(best), free_run=best.score.rmse,
-                   alternatives=() if best.offsets else in_coordinates_of(
-                       predictor, _equals(best, able), record),
                    dead_time=record.period * np.array(best.late or np.zeros(
                        len(plant.input_names))))
 

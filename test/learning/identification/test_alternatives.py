@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from koopman_ros.learning.identification import DriftModel
-from koopman_ros.learning.identification.alternatives import in_coordinates_of
+from koopman_ros.learning.identification import DriftModel, Identified
+from koopman_ros.learning.identification.alternatives import in_coordinates_of, TransformedDrift
+from koopman_ros.learning.identification.episode_offsets import without_episode_inputs
 from koopman_ros.learning.identification.innovations_form import Predictor
 from support.known_plants import box
 
@@ -55,3 +56,15 @@ def test_a_drift_in_other_coordinates_has_the_same_motion() -> None:
         assert found.scaled_slope(xi, v)[..., j] == pytest.approx(beside, abs=1e-8)
     assert MAP @ found.scaled_input_matrix(xi) == pytest.approx(other.drift.B)
     assert (found.form, found.varying_input_matrix) == ('drift of degree 1', False)
+
+
+def test_alternatives_lose_the_offsets_of_the_episodes_like_the_drift() -> None:
+    both = box([-1.0, -2.0], [3.0, 2.0], [-1.0, -1.0], [1.0, 1.0])
+    drift = DriftModel(both, 1, np.ones((3, 2)), np.array([[0.4, 0.3], [0.8, 0.5]]))
+    found = without_episode_inputs(Identified(
+        drift, '', drift, (), np.zeros(1), (), (), 1,
+        alternatives=(TransformedDrift(both, drift, MAP, SHIFT),)), 1)
+    xi, v = np.linspace(-1.0, 1.0, 10).reshape(5, 2), np.linspace(-1.0, 1.0, 5)[:, None]
+    assert found.offsets == pytest.approx(np.outer([1.0, -1.0], drift.input_matrix[:, 1]))
+    assert found.alternatives[0].scaled_rate(xi, v) == pytest.approx(
+        TransformedDrift(both, drift, MAP, SHIFT).scaled_rate(xi, np.pad(v, ((0, 0), (0, 1)))))

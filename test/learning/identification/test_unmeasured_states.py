@@ -12,6 +12,7 @@ from scipy.optimize import fsolve
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import (
+    DriftModel,
     identify_structure,
     identify_unmeasured,
     Stopped,
@@ -134,20 +135,29 @@ def test_a_known_input_matrix_is_kept():
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
 
-def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypatch):
+def outlet(x, u):
+    """Overflow at a level: no polynomial has the corner."""
+    y, w = x
+    return np.array([w - 0.4 * y - 2.0 * max(0.0, y - 0.3), 1.5 * (u - w)])
+
+
+def duffing(x, u):
+    """Oscillate on a spring that hardens; the speed is not measured."""
+    y, w = x
+    return np.array([w, u - 0.4 * w - y - 2.0 * y ** 3])
+
+
+@pytest.mark.parametrize(('rate', 'degree', 'kind', 'samples'), [
+    (outlet, 1, NetworkDrift, 1000), (duffing, 3, DriftModel, 700)])
+def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
+        monkeypatch, rate, degree, kind, samples):
     # one of all networks
     monkeypatch.setattr(unmeasured_states, '_UNITS', (8,))
     monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
-
-    # no polynomial has the corner of an outlet that opens at a level
-    def outlet(x, u):
-        y, w = x
-        return np.array([w - 0.4 * y - 2.0 * max(0.0, y - 0.3), 1.5 * (u - w)])
-
-    found = identify_unmeasured(PLANT, [record(outlet, samples=1000, size=0.8)], 1,
-                                highest_degree=1, dead_times=False, seed=2)
-    assert isinstance(found.drift, NetworkDrift)
-    other = record(outlet, samples=600, size=0.8, seed=5)
+    found = identify_unmeasured(PLANT, [record(rate, samples=samples, size=0.8)], 1,
+                                highest_degree=degree, dead_times=False, seed=2)
+    assert isinstance(found.drift, kind)
+    other = record(rate, samples=600, size=0.8, seed=5)
     settled = slice(100, None)
     errors = [np.sqrt(np.mean((simulated(drift, other)[settled] - other.x[settled, 0]) ** 2))
               for drift in (found.drift, found.linear)]
@@ -158,9 +168,8 @@ def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
     monkeypatch.setattr(NetworkDrift, 'bounded', False)
     monkeypatch.setattr(unmeasured_states, '_UNITS', (1,))
     monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
-    found = identify_unmeasured(PLANT, [record(
-        lambda x, u: np.array([x[1] - 0.4 * x[0] - 2.0 * max(0.0, x[0] - 0.3), 1.5 * (u - x[1])]),
-        samples=300, size=0.8)], 1, highest_degree=1)
+    found = identify_unmeasured(PLANT, [record(outlet, samples=300, size=0.8)], 1,
+                                highest_degree=1)
     assert not any('network' in score.method for score in found.scores)
 
 
