@@ -14,8 +14,8 @@ from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import (
     identify_structure,
     identify_unmeasured,
+    network_candidates,
     Stopped,
-    unmeasured_states,
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 
@@ -136,8 +136,8 @@ def test_a_known_input_matrix_is_kept():
 
 def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypatch):
     # one of all networks
-    monkeypatch.setattr(unmeasured_states, '_UNITS', (8,))
-    monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
+    monkeypatch.setattr(network_candidates, 'UNITS', (8,))
+    monkeypatch.setattr(network_candidates, 'STARTS', 1)
 
     # no polynomial has the corner of an outlet that opens at a level
     def outlet(x, u):
@@ -156,8 +156,8 @@ def test_a_kink_needs_a_network_whose_simulation_is_good_on_other_days(monkeypat
 
 def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
     monkeypatch.setattr(NetworkDrift, 'bounded', False)
-    monkeypatch.setattr(unmeasured_states, '_UNITS', (1,))
-    monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
+    monkeypatch.setattr(network_candidates, 'UNITS', (1,))
+    monkeypatch.setattr(network_candidates, 'STARTS', 1)
     found = identify_unmeasured(PLANT, [record(
         lambda x, u: np.array([x[1] - 0.4 * x[0] - 2.0 * max(0.0, x[0] - 0.3), 1.5 * (u - x[1])]),
         samples=300, size=0.8)], 1, highest_degree=1)
