@@ -32,7 +32,6 @@ from koopman_ros.export.vectors import vectors
 from koopman_ros.model import (
     Coordinates,
     LiftedModel,
-    load,
     NetworkObservables,
     PolynomialObservables,
 )
@@ -51,8 +50,8 @@ _FLOOR = 1e-3
 # Seconds between samples of the bundled models, where not 1 s, and the plants of those that are
 # not named like one.
 _INTERVALS = {'pendulum': 0.02, 'two_state_example': 0.1, 'two_tanks': 0.5}
-_PLANTS = {'reactor_feed': 'reactor', 'reactor_linear': 'reactor', 'reactor_nz3': 'reactor', 'reactor_nz4': 'reactor',
-           'two_state_saddle': 'two_state'}
+_PLANTS = {'reactor_feed': 'reactor', 'reactor_linear': 'reactor', 'reactor_nz3': 'reactor',
+           'reactor_nz4': 'reactor', 'two_state_saddle': 'two_state'}
 
 
 @dataclass(frozen=True)

@@ -326,15 +326,16 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
             warnings.append(
                 f'the best drift predicts {name} with an error of {error[i]:.3g} {unit}, of which '
                 f'{excess:.3g} {unit} is not noise ({noise:.3g} {unit} from sample to sample): '
-                + _remedy(likely_causes(found, i)))
+                + _remedy(found, i))
     return tuple(warnings)
 
 
-def _remedy(causes: Sequence[tuple[float, str]]) -> str:
-    """Name the parameters to try, likeliest first."""
+def _remedy(found: Identified, i: int) -> str:
+    """Name the parameters to try for a measured state, likeliest first."""
+    causes = likely_causes(found, i)
     if not causes:
-        return ('the inputs do not explain it: set unmeasured_states, or record a disturbance as '
-                'another input')
+        states = 'set unmeasured_states, or ' * ('unmeasured_states' not in found.searched)
+        return f'the inputs do not explain it: {states}record a disturbance as another input'
     return 'change ' + ', or '.join(
         f'{name} (explains {100.0 * share:.0f} % of its square)' for share, name in causes)
 

@@ -24,8 +24,8 @@ def likely_causes(found: Identified, i: int) -> list[tuple[float, str]]:
     Return the likely causes of the errors of a measured state, likeliest first.
 
     The errors of the drift in each segment are regressed on the response of a linear state with
-    the drift's slope to the rate due to each cause: inputs that act later, products of inputs and
-    states, filtered inputs.
+    the drift's slope to the rate due to each cause that was not searched for: inputs that act
+    later, products of inputs and states, filtered inputs.
 
     :param i: number of the state.
     :return: the explained share of the mean square, cross-validated over the segments, and the
@@ -61,10 +61,11 @@ def _causes(found: Identified, episodes: Sequence[Episode]) -> dict[str, list[Ar
             episode.time - count * period, episode.input_time[0]))) - v for count in _DELAYS])
         for j, name in enumerate(box.inputs.names):
             causes.setdefault(f'{name}.dead_time', []).append(late[..., j].T)
-        if not (found.constants or found.hidden or found.drift.varying_input_matrix):
+        if not (found.constants or found.hidden or found.drift.varying_input_matrix
+                or 'input_matrix_degree' in found.searched):
             causes.setdefault('input_matrix_degree', []).append(
                 (xi[:, :, None] * v[:, None]).reshape(len(xi), -1))
-        if not found.constants:
+        if not (found.constants or 'unmeasured_states' in found.searched):
             # past states would also contain the effects of disturbances
             causes.setdefault('unmeasured_states', []).append(np.hstack([
                 _filtered(episode.time, v, -1.0 / (count * period)) / (count * period)

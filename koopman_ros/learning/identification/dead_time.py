@@ -67,17 +67,20 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
             if len(episode) > 2 * longest + 10 * _ORDERS[-1]]
     none = (0,) * n_u
     highest = tuple(0 if fixed else longest for fixed in known or (False,) * n_u)
-    tried: list[_LinearModel] = []
+    searches: list[LinearModels] = []
+    delays = none
     for order in _ORDERS if data and any(highest) else ():
-        search = LinearModels(data, order, n_y)
-        delays = search.best(highest, watch)
+        for zeros in sorted({order - 1, 0}, reverse=True):
+            search = LinearModels(data, order, n_y, zeros)
+            delays = search.best(highest, watch, tuple(map(min, delays, highest)))
+            search.model(none)
+            searches.append(search)
         # a larger model needs no longer dead time, but for chance
         highest = tuple(min(most, d + 2) for most, d in zip(highest, delays, strict=True))
-        tried += [model for one in dict.fromkeys((none, delays))
-                  if (model := search.model(one)) is not None]
+    tried = [model for search in searches for model in search.models]
     if not tried:
         return DeadTimes(none, period, 0, np.full(n_y, np.nan), np.full(n_y, np.nan))
-    best = min(tried, key=lambda one: one.criterion)
+    best = _median(searches, tried)
     plain = min((one for one in tried if one.delays == none), key=lambda one: one.criterion,
                 default=best)
     # errors that are not white hide whether a dead time is one, or what the models lack
@@ -91,6 +94,7 @@ class _LinearModel:
     """A linear model with dead times, and the errors (N, n_y) of its simulations."""
 
     order: int
+    taps: int  # coefficients of each input
     delays: tuple[int, ...]
     errors: Array
 
@@ -101,8 +105,21 @@ class _LinearModel:
     @property
     def criterion(self) -> float:
         count, n_y = self.errors.shape
-        size = n_y * self.order * (1 + len(self.delays)) + np.count_nonzero(self.delays)
+        size = n_y * (self.order + self.taps * len(self.delays)) + np.count_nonzero(self.delays)
         return float(2.0 * count * np.sum(np.log(self.rmse + 1e-300)) + size * np.log(count))
+
+
+def _median(searches: Sequence[LinearModels], tried: Sequence[_LinearModel]) -> _LinearModel:
+    """Return the best structure with the posterior medians of the dead times."""
+    least = min(tried, key=lambda one: one.criterion)
+    weights = np.exp(0.5 * (least.criterion - np.array([one.criterion for one in tried])))
+    medians = []
+    for values in np.array([one.delays for one in tried]).T:
+        order = np.argsort(values)
+        shares = np.cumsum(weights[order])
+        medians.append(int(values[order[np.searchsorted(shares, 0.5 * shares[-1])]]))
+    search = next(one for one in searches if least in one.models)
+    return search.model(tuple(medians)) or least
 
 
 def _white(errors: Array) -> bool:
@@ -135,32 +152,43 @@ class Sampled:
         u = np.diff(episode.input_integral(time), axis=0) / period
         return cls(y[longest:], np.vstack((u, u[-1:])))
 
-    def inputs(self, delays: Sequence[int], order: int) -> Array:
-        """Return the inputs (N, n_u order) of the samples before, each late by its dead time."""
+    def inputs(self, delays: Sequence[int], count: int) -> Array:
+        """Return the inputs (N, n_u count) of the samples before, each late by its dead time."""
         rows = np.arange(len(self.u) - len(self.y), len(self.u))
         return np.column_stack([self.u[np.maximum(rows - d - k, 0), j]
-                                for j, d in enumerate(delays) for k in range(1, 1 + order)])
+                                for j, d in enumerate(delays) for k in range(1, 1 + count)])
 
 
 class LinearModels:
     """Linear models of an order with any dead times, each output by itself."""
 
-    def __init__(self, data: Sequence[Sampled], order: int, n_y: int) -> None:
+    def __init__(self, data: Sequence[Sampled], order: int, n_y: int, zeros: int | None = None
+                 ) -> None:
         self._data, self._order, self._n_y = data, order, n_y
+        self._taps = order if zeros is None else 1 + zeros
         self._variance = np.var(np.concatenate([one.y for one in data]), axis=0) + 1e-300
         self._filters: dict[int, Array] = {}  # the last denominator of each output
         self._found: dict[tuple[int, ...], _LinearModel | None] = {}
 
-    def best(self, highest: tuple[int, ...], watch: Callable[[], object]) -> tuple[int, ...]:
-        """Return the dead times with the least error, one input after the other."""
-        delays: tuple[int, ...] = (0,) * len(highest)
-        for _ in range(_ROUNDS if len(highest) > 1 else 1):
+    @property
+    def models(self) -> list[_LinearModel]:
+        """All that were fitted."""
+        return [model for model in self._found.values() if model is not None]
+
+    def best(self, highest: tuple[int, ...], watch: Callable[[], object],
+             start: tuple[int, ...] | None = None) -> tuple[int, ...]:
+        """Return the dead times with the least error, one input after the other, then all."""
+        delays, n_u = start or (0,) * len(highest), len(highest)
+        # a common lag and a common dead time are much alike
+        sets = [{j} for j in range(n_u)] + [set(range(n_u))] * (n_u > 1)
+        for _ in range(_ROUNDS if n_u > 1 else 1):
             before = delays
-            for j, most in enumerate(highest):
+            for moved in sets:
                 costs = []
-                for d in range(most + 1):
+                for shift in range(-min(delays[j] for j in moved),
+                                   1 + min(highest[j] - delays[j] for j in moved)):
                     watch()
-                    tried = (*delays[:j], d, *delays[j + 1:])
+                    tried = tuple(d + shift * (j in moved) for j, d in enumerate(delays))
                     model = self.model(tried)
                     costs.append((np.inf if model is None else float(np.sum(
                         model.rmse ** 2 / self._variance)), tried))
@@ -174,7 +202,8 @@ class LinearModels:
         if delays not in self._found:
             errors = [self._errors(i, delays) for i in range(self._n_y)]
             self._found[delays] = None if any(own is None for own in errors) else _LinearModel(
-                self._order, delays, np.column_stack([own for own in errors if own is not None]))
+                self._order, self._taps, delays,
+                np.column_stack([own for own in errors if own is not None]))
         return self._found[delays]
 
     def state_space(self) -> tuple[Array, Array, Array] | None:
@@ -236,7 +265,7 @@ class LinearModels:
             y, order = one.y[:, i], self._order
             past = [] if simulated else [
                 -np.concatenate((np.zeros(k), y[:-k])) for k in range(1, 1 + order)]
-            regressors = np.column_stack((*past, one.inputs(delays, order), np.ones(len(y))))
+            regressors = np.column_stack((*past, one.inputs(delays, self._taps), np.ones(len(y))))
             columns = lfilter([1.0], denominator, np.hstack((
                 regressors, np.eye(len(y), order), y[:, None])), axis=0)
             shared.append(columns[:, :-1 - order])

@@ -151,6 +151,7 @@ class Identified:
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
     disturbances: tuple[str, ...] = ()  #: inputs that are measured disturbances
     steps: tuple[str, ...] = ()  #: of the search for the structure, in words
+    searched: tuple[str, ...] = ()  #: parameters of the training whose values it has compared
     #: (n_y,) root mean square errors of free runs of the record, in state units, where they were
     #: compared
     free_run: Array = field(default_factory=lambda: np.zeros(0))

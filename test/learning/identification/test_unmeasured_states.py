@@ -15,8 +15,8 @@ from koopman_ros.learning.identification import (
     DriftModel,
     identify_structure,
     identify_unmeasured,
+    network_candidates,
     Stopped,
-    unmeasured_states,
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 
@@ -152,8 +152,8 @@ def duffing(x, u):
 def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
         monkeypatch, rate, degree, kind, samples):
     # one of all networks
-    monkeypatch.setattr(unmeasured_states, '_UNITS', (8,))
-    monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
+    monkeypatch.setattr(network_candidates, 'UNITS', (8,))
+    monkeypatch.setattr(network_candidates, 'STARTS', 1)
     found = identify_unmeasured(PLANT, [record(rate, samples=samples, size=0.8)], 1,
                                 highest_degree=degree, dead_times=False, seed=2)
     assert isinstance(found.drift, kind)
@@ -166,8 +166,8 @@ def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
 
 def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
     monkeypatch.setattr(NetworkDrift, 'bounded', False)
-    monkeypatch.setattr(unmeasured_states, '_UNITS', (1,))
-    monkeypatch.setattr(unmeasured_states, '_STARTS', 1)
+    monkeypatch.setattr(network_candidates, 'UNITS', (1,))
+    monkeypatch.setattr(network_candidates, 'STARTS', 1)
     found = identify_unmeasured(PLANT, [record(outlet, samples=300, size=0.8)], 1,
                                 highest_degree=1)
     assert not any('network' in score.method for score in found.scores)
