@@ -772,6 +772,12 @@ static mat position(const koopman_estimate *e, const double *y) {
     return physical(OF_X, block(found, 0, 0, NX, 1));
 }
 
+/* Whether a measurement (NY) itself is so far from the training data that no law acts there. */
+static int far(const double *y) {
+    static const koopman_estimate unknown = {0};
+    return distance(position(&unknown, y)) > MARGIN[LAWS - 1];
+}
+
 /* Check a measurement (NY) against the last accepted one, of `before`, and renew that in s. */
 static int check(const koopman_state *before, koopman_state *s, const double *y, double elapsed,
                  double outside, int *moved) {
@@ -865,7 +871,7 @@ static int observe(koopman_state *s, const double *y, double elapsed, double *ou
         if (s->commanded) piece(s, s->now, s->now, held);
         u = deviation(OF_U, held);
         restart(linear, e, x, s->commanded ? &u : NULL, feed_forward(s));
-    } else if (moved || !(elapsed > 0.0) || *outside > MARGIN[LAWS - 1]
+    } else if (moved || !(elapsed > 0.0) || (*outside > MARGIN[LAWS - 1] && far(y))
                || (silent * OBSERVER_BANDWIDTH > 2.0 && silent > 1.5 * s->interval)) {
         restart(linear, e, x, NULL, x);
     } else {
