@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.optimize import least_squares, OptimizeResult
 
-from koopman_ros.core.arrays import Array, expect, short_repr
+from koopman_ros.core.arrays import Array, expect, short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
 from koopman_ros.core.solvers import differences
@@ -61,6 +61,7 @@ class FreeRun:
     fit: Array
 
     __repr__ = short_repr
+    _repr_pretty_ = show_printed
 
     def __str__(self) -> str:
         """Show the errors."""
