@@ -91,13 +91,13 @@ def compiled_example(controller: Controller, interval: float, folder: Path, comp
 
 
 def _check(controller: Controller) -> None:
-    """Raise an error for an unsupported part."""
+    """Raise an error for a part that the C code does not support."""
     for name in controller.levels:
         if name not in _LAWS:
             raise ExportError(
                 f'the law {name} cannot be exported, only {" and ".join(_LAWS)}: '
                 + ('for C code of a receding-horizon law use acados' if name == 'mpc' else
-                   'remove it from fallback_order'))
+                   'take it out of fallback_order'))
     estimator = controller.best.estimator
     if type(estimator) not in (DisturbanceObserver, MeasuredState, ExtendedKalmanFilter):
         raise ExportError(

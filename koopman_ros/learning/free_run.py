@@ -134,8 +134,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     :param init: samples to which the start is fitted; at most half of an episode.
     :param usual: (n_y,) root mean square error of the model's free run over a record that it was
         learned from, in its units; by default that of the model itself. The first samples
-        contradict the model if their error is above 1.5 times that. None: no disturbance is
-        fitted.
+        contradict the model where they err by more than 1.5 times that. Without it there is no
+        disturbance.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """

@@ -135,7 +135,7 @@ class _StructureCandidate:
 
 
 def _not_measured(count: int) -> str:
-    return f'{count} unmeasured {"state" if count == 1 else "states"}'
+    return f'{count} {"state" if count == 1 else "states"} not measured'
 
 
 class _Choice:
@@ -161,8 +161,8 @@ class _Choice:
         best = _plainest(before)
         more, deviation = _excess(*_blocks([one, best]))
         self.steps.append(
-            f'{one.text}; mean squared error {100.0 * abs(more):.3g} % '
-            f'{"above" if more > 0.0 else "below"} the previous best (standard error '
+            f'{one.text}; mean square {100.0 * abs(more):.3g} % '
+            f'{"more" if more > 0.0 else "less"} than with the best before (standard error '
             f'{100.0 * deviation:.2g} %)')
         return more < -_SIGMAS * deviation
 
