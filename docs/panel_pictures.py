@@ -47,7 +47,7 @@ def main() -> None:
         page.wait_for_timeout(25_000.0)
         page.get_by_role('button', name='Stop').click()
         page.get_by_role('button', name='Train').click()
-        page.get_by_text(re.compile('The new model is')).wait_for(timeout=120_000.0)
+        page.get_by_text(re.compile('The new model is')).wait_for(timeout=600_000.0)
         picture('model')
         page.goto(url)
         entry = page.get_by_label('Set-point of temperature, °C', exact=True)

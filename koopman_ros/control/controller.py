@@ -132,7 +132,7 @@ class Controller(ControlStep):
 
     def set_mode(self, state: State, mode: Mode) -> State:
         """
-        Hand over between operator and law, without a bump.
+        Switch between operator and law, bumplessly.
 
         Both modes start from the last command; the difference to the law's input fades in.
         """

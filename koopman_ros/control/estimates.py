@@ -250,7 +250,7 @@ class StateEstimation:
         return estimator.correct(predicted, xi, elapsed)
 
     def _started(self, state: State, xi: Array, u: Array | None) -> Estimate:
-        """Return the first estimate, at a state (n_x,) assumed steady under inputs (n_u,)."""
+        """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
         estimator = self.level(state.supervisor).estimator
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:

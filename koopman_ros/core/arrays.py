@@ -31,6 +31,11 @@ def short_repr(holder: object) -> str:
     return f'{type(holder).__name__}({shown})'
 
 
+def show_printed(holder: object, printer: Any, cycle: bool) -> None:
+    """Show in a notebook the text that ``print`` shows, as ``_repr_pretty_`` of a class."""
+    printer.text(repr(holder) if cycle else str(holder))
+
+
 def _brief(value: object) -> str:
     if isinstance(value, np.ndarray):
         few = value.ndim == 1 and len(value) <= _FEW

@@ -101,7 +101,7 @@ def loaded_class(name: str) -> type[Any]:
 
 def contained(error: BaseException) -> str:
     """
-    Return the exception of a plug-in in one line, whatever it is, also SystemExit.
+    Return any exception of a plug-in in one line, also SystemExit.
 
     :raises KeyboardInterrupt: where that is the error: it is meant for the process.
     """

@@ -115,7 +115,7 @@ def _fields(controller: Controller, code: str) -> dict[str, Any]:
             raise ExportError(
                 f'the law {name} cannot be exported, only {" and ".join(_LAWS)}: '
                 + ('for C code of a receding-horizon law use acados' if name == 'mpc' else
-                   'remove it from fallback_order'))
+                   'take it out of fallback_order'))
     if type(estimator) not in (DisturbanceObserver, MeasuredState, ExtendedKalmanFilter):
         raise ExportError(
             f'the estimator {type(estimator).__name__} cannot be exported: set estimator to '

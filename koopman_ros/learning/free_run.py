@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.optimize import least_squares, OptimizeResult
 
-from koopman_ros.core.arrays import Array, expect, short_repr
+from koopman_ros.core.arrays import Array, expect, short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
 from koopman_ros.core.solvers import differences
@@ -61,6 +61,7 @@ class FreeRun:
     fit: Array
 
     __repr__ = short_repr
+    _repr_pretty_ = show_printed
 
     def __str__(self) -> str:
         """Show the errors."""
@@ -145,8 +146,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     :param init: samples to which the start is fitted; at most half of an episode.
     :param usual: (n_y,) root mean square error of the model's free run over a record that it was
         learned from, in its units; by default that of the model itself. The first samples
-        contradict the model if their error is above 1.5 times that. None: no disturbance is
-        fitted.
+        contradict the model where they err by more than 1.5 times that. Without it there is no
+        disturbance.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """

@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 
-from koopman_ros.core.arrays import expect
+from koopman_ros.core.arrays import expect, show_printed
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, LOOPS
@@ -71,6 +71,8 @@ class ClassComparison:
     chosen: ModelCandidate  #: selected by the rule, or named by the user
     state_names: tuple[str, ...]  #: of the states, with their units
     state_units: tuple[str, ...]
+
+    _repr_pretty_ = show_printed
 
     @property
     def model(self) -> LiftedModel:

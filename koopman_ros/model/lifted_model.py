@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array, frozen, short_repr
+from koopman_ros.core.arrays import Array, frozen, short_repr, show_printed
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import (
     check_time_unit,
@@ -130,6 +129,7 @@ class LiftedModel:
     E: Array | None = None
 
     __repr__ = short_repr
+    _repr_pretty_ = show_printed
 
     def __str__(self) -> str:
         """Show the plant, the trained ranges, the rates, the held-out figures and the verdict."""
@@ -150,10 +150,6 @@ class LiftedModel:
                   *[f'simulated closed loops: {about.closed_loops}'] * bool(about.closed_loops),
                   f'acceptance: {about.acceptance}']
         return '\n  '.join(lines)
-
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        # of notebooks
-        printer.text(str(self) if not cycle else repr(self))
 
     def __post_init__(self) -> None:
         n_x, n_u, n_z = self.n_x, self.n_u, self.observables.n_z

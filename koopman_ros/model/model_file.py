@@ -213,7 +213,7 @@ def _read(path: Path) -> bytes:
 
 
 def _parsed(content: bytes) -> LiftedModel:
-    """Return the model of a file; raise whatever its content makes the parts raise."""
+    """Return the model of a file; errors of its parts pass."""
     tensors: Tensors = safetensors.numpy.load(content)
     # the library has checked the header, and gives its metadata for paths alone
     header = json.loads(content[8:8 + int.from_bytes(content[:8], 'little')])

@@ -21,7 +21,7 @@ def is_loopback(host: str) -> bool:
 
 def refusal(kind: str, host: str, origin: str | None, scheme: str, *, users: bool) -> str:
     """
-    Return the reason to refuse a request whatever its session is, or ''.
+    Return the reason to refuse a request of any session, or ''.
 
     Browsers send the origin with each WebSocket: a WebSocket without origin is refused as well.
 

@@ -219,7 +219,7 @@ def _lines(own: _Pen, face: Faceplate, marks: Sequence[MarkGroup]) -> list[dict[
 
 
 def ink(number: int) -> str:
-    """Return the colour of a pen of a chart: black, then hues of which none comes again."""
+    """Return the colour of a pen of a chart: black, then distinct hues."""
     # by the golden ratio from blue on
     share = (0.618034 * number - 0.035) % 1.0
     red, green, blue = colorsys.hls_to_rgb(share, 0.28 + 0.14 * (number % 2), 0.4)

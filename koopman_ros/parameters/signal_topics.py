@@ -80,7 +80,7 @@ class StatePlaces(MeasuredPlace):
 
 @dataclass(frozen=True)
 class AnalysisPlaces:
-    """Where values of a state come that are rare and late, as from a laboratory."""
+    """Topic of the late values of a state, e.g. of a laboratory."""
 
     analysis_topic: str = _topic('Topic of late values, e.g. of a laboratory analyser; empty: '
                                  'none.')

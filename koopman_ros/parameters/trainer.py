@@ -208,8 +208,8 @@ class TrainerParameters:
         'inputs', 0.0, 'Delay between a command and its application, where that is not recorded.',
         's', 0.0, 3600.0)
     dead_time: Array = column(
-        'inputs', -1.0, 'Dead time between the applied input and its effect; -1: estimated from '
-                        'the record.', 's', -1.0, 3600.0)
+        'inputs', -1.0, 'Dead time between the applied input and its effect; -1: found from the '
+        'record.', 's', -1.0, 3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """

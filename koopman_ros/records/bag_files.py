@@ -27,7 +27,7 @@ def locate(path: str | os.PathLike[str], *, recover: bool) -> tuple[tuple[Path, 
 
     With `recover`, files without a footer pass, and a directory without metadata.yaml, or with
     numbered files that it does not list, is read in the order of the file numbers. Raises
-    BagReadError for whatever else is wrong.
+    BagReadError for any other defect.
     """
     path = Path(path)
     if not path.exists():

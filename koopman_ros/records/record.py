@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.arrays import short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import base_name, place
 from koopman_ros.core.units import check_unit, NANOSECONDS
@@ -45,6 +45,7 @@ class Record:
     sources: tuple[str, ...]  #: names of the files
 
     __repr__ = short_repr
+    _repr_pretty_ = show_printed
 
     def of(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> Record:
         """

@@ -40,8 +40,8 @@ class BagWriter:
     A bag directory can be split: a message that finds `max_file_bytes` written, or
     `max_file_duration_s` [s] passed since the first log time of the file, begins the next file
     (`<name>_1.mcap`, ...; 0: never). The file before it is completed in the background, written
-    through to the disk and only then listed in `metadata.yaml`: files listed there can be read
-    whatever happens later.
+    through to the disk and only then listed in `metadata.yaml`: files listed there stay readable
+    after any later failure.
 
     `compression` of the chunks is 'none', 'zstd' or 'lz4'. The default is that of rosbag2: every
     reader can open it, and there is no codec between a damaged file and its messages. With 'zstd'

@@ -75,7 +75,7 @@ class PlantExperiment:
                 reason = self._words(await self._run.started)
             response.success = not reason
             response.message = f'refused: {reason}' if reason else (
-                f'running on {self._run.topics if self._run else ""}')
+                f'started on {self._run.topics if self._run else ""}')
             if reason:
                 self._release(TaskReport(Severity.WARN, response.message))
         self._report(response.message)

@@ -31,7 +31,7 @@ class Sample(NamedTuple):
 
 class Measurements:
     """
-    Hand over measurements when they are complete.
+    Pass on measurements when they are complete.
 
     A signal that is reported on change has its last value until its heartbeat is over. If all
     signals are, there is a measurement every `sample_time`.
@@ -87,7 +87,7 @@ class Measurements:
     def begin(self, timing: Timing, window: Callable[[], float], begun: Callable[[], bool]
               ) -> None:
         """
-        Hand over measurements from now on.
+        Pass on measurements from now on.
 
         :param window: s between two changes of the source within which one may take over.
         :param begun: whether there was a command, before which the measured inputs are awaited.
@@ -97,7 +97,7 @@ class Measurements:
         self._wait.clear()
 
     def end(self) -> None:
-        """Hand over no measurement, not even one that waits."""
+        """Pass on no measurement, not even a waiting one."""
         self._active = False
         self._wait.clear()
 
@@ -148,7 +148,7 @@ class Measurements:
             self._sampled(now_ns, np.zeros(0))
 
     def _sampled(self, stamp_ns: int, values: Array) -> None:
-        """Hand over a measurement, unless a signal that is reported on change is missing."""
+        """Pass on a measurement, unless a signal that is reported on change is missing."""
         if self._heartbeats:
             if self._silent(self._clock.now().nanoseconds):
                 return

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recording of topics as they come: raw subscriptions into a bag."""
+"""Recording of topics by raw subscriptions into a bag."""
 
 from collections.abc import Mapping
 import heapq

@@ -36,7 +36,7 @@ class Watchdog:
         self.start = self._thread.start  #: begins to look
 
     def beat(self) -> None:
-        """Note that the executor has come by; called from it, every `PERIOD`."""
+        """Note a sign of life of the executor; called from it, every `PERIOD`."""
         self._beats += 1
         if self._failure is not None:
             raise self._failure

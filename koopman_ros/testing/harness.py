@@ -62,7 +62,7 @@ class Harness:
         that no other run uses.
     :param each_turn: called again and again while something is waited for; may raise.
 
-    :ivar node: the node in here, for whatever has no method of its own.
+    :ivar node: the node of the test, for all that has no method here.
     :ivar environment: variables of the processes, ``ROS_DOMAIN_ID`` among them.
     :ivar processes: all that were started.
     :ivar statuses: of diagnostics, as they came.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A process that is ended whatever happens; the domain and folder that a run has reserved."""
+"""A process that is ended in any case; the domain and folder that a run has reserved."""
 
 from __future__ import annotations
 

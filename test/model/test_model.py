@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -290,6 +291,9 @@ def test_a_printed_model_shows_its_ranges_rates_and_verdict():
                for line in lines)
     assert f'  dead time of {model.inputs.names[0]}: 7.5 s' in lines
     assert lines[-1] == '  acceptance: rejected (too few loops)'
+    in_notebook = []
+    model._repr_pretty_(SimpleNamespace(text=in_notebook.append), False)
+    assert in_notebook == [str(model)]
 
 
 def test_a_model_cannot_be_changed():

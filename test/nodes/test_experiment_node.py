@@ -88,7 +88,7 @@ def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> l
     ros.meet('plant')
     response = ros.set_bool(SERVICE, True)
     assert response.success, response.message
-    assert response.message == 'running on /coolant_setpoint'
+    assert response.message == 'started on /coolant_setpoint'
     return measured
 
 
@@ -153,7 +153,7 @@ def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
 def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     assert bench.ask(False)[1] == 'no experiment is running'
-    assert bench.start() == (True, 'running on /unit_1/jacket')
+    assert bench.start() == (True, 'started on /unit_1/jacket')
     assert not bench.ask(True)[0]
     for _ in range(20):
         bench.answer()
@@ -227,7 +227,7 @@ def test_one_input_in_manual_mode_until_the_controller_moves_it_elsewhere(
     controller = ros.node.create_publisher(Temperature, JACKET, topics.LOOP_QOS)
     bench.set(experiment_signal='manual')
     # until the graph shows the controller to the trainer
-    ros.wait_until(lambda: bench.start() == (True, 'running on /unit_1/manual_coolant_setpoint'))
+    ros.wait_until(lambda: bench.start() == (True, 'started on /unit_1/manual_coolant_setpoint'))
 
     def request() -> Temperature:
         bench.measure()

@@ -79,7 +79,7 @@ def test_bounds_of_each_signal_refuse_and_abort(ros: Harness, tmp_path: Path) ->
         assert said.startswith(words)
     for levels, name in (((0.51, 0.25), 'level_1'), ((0.15, 0.019), 'level_2')):
         started, said = bench.start(*inside)
-        assert (started, said) == (True, 'running on /pump_1_setpoint, /pump_2_setpoint')
+        assert (started, said) == (True, 'started on /pump_1_setpoint, /pump_2_setpoint')
         for _ in range(10):
             away = bench.answer(*inside)
         assert all(abs(np.subtract(away, SAFE)) > 0.1)
@@ -130,7 +130,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
 
     # until the graph tells the trainer the same
     said = ros.wait_until(lambda: (answer := ros.set_bool(SERVICE, True)).success and answer)
-    assert said.message == 'running on /level_1/setpoint, /level_2/setpoint'
+    assert said.message == 'started on /level_1/setpoint, /level_2/setpoint'
     first = len(measured[0])
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     home = ', '.join(f'{name} to {level:.6g} m' for name, level in zip(
@@ -171,7 +171,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
     ros.set_parameters('trainer', experiment_signal='manual', experiment_length=60000.0)
     commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
     assert ros.set_bool(SERVICE, True).message == (
-        'running on /manual_pump_1_setpoint, /manual_pump_2_setpoint')
+        'started on /manual_pump_1_setpoint, /manual_pump_2_setpoint')
     ros.wait_until(lambda: all(np.ptp(numbers(heard) if heard else [0.0]) > 1.0
                                for heard in commands))
     ros.set_bool('controller/set_automatic', True)

@@ -359,6 +359,7 @@ def test_manual_mode_is_confirmed_and_left_again(site: Site) -> None:
         expect(by_hand).to_have_value('32.0')
         expect(own.get_by_role('slider')).to_have_attribute('aria-valuenow', '32')
         expect(ask_setpoint(page, '47')).to_contain_text('only in automatic mode')
+        fits(page)
         page.get_by_role('button', name='Switch to automatic mode').click()
         expect(page.locator('header')).to_contain_text('AUTOMATIC')
 
@@ -459,6 +460,7 @@ def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site
             evil.publish(DiagnosticArray(status=[status]))
             row.get_by_role('button', name='Acknowledge').click()
             expect(own).to_contain_text('MEDIUM')
+            fits(page)
             expect(page.get_by_role('link', name=re.compile(r'Alarms \(\d\)'))).to_be_visible()
             own.get_by_role('button', name='Shelve 10 min').click()
             expect(own).to_have_count(0)
@@ -610,6 +612,7 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
         expect(banner).to_have_text(re.compile(
             r'⚠ Connection lost: no message from the controller since \d\d:\d\d:\d\d'))
         expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
+        fits(page)
         expect(ask_setpoint(page, '45')).to_have_text(
             '✖ refused: the controller is not running: start it')
         for path, name in (('/', 'Controller'), ('/model', 'Model'),

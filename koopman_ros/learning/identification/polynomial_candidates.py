@@ -45,7 +45,7 @@ class PolynomialSearch:
     :param offsets: whether the inputs of the record are constant disturbances, too.
     :param late: dead times by which its inputs are later, in samples.
     :ivar deviation: (n_y,) standard deviations of the innovations of the last filter.
-    :ivar samples: longest piece that is simulated; 0 until a model tells the plant's memory.
+    :ivar samples: longest piece that is simulated; 0 until a model shows the plant's memory.
     """
 
     def __init__(self, record: SplitRecord, samples: int = 0, *, offsets: bool = False,
@@ -108,7 +108,7 @@ class PolynomialSearch:
         return Predictor(replace(drift, B=B, box=replace(drift.box, inputs=inputs)), linear.gain)
 
     def filtered(self, start: _Polynomial, monitor: Callable[..., bool]) -> _Polynomial | None:
-        """Return a filter that foresees the record better; None where there is none."""
+        """Return a filter that predicts the record better; None if there is none."""
         try:
             found, _ = self._refined(start, monitor)
             self.deviation = np.std(self.record.innovations(found), axis=0)

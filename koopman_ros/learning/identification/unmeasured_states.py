@@ -188,7 +188,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             return time.process_time() > limit
 
         if monitor():
-            choice.steps.append(f'left out after {budget:.0f} s: {text}')
+            choice.steps.append(f'stopped after {budget:.0f} s: {text}')
         return monitor
 
     first, linear, n_y = PolynomialSearch(record), None, len(plant.state_names)

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from koopman_ros import __version__
-from koopman_ros.core.arrays import expect, short_repr
+from koopman_ros.core.arrays import expect, short_repr, show_printed
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.core.progress import progress_line
 from koopman_ros.evaluation.closed_loop_test import (
@@ -63,6 +63,11 @@ class Trained:
     steps: int  #: of the minimisations of all these together
 
     __repr__ = short_repr
+    _repr_pretty_ = show_printed
+
+    def __str__(self) -> str:
+        """Show the model."""
+        return str(self.model)
 
 
 class TrainingFailed(ValueError):  # noqa: N818
