@@ -28,13 +28,13 @@ from support.disturbance import disturb_training
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_browser', 'test_unmeasured_states', 'test_benchmarks', 'test_studies',
-           'test_replay', 'test_parallel', 'test_panel', 'test_training_node', 'test_demo',
-           'test_own_plant', 'test_partly_measured', 'test_examples', 'test_several_states',
-           'test_fault_campaign', 'test_shipped_models', 'test_closed_loop_test',
-           'test_closed_loop', 'test_contained_failures', 'test_disturbance_observer',
-           'test_dead_time', 'test_experiment_tanks', 'test_classes', 'test_laws',
-           'test_controller_process', 'test_processes', 'test_fleet', 'test_experiment_node',
+LONGEST = ('test_browser', 'test_training_node', 'test_demo', 'test_unmeasured_states',
+           'test_studies', 'test_own_plant', 'test_panel', 'test_fault_campaign',
+           'test_partly_measured', 'test_parallel', 'test_shipped_models', 'test_several_states',
+           'test_examples', 'test_replay', 'test_closed_loop_test', 'test_closed_loop',
+           'test_contained_failures', 'test_disturbance_observer', 'test_dead_time',
+           'test_experiment_tanks', 'test_classes', 'test_laws', 'test_controller_process',
+           'test_processes', 'test_fleet', 'test_experiment_node', 'test_benchmarks',
            'test_kalman_filters', 'test_simulate', 'test_server', 'test_player', 'test_learn',
            'test_model_comparison', 'test_pipeline', 'test_reload', 'test_plant_node',
            'test_graph', 'test_supervisor', 'test_recording', 'test_controller_node',

@@ -247,6 +247,12 @@ class PolynomialObservables(Observables):
         first = own.differentiated()
         return own, first, first.differentiated()
 
+    @cached_property
+    def _quadrature(self) -> tuple[Array, Array]:
+        """Shares of a segment and their weights, exact for the derivatives."""
+        nodes, weights = np.polynomial.legendre.leggauss((self.degree + 1) // 2)
+        return 0.5 * (1.0 + nodes[:, None]), 0.5 * weights
+
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
         return self._derivatives[0].at(x)
@@ -264,13 +270,13 @@ class PolynomialObservables(Observables):
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
         """Evaluate the lift, and the secants as means along the segment, by exact quadrature."""
-        nodes, weights = np.polynomial.legendre.leggauss((self.degree + 1) // 2)
-        points = x_ref + 0.5 * (1.0 + nodes[:, None]) * (x - x_ref)
+        shares, weights = self._quadrature
+        points = x_ref + shares * (x - x_ref)
         _, first, second = self._derivatives
-        M = np.tensordot(0.5 * weights, first.at(points), 1)
+        M = np.tensordot(weights, first.at(points), 1)
         # the weights add up to 1 but for rounding
         M[:self.n_x] = np.eye(self.n_x)
-        return *self.lift_and_jacobian(x), M, np.tensordot(0.5 * weights, second.at(points) @ w, 1)
+        return *self.lift_and_jacobian(x), M, np.tensordot(weights, second.at(points) @ w, 1)
 
 
 @dataclass(frozen=True, eq=False)

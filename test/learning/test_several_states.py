@@ -4,7 +4,6 @@
 """Retraining with two states and two inputs from a bag; the input as measured or as commanded."""
 
 from dataclasses import asdict, replace
-from functools import partial
 import importlib
 import json
 import warnings
@@ -37,6 +36,7 @@ STATES = tuple(RecordedState(name, 'm', MessageField('/tanks', JOINTS, f'positio
                for name in ('level_2', 'level_1'))
 INPUTS = tuple(RecordedInput(name, 'V', MessageField('/pumps', ARRAY, f'data[{k}]', 'mV'))
                for k, name in ((1, 'pump_2'), (0, 'pump_1')))
+FEWER = {'highest_degree': 2, 'dead_times': False}  # drifts that are tried
 
 
 def write_tanks(path, seconds=1000.0):
@@ -175,11 +175,12 @@ def test_measured_input_tells_what_the_command_hides(lagging, measured):
 
 def test_a_level_that_is_in_no_bag_is_learned_with_the_other(short_bag, tmp_path, monkeypatch):
     """Tank 1 flows into tank 2, so that what it holds shows there."""
-    monkeypatch.setattr(task_module, 'identify_unmeasured',
-                        partial(identify_unmeasured, highest_degree=2))
-    found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '',
-                                 STATES[:1], INPUTS, model_class='polynomial',
-                                 unmeasured_states=1))
+    monkeypatch.setattr(task_module, 'identify_unmeasured', lambda *given, **others:
+                        identify_unmeasured(*given, **{**others, **FEWER}))
+    with quick_retraining(16):
+        found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '',
+                                     STATES[:1], INPUTS, model_class='polynomial',
+                                     unmeasured_states=1))
     assert found.reasons == ()
     assert not any('hidden_1' in warning for warning in found.decision.warnings)
     model = load(found.model_file)
@@ -202,7 +203,8 @@ def by_equations(short_bag, tmp_path_factory):
                         model_class='polynomial', physical_model='two_tanks',
                         constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
     # as the process that retrains is given it
-    return retrain(TrainingTask.of(json.loads(json.dumps(asdict(task)))))
+    with quick_retraining(16):
+        return retrain(TrainingTask.of(json.loads(json.dumps(asdict(task)))))
 
 
 def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):

@@ -104,19 +104,6 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
     loop.rest()
 
 
-def test_a_late_coolant_neither_overshoots_nor_leaves_an_offset(ros: Harness) -> None:
-    """The coolant acts 30 s late, and the controller takes it for 27 s."""
-    loop = Loop(ros)
-    loop.controller = ros.start('controller', {'coolant_temperature.dead_time': 27.0})
-    ros.speak(Temperature, reactor.SETPOINT, to='controller').publish(temperature(SETPOINT))
-    ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 2, 'speed': 200.0,
-                        'lockstep_timeout': 0.3, 'coolant_temperature.dead_time': 30.0})
-    loop.rest()
-    assert min(message.temperature for message in loop.measured) > SETPOINT - 0.3
-    ros.wait_for_status('controller: control', lambda s: float(
-        value(s, 'measurements')) >= seconds(loop.commands[-1]))
-
-
 def test_each_node_tells_of_all_its_tasks_in_one_message_and_names_the_plant(ros: Harness) -> None:
     heard: list[DiagnosticArray] = ros.listen(DiagnosticArray, topics.DIAGNOSTICS)
     tasks = {'plant': ('simulation',), 'controller': TASKS,

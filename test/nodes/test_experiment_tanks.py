@@ -3,6 +3,7 @@
 
 """Experiments with two inputs, and on set-points, across processes: two tanks and their pumps."""
 
+import itertools
 from pathlib import Path
 import re
 from typing import Any
@@ -16,7 +17,6 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
-from support.nodes import seconds
 from support.tanks import LEVELS, linear, PUMPS, TANKS
 
 STATUS, SERVICE = 'trainer: experiment', 'trainer/experiment'
@@ -34,66 +34,6 @@ PLANT = {'system': 'two_tanks', 'sample_period': 1.0, 'lockstep': True, 'speed':
 
 def numbers(messages: list[Any]) -> np.ndarray:
     return np.array([message.position[0] for message in messages])
-
-
-class Bench:
-    """A trainer whose levels are measured by the test."""
-
-    def __init__(self, ros: Harness, folder: Path, **trainer: object) -> None:
-        self.ros, self._time = ros, 0
-        self.commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
-        self._sensors = [ros.node.create_publisher(JointState, name, topics.LOOP_QOS)
-                         for name in LEVELS]
-        ros.start('trainer', {**TRAINER, 'model': linear(folder), **trainer})
-        ros.meet('trainer')
-
-    def measure(self, *levels: float) -> None:
-        self._time += 1
-        for name, level, sensor in zip(LEVELS, levels, self._sensors, strict=True):
-            message = JointState(name=[name], position=[level])
-            message.header.stamp = stamp_message(self._time * NANOSECONDS)
-            sensor.publish(message)
-
-    def start(self, *levels: float) -> tuple[bool, str]:
-        timer = self.ros.node.create_timer(0.02, lambda: self.measure(*levels))
-        response = self.ros.set_bool(SERVICE, True)
-        self.ros.node.destroy_timer(timer)
-        return response.success, response.message
-
-    def answer(self, *levels: float) -> list[float]:
-        self.measure(*levels)
-        self.ros.wait_until(lambda: all(
-            heard and seconds(heard[-1]) == self._time for heard in self.commands))
-        return [float(heard[-1].position[0]) for heard in self.commands]
-
-
-def test_bounds_of_each_signal_refuse_and_abort(ros: Harness, tmp_path: Path) -> None:
-    bench = Bench(ros, tmp_path)
-    inside = 0.15, 0.25
-    for levels, words in (
-            ((0.6, 0.25), 'refused: the level_1 0.6 m is outside the bounds of the experiment, '
-             '0.02 m to 0.5 m'),
-            ((0.15, 0.01), 'refused: the level_2 0.01 m is outside the bounds of the')):
-        started, said = bench.start(*levels)
-        assert not started
-        assert said.startswith(words)
-    for levels, name in (((0.51, 0.25), 'level_1'), ((0.15, 0.019), 'level_2')):
-        started, said = bench.start(*inside)
-        assert (started, said) == (True, 'started on /pump_1_setpoint, /pump_2_setpoint')
-        for _ in range(10):
-            away = bench.answer(*inside)
-        assert all(abs(np.subtract(away, SAFE)) > 0.1)
-        back = [away, *(bench.answer(*levels) for _ in range(12))]
-        status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
-        assert status.message.startswith(f'aborted: the {name} ')
-        assert status.message.endswith('; pump_1 to 6 V, pump_2 to 2 V, held there')
-        # each along its own limit, straight
-        for one, rate, safe in zip(zip(*back, strict=True), RATE, SAFE, strict=True):
-            way = np.sign(safe - one[0]) * np.minimum(
-                rate * np.arange(len(back)), abs(safe - one[0]))
-            assert one == pytest.approx(one[0] + way)
-        assert back[-1] == pytest.approx(SAFE)
-        assert ros.set_bool(SERVICE, False).success
 
 
 def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: Path) -> None:
@@ -181,17 +121,30 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
 
 
 def test_setpoints_that_nobody_tracks_refuse_the_start(ros: Harness, tmp_path: Path) -> None:
-    bench = Bench(ros, tmp_path, experiment_signal='setpoint', experiment_timeout=1.0, **{
-        f'{name}.setpoint_{end}': bound for name in LEVELS
-        for end, bound in (('min', 0.1), ('max', 0.2))})
-    assert bench.start(0.15, 0.25)[1] == (
+    ros.start('trainer', {
+        **TRAINER, 'model': linear(tmp_path), 'experiment_signal': 'setpoint',
+        'experiment_timeout': 1.0, **{f'{name}.setpoint_{end}': bound for name in LEVELS
+                                      for end, bound in (('min', 0.1), ('max', 0.2))}})
+    sensors = {name: ros.node.create_publisher(JointState, name, topics.LOOP_QOS)
+               for name in LEVELS}
+    ros.meet('trainer')
+    times = itertools.count(1)
+
+    def measure() -> None:
+        stamp = stamp_message(next(times) * NANOSECONDS)
+        for (name, sensor), level in zip(sensors.items(), (0.15, 0.25), strict=True):
+            message = JointState(name=[name], position=[level])
+            message.header.stamp = stamp
+            sensor.publish(message)
+
+    ros.node.create_timer(0.02, measure)
+    assert ros.set_bool(SERVICE, True).message == (
         'refused: /pump_1_setpoint is not published: start the controller and switch it to '
         'automatic mode')
     ros.node.create_publisher(JointState, 'pump_1_setpoint', topics.LOOP_QOS)
     # until the graph tells the trainer
-    said = ros.wait_until(lambda: 'unknown' in (said := bench.start(0.15, 0.25)[1]) and said)
+    said = ros.wait_until(lambda: 'unknown' in (
+        said := ros.set_bool(SERVICE, True).message) and said)
     assert said == (
         'refused: the active set-points have been unknown for 1 s: switch the controller to '
         'automatic mode, and check sensor and plant')
-
-

@@ -113,42 +113,6 @@ def own_commands(bench: Bench, after: float) -> list[Temperature]:
     return [message for message in bench.commands if seconds(message) > after]
 
 
-@pytest.fixture
-def bench(ros: Harness) -> Bench:
-    """Return a controller with its shipped settings that has measured for 20 s, up to 20 s."""
-    bench = Bench(ros)
-    measured(bench, 2, 19)
-    bench.status(lambda s: s.level == DiagnosticStatus.OK)
-    del ros.statuses[:-1]
-    return bench
-
-
-def test_bursts_of_nonsense_hold_the_coolant_which_goes_on_smoothly(bench: Bench) -> None:
-    k = 21
-    for celsius, count, words in (
-            (math.nan, 5, 'the measured temperature is nan, not finite: check the sensor'),
-            # which is no temperature
-            (-300.0, 5, 'the measured temperature is nan, not finite: check the sensor'),
-            (400.0, 5, 'the measured temperature 400.00 degC is outside the range of the '
-                       'sensor, -20.00 degC to 150.00 degC: check'),
-            (30.0, 2, 'to 30.00 degC in 2 s, at most 2 K and 2 K/s are possible: check the '
-             'sensor')):
-        held = bench.commands[-1].temperature
-        for second in range(k, k + count):
-            assert bench.measure(celsius, float(second)).temperature == held
-        status = bench.status()
-        assert status.level == DiagnosticStatus.ERROR
-        assert status.message.startswith('the last command is held: ')
-        assert words in status.message
-        assert value(status, 'active law') == 'hold'
-        after = measured(bench, k + count, 10)
-        assert np.max(np.abs(np.diff([held, *after]))) < 0.2
-        k += count + 10
-    status = bench.status()
-    assert status.level == DiagnosticStatus.OK
-    assert value(status, 'active law') == 'learned law'
-
-
 def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros: Harness) -> None:
     bench = Bench(ros, first=0.0)
     assert seconds(bench.commands[0]) == 0.0

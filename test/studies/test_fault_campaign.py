@@ -20,7 +20,6 @@ from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
 from studies.faults.judge import judge
 from studies.faults.plants import FaultPlant, QUADRUPLE_TANK, REACTOR, TWO_TANKS
-from studies.faults.processes import second_controller
 from studies.faults.report import write
 from support.recorded_runs import Recorded, STEADY
 
@@ -109,21 +108,6 @@ def test_faults_of_messages_models_and_processes_are_survived(tmp_path: Path) ->
     result, _ = run(replace(
         nan, play=play, says=garbage.says, bump=killed.bump, plant=killed.plant,
         afterwards=60.0, recovery=60.0), tmp_path)
-    assert result['reasons'] == []
-
-
-def test_a_bad_signal_of_two_and_a_second_controller_are_survived(tmp_path: Path) -> None:
-    case = CASES['two_tanks-nan-one']
-
-    def play(loop: FaultHarness) -> None:
-        second_controller(loop, says=('^controller: control: 2 nodes command the pump_1',))
-        loop.run_for(20.0)
-        case.play(loop)
-
-    result, _ = run(replace(
-        # as fast as it can, it would work on while the second one starts
-        case, play=play, largest_step=math.inf, plant={**case.plant, 'speed': 20.0},
-        settle=60.0, afterwards=60.0), tmp_path)
     assert result['reasons'] == []
 
 

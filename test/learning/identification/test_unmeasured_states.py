@@ -109,7 +109,7 @@ def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
     found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
-                                highest_degree=2)
+                                highest_degree=2, dead_times=False)
     drift = found.drift
     assert drift.degree >= 2
     for y in (-0.3, 0.0, 0.3):
@@ -131,7 +131,8 @@ def test_steady_states_of_an_unstable_plant_from_closed_loop():
 def test_a_known_input_matrix_is_kept():
     gain = 1.0
     moved = record(lambda x, u: A @ x + np.array([gain, 0.0]) * u, samples=400)
-    found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])), [moved], 1, highest_degree=1)
+    found = identify_unmeasured(replace(PLANT, B=np.array([[gain]])), [moved], 1, highest_degree=1,
+                                dead_times=False)
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
 
@@ -169,7 +170,7 @@ def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
     monkeypatch.setattr(network_candidates, 'UNITS', (1,))
     monkeypatch.setattr(network_candidates, 'STARTS', 1)
     found = identify_unmeasured(PLANT, [record(outlet, samples=300, size=0.8)], 1,
-                                highest_degree=1)
+                                highest_degree=1, dead_times=False)
     assert not any('network' in score.method for score in found.scores)
 
 
