@@ -61,6 +61,8 @@ def test_a_file_is_learned_tested_and_reported(folder, capsys):
     assert {path.name for path in folder.glob('day.*')} == {
         'day.csv', 'day.safetensors', 'day.json', 'day.md', 'day.png', 'day.free_run.png',
         'day.test.png', *others}
+    # no other class can be better than that of the drift
+    assert set(summary['classes']) == {'linear'}
     runs = summary['free_runs']
     assert [runs[name]['fit_percent']['level'] > 99.0 for name in ('record', 'test')] == [True] * 2
     assert {(model, name) for model, some in summary['free_runs_of'].items() for name in some} == {

@@ -174,7 +174,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     coordinates or a linear model that is as good are refused.
 
     :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
-        them and the rule.
+        them and the rule; of a linear drift for the linear one.
     :param n_z: coordinates of the identity lift; other arguments as for :func:`learn_lift`.
     :param judging: called with the class whose law is being tried and the share that is done.
     :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
@@ -202,6 +202,11 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     known, samples = _estimated(found, plant)
     # the mean square of so many white errors strays by this share
     chance = float(np.mean(noise ** 2)) * np.sqrt(2.0 / held_out.count)
+    drift = found.drift
+    if model_class == BEST and isinstance(drift, DriftModel) and drift.degree == 1 and not (
+            drift.varying_input_matrix):
+        # which is that drift itself
+        model_class, begin = LINEAR, None
     alone = model_class != BEST
     return compare(known, samples,
                    {**usual_recipes(len(noise)), IDENTITY_LIFT: IncrementalTraining(n_z)},

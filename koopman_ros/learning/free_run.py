@@ -132,7 +132,7 @@ class FreeRun:
 
 
 def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | None = None,
-             picture: str | os.PathLike[str] = '') -> FreeRun:
+             offsets: Array | None = None, picture: str | os.PathLike[str] = '') -> FreeRun:
     """
     Simulate a whole record by its inputs alone, and compare with the measurements.
 
@@ -148,6 +148,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
         learned from, in its units; by default that of the model itself. The first samples
         contradict the model where they err by more than 1.5 times that. Without it there is no
         disturbance.
+    :param offsets: (M, n_x) known disturbances of the rates in the episodes, in place of that, in
+        the order and units of the model per time unit of the record.
     :param picture: file of a picture to draw, ending in .png; none by default.
     :raises ValueError: for a record without the model's signals.
     """
@@ -171,11 +173,17 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
     step = longest_step(episodes)
     inits = [max(1, min(init, len(one) // 2)) for one in episodes]
-    if usual is None:
+    if usual is None and offsets is None:
         usual = _usual(model, some.names)
-    found = [_start(rate, states, measured, one, index, count, step, usual)
-             for one, index, count in zip(episodes, indexed, inits, strict=True)]
+    known = np.zeros((len(episodes), len(states))) if offsets is None else offsets
+
+    def under(offset: Array) -> Rate:
+        return lambda x, u: rate(x, u) + offset
+
+    found = [_start(under(own), states, measured, one, index, count, step, usual)
+             for one, index, count, own in zip(episodes, indexed, inits, known, strict=True)]
     starts, disturbances = (np.array(some) for some in zip(*found, strict=True))
+    disturbances = disturbances + known
     segments = Segments.of(indexed, step)
     run = segments.path(lambda x, u: rate(x, u) + disturbances, starts)
     paths = tuple(run[np.flatnonzero(segments.x[:, k, 0])[:len(one)], k][:, order]

@@ -259,7 +259,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                     disturbances=plant.disturbance_names)
     dead_time = seconds * found.dead_time
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
-                      tuple(record.episodes), record.account, task.bags)
+                      tuple(one for one in record.episodes if one.delayed(dead_time) is not None),
+                      record.account, task.bags)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
     box = found.drift.box
@@ -278,9 +279,10 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     learned = learned.with_model(replace(learned.model, dead_time=dead_time))
-    usual = found.free_run if len(found.free_run) else None
-    runs = _free_runs(learned, recorded, test, usual)
-    others = {name: _free_runs(replace(found, drift=drift), recorded, test, usual)
+    offsets = found.offsets / seconds if len(found.offsets) == len(recorded.episodes) else (
+        np.zeros((len(recorded.episodes), len(box.states))))
+    runs = _free_runs(learned, recorded, test, offsets)
+    others = {name: _free_runs(replace(found, drift=drift), recorded, test, offsets)
               for name, drift in ((DRIFT, found.drift), (LINEAR_MODEL, found.linear))}
     decision = replace(decision, reasons=(
         *decision.reasons, *_failed_runs(runs, others)), warnings=(
@@ -360,10 +362,10 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
         episodes, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
 
 
-def _free_runs(model: AnyModel, recorded: Record, test: Record | None, usual: Array | None
+def _free_runs(model: AnyModel, recorded: Record, test: Record | None, offsets: Array
                ) -> dict[str, FreeRun]:
-    """Simulate the record, with an offset of each episode like the drift, and the test record."""
-    runs = {'record': simulate(model, recorded, usual=usual)}
+    """Simulate the record, with the offset of each episode, and the test record."""
+    runs = {'record': simulate(model, recorded, offsets=offsets)}
     if test is not None:
         runs['test'] = simulate(model, test, usual=runs['record'].rmse)
     return runs
@@ -382,6 +384,14 @@ def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, 
             yield (f'the error of its free run of the test record, {own.error_text()}, is above '
                    f'that of the best linear model, {linear.error_text()}, by more than '
                    f'{_LESS_FIT:g} % of the motion')
+        elif test:
+            # motion below the usual error is none
+            yield from (
+                f'its free run of the test record errs by {rmse:.4g} {unit} in {state}, more than '
+                f'the mean value does (fit {fit:.1f} %): record under such conditions, too'
+                for state, unit, rmse, fit, usual in zip(
+                    own.names, own.units, own.rmse, own.fit, runs['record'].rmse, strict=True)
+                if fit < 0.0 and rmse > (1.0 - fit / 100.0) * usual)
 
 
 def _checked(task: TrainingTask) -> Thresholds:

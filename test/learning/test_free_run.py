@@ -109,6 +109,19 @@ def test_a_model_is_rejected_whose_free_run_diverges_or_is_worse_than_that_of_th
     assert len(reasons) == bool(words) + (slope[0, 0] > 0.0 and not diverged)
 
 
+@pytest.mark.parametrize('usual', ['good', 'bad'])
+def test_a_model_is_rejected_that_errs_more_than_the_mean_of_a_record_with_motion(usual):
+    record = read(table(), 'position [m]', 'force [N]')
+    runs = {name: simulate(lifted(slope=A * [[1.0, 1.0], [factor, 1.0]]), record, init=2)
+            for name, factor in (('good', 1.1), ('bad', 0.3))}
+    assert runs['bad'].fit[0] < 0.0
+    own = {'record': runs[usual], 'test': runs['bad']}
+    reasons = list(_failed_runs(own, {DRIFT: own, LINEAR_MODEL: own}))
+    # motion that is as small as the usual error is none
+    assert ['than the mean value does (fit -' in one for one in reasons] == [True] * (
+        usual == 'good')
+
+
 @pytest.mark.parametrize(('push', 'usual', 'found'), [
     (0.5, 0.01, 0.5), (0.5, 1.0, 0.0), (0.5, None, 0.0), (0.0, 0.01, 0.0)])
 def test_a_constant_disturbance_is_found_where_the_first_samples_contradict(push, usual, found):
@@ -120,6 +133,10 @@ def test_a_constant_disturbance_is_found_where_the_first_samples_contradict(push
     run = simulate(model, read(table(push=push), ['position [m]', 'speed [m/s]'], 'force [N]'))
     assert run.disturbances == pytest.approx(np.array([[0.0, found]]), abs=0.05)
     assert np.all(run.fit > 90.0) == (push == found)
+    known = simulate(model, read(table(push=push), ['position [m]', 'speed [m/s]'], 'force [N]'),
+                     offsets=np.array([[0.0, push]]))
+    assert known.disturbances.tolist() == [[0.0, push]]
+    assert np.all(known.fit > 99.9)
 
 
 @pytest.mark.parametrize(('signals', 'options', 'words'), [
