@@ -86,7 +86,7 @@ def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate
 def test_the_best_so_far_is_taken_when_the_time_is_over():
     found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
     assert found.hidden == 1
-    assert any('left out after 0 s: drift of degree 1 with 2' in step for step in found.steps)
+    assert any('stopped after 0 s: drift of degree 1 with 2' in step for step in found.steps)
 
 
 def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
