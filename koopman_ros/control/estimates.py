@@ -101,7 +101,8 @@ class StateEstimation:
 
         That is the command, unless a measurement (n_u,) of the input says that it was not
         reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences
-        below `tracking_tolerance` count for nothing: a bias would come into the loop.
+        below `tracking_tolerance` count for nothing: a bias would come into the loop. Behind a lag
+        of the model the command counts.
 
         :return: the state, and whether the applied input follows the command.
         """
@@ -109,6 +110,8 @@ class StateEstimation:
         if command is None or measured is None or not np.isfinite(measured).all():
             return state, True
         u = np.minimum(np.maximum(command, measured - tolerance), measured + tolerance)
+        lagged = list(self.model.lagged)
+        u[lagged] = command[lagged]
         return (replace(state, applied=state.applied.corrected(u)), bool((u == command).all()))
 
     def feed_forward(self, state: State) -> Array | None:
@@ -248,7 +251,13 @@ class StateEstimation:
 
     def _started(self, state: State, xi: Array, u: Array | None) -> Estimate:
         """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
-        estimator = self.level(state.supervisor).estimator
+        estimator, model = self.level(state.supervisor).estimator, self.model
+        if u is not None and model.lagged:
+            xi = xi.copy()
+            for j, i in model.lagged.items():
+                if not self.outputs.C[:, i].any():
+                    xi[i] = ((model.inputs.to_physical(u) - model.states.center[i])[j]
+                             / model.states.scale[i])
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:
             return started

@@ -1,0 +1,215 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""First-order lags of the inputs: the applied inputs become states, with a known drift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import contextlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
+from koopman_ros.learning.identification.drift import (
+    box_of,
+    Drift,
+    fitted_starts,
+    longest_step,
+    Segments,
+)
+from koopman_ros.learning.identification.identify import Identified, usual_degrees
+from koopman_ros.learning.identification.output_error import output_error
+from koopman_ros.learning.identification.weak_form import weak_form
+from koopman_ros.learning.lift.input_model import InputModel
+from koopman_ros.model import APPLIED, Box, Coordinates
+
+# Times after a change, in time constants, between which an applied input is nearly linear; at the
+# last one it has settled.
+_KNOTS = np.arange(0.25, 8.0, 0.25)
+# Samples of a segment that is simulated.
+_SAMPLES = 240
+# A search tries lags from an interval between samples on, with this ratio, up to this share of an
+# episode, then between, to this share of the lag.
+_RATIO, _SHARE, _TOLERANCE = 2.0, 40.0, 0.02
+# Drifts that are tried with each: degrees from 1 on, and windows of the weak form, in samples.
+_DEGREES, _WINDOWS = 3, (20, 80)
+# A lag must reduce the squared error by so many standard errors of the difference.
+_SIGMAS = 2.0
+
+
+def lagged(episode: Episode, lag: Array) -> Episode:
+    """Return the episode with each input as it acts behind its lag (n_u,), from rest."""
+    begin, times = episode.input_time, [episode.input_time, episode.time]
+    end = np.append(begin[1:], max(begin[-1], episode.time[-1]))
+    for seconds in lag[lag > 0.0].tolist():
+        later = begin[:, None] + seconds * _KNOTS
+        times.append(later[later < end[:, None]])
+    knots = np.unique(np.concatenate(times))
+    u, linear = episode.inputs_at(knots), list(episode.linear) or [False] * len(lag)
+    for j in np.flatnonzero(lag):
+        value, applied = u[0, j], [u[0, j]]
+        for command, share in zip(u[:-1, j].tolist(), np.exp(-np.diff(knots) / lag[j]).tolist(),
+                                  strict=True):
+            value = command + share * (value - command)
+            applied.append(value)
+        u[:, j], linear[j] = applied, True
+    return Episode(episode.time, episode.x, knots, u, tuple(linear))
+
+
+def _commanded(episode: Episode, lag: Array) -> Episode:
+    """Return an episode of :func:`lagged` with commands as inputs, applied inputs as states."""
+    u, steps, linear = episode.u.copy(), np.diff(episode.input_time), list(episode.linear)
+    for j in np.flatnonzero(lag):
+        share = np.exp(-steps / lag[j])
+        u[:-1, j] = (u[1:, j] - share * u[:-1, j]) / (1.0 - share)
+        u[-1, j], linear[j] = u[-2, j], False
+    return replace(episode, u=u, linear=tuple(linear), x=np.hstack(
+        (episode.x, episode.inputs_at(episode.time)[:, np.flatnonzero(lag)])))
+
+
+@dataclass(frozen=True)
+class LaggedDrift(Drift):
+    """A drift behind lags of some inputs: dx/dt = f(x) + B(x) v, dv/dt = (u - v) / lag."""
+
+    drift: Drift  #: of the applied inputs
+    lag: Array  #: (n_u,) in time units, 0 for none
+
+    __repr__ = short_repr
+
+    @classmethod
+    def of(cls, drift: Drift, lag: Array, commands: Coordinates) -> LaggedDrift:
+        """Return the drift of the states of another one and of its applied inputs."""
+        own = drift.box.inputs.only([drift.box.inputs.names[j] for j in np.flatnonzero(lag)])
+        applied = replace(own, names=tuple(APPLIED + name for name in own.names))
+        return cls(Box(drift.box.states.followed_by(applied), commands, drift.box.time_unit),
+                   drift, lag)
+
+    @property
+    def form(self) -> str:
+        """The kind of model, in words."""
+        return f'{self.drift.form} behind a lag of the input'
+
+    @property
+    def varying_input_matrix(self) -> bool:
+        """Whether B depends on the state."""
+        return self.drift.varying_input_matrix
+
+    def _applied(self, xi: Array, v: Array) -> tuple[Array, Array]:
+        """Return states and inputs of the drift, in its deviations."""
+        n, box = len(self.drift.box.states), self.drift.box.inputs
+        u = box.to_deviation(self.box.inputs.to_physical(v))
+        return xi[..., :n], np.where(self.lag > 0.0, self._spread(xi[..., n:]), u)
+
+    def _spread(self, values: Array) -> Array:
+        """Return one value for each input (..., n_u), 0 where it has no lag."""
+        return values @ np.eye(len(self.lag))[self.lag > 0.0]
+
+    def scaled_rate(self, xi: Array, v: Array) -> Array:
+        """Evaluate the rate in deviations; see :class:`Drift`."""
+        behind, states, n = self.lag > 0.0, self.box.states, len(self.drift.box.states)
+        applied = self.box.inputs.to_physical(v) - self._spread(states.to_physical(xi)[..., n:])
+        return np.concatenate((self.drift.scaled_rate(*self._applied(xi, v)), (
+            applied[..., behind] / self.lag[behind] / states.scale[n:])), axis=-1)
+
+    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
+        """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
+        behind, n = self.lag > 0.0, len(self.drift.box.states)
+        x, u = self._applied(xi, np.zeros(len(self.lag)) if v is None else v)
+        slope = np.zeros((*xi.shape, xi.shape[-1]))
+        slope[..., :n, :n] = self.drift.scaled_slope(x, u)
+        slope[..., :n, n:] = self.drift.scaled_input_matrix(x)[..., behind]
+        slope[..., n:, n:] = -np.diag(1.0 / self.lag[behind])
+        return slope
+
+    def scaled_input_matrix(self, xi: Array) -> Array:
+        """Evaluate B(x) in deviations; see :class:`Drift`."""
+        behind, n = self.lag > 0.0, len(self.drift.box.states)
+        scale = self.box.inputs.scale
+        B = self.drift.scaled_input_matrix(xi[..., :n]) * scale / self.drift.box.inputs.scale
+        rates = np.diag(scale / np.where(behind, self.lag, 1.0))[behind] / (
+            self.box.states.scale[n:, None])
+        return np.concatenate((np.where(behind, 0.0, B), np.broadcast_to(
+            rates, (*B.shape[:-2], *rates.shape))), axis=-2)
+
+
+def with_lag(found: Identified, lag: Array) -> Identified:
+    """
+    Return an estimate on episodes of :func:`lagged` with the commands as inputs.
+
+    The applied inputs follow the unmeasured states.
+
+    :param lag: (n_u,) in time units, 0 for none.
+    """
+    fitted, held_out = (tuple(_commanded(one, lag) for one in some)
+                        for some in (found.fitted, found.held_out))
+    inputs, u = found.drift.box.inputs, np.vstack([one.u for one in (*fitted, *held_out)])
+    commands = Coordinates.spanning(inputs.names, inputs.units, u.min(axis=0), u.max(axis=0))
+    count, zeros = int(np.count_nonzero(lag)), np.zeros
+    return replace(
+        found, drift=LaggedDrift.of(found.drift, lag, commands), fitted=fitted, held_out=held_out,
+        linear=LaggedDrift.of(found.linear, lag, commands),
+        alternatives=tuple(LaggedDrift.of(one, lag, commands) for one in found.alternatives),
+        noise=np.append(found.noise, zeros(count)), hidden=found.hidden + count,
+        offsets=np.hstack((found.offsets, zeros((len(found.offsets), count)))) if (
+            len(found.offsets)) else found.offsets)
+
+
+def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
+              sought: Sequence[int], *, watch: Callable[[], object] = lambda: None) -> Array:
+    """
+    Find the lags (n_u,) of inputs by simulations of a record of all states.
+
+    For each lag of a search a polynomial drift is estimated by the weak form. The lag with the
+    least mean squared error of simulations is taken if it errs less than none by more than two
+    standard errors of the difference, over segments of the record, both refined by output error.
+    Several inputs are searched one after the other.
+
+    :param lag: (n_u,) those that are known, in time units.
+    :param sought: indices of the inputs whose lag is to be found.
+    :param watch: called now and then; it may raise to end the search.
+    """
+    lag = lag.copy()
+    period = float(np.median(np.concatenate([np.diff(one.time) for one in episodes])))
+    longest = max(one.time[-1] - one.time[0] for one in episodes) / _SHARE
+
+    def simulated(j: int, tried: float, *, refine: bool = False) -> Array:
+        watch()
+        return _squares(plant, [lagged(one, np.where(np.arange(len(lag)) == j, tried, lag))
+                                for one in episodes], refine)
+
+    for j in sought:
+        grid = period * _RATIO ** np.arange(max(1.0, np.log(longest / period) / np.log(_RATIO)))
+        costs = [float(np.mean(simulated(j, tried))) for tried in grid]
+        best = float(np.log(grid[int(np.argmin(costs))]))
+        found = float(np.exp(minimize_scalar(
+            lambda tried, j=j: float(np.mean(simulated(j, np.exp(tried)))), method='bounded',
+            bounds=(best - np.log(_RATIO), best + np.log(_RATIO)),
+            options={'xatol': _TOLERANCE}).x))
+        less = simulated(j, 0.0, refine=True) - simulated(j, found, refine=True)
+        if np.mean(less) > _SIGMAS * np.std(less) / np.sqrt(len(less)):
+            lag[j] = found
+    return lag
+
+
+def _squares(plant: PlantDescription, episodes: Sequence[Episode], refine: bool) -> Array:
+    """Return the mean squared errors (M,) of segments, simulated by the best drift."""
+    parts = cut([replace(one, x=one.interpolated()) for one in episodes], _SAMPLES)
+    box, step = box_of(plant, parts), longest_step(parts)
+    segments, scale = Segments.of(parts, step), box.states.scale
+    inputs = InputModel.of(plant, box, np.concatenate([one.x for one in parts]))
+    best, least = np.full(len(parts), np.inf), None
+    for degree in usual_degrees(len(scale))[:_DEGREES]:
+        for window in _WINDOWS:
+            with contextlib.suppress(ValueError, np.linalg.LinAlgError):
+                drift = weak_form(parts, box, degree, inputs.weights, window, inputs.degree)
+                squares = np.mean(fitted_starts(drift.rate, segments, scale)[1] / scale ** 2, 1)
+                if np.mean(squares) < np.mean(best):
+                    best, least = squares, drift
+    if refine and least is not None:
+        drift = output_error(least, segments, learn_input_matrix=inputs.weights is None)
+        best = np.mean(fitted_starts(drift.rate, segments, scale)[1] / scale ** 2, 1)
+    return best
