@@ -43,6 +43,8 @@ _SIGMAS = 2.0
 
 def lagged(episode: Episode, lag: Array) -> Episode:
     """Return the episode with each input as it acts behind its lag (n_u,), from rest."""
+    if not lag.any():
+        return episode
     begin, times = episode.input_time, [episode.input_time, episode.time]
     end = np.append(begin[1:], max(begin[-1], episode.time[-1]))
     for seconds in lag[lag > 0.0].tolist():
