@@ -201,7 +201,7 @@ class Estimator(ABC):
         for j, i in lagged.items():
             effect[:, j] = slope[:, i] * model.inputs.scale[j] / model.states.scale[i]
         effect[rows] = 0.0
-        found = np.linalg.pinv(effect)
+        found = np.asarray(np.linalg.pinv(effect), dtype=np.float64)
         found[:, rows] = model.input_inverse()[:, rows]
         return found
 

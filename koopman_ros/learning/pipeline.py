@@ -255,14 +255,13 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
     _check_disturbances(plant, episodes)
-    lag = _given_lag(task, plant, episodes)
-    dead_time = _dead_time(task, plant, [lagged(one, lag / seconds) for one in episodes], progress)
-    if len(sought := [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]):
-        lag = seconds * find_lags(plant, _delayed(episodes, dead_time / seconds), lag / seconds,
-                                  sought, watch=lambda: progress.estimating(0, 1, 'lag'))
-        dead_time = _dead_time(task, plant, [lagged(one, lag / seconds) for one in episodes],
-                               progress)
-    lag = lag / seconds
+    lag = _given_lag(task, plant, episodes) / seconds
+    dead_time = _dead_time(task, plant, [lagged(one, lag) for one in episodes], progress)
+    sought = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
+    if sought:
+        lag = find_lags(plant, _delayed(episodes, dead_time / seconds), lag, sought,
+                        watch=lambda: progress.estimating(0, 1, 'lag'))
+        dead_time = _dead_time(task, plant, [lagged(one, lag) for one in episodes], progress)
     episodes = [lagged(one, lag) for one in _delayed(episodes, dead_time / seconds)]
     found = _estimate(task, plant, episodes, methods, progress, backend)
     found = replace(found, dead_time=found.dead_time + dead_time / seconds,
@@ -385,7 +384,7 @@ def _given_lag(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
         [np.diff(one.time) for one in episodes])))
     for name, value in task.lag.items():
         if not (value in (-1.0, 0.0) or shortest <= value <= LONGEST_DEAD_TIME):
-            raise ValueError(f'lag of {name} is {value:g} s, must be {shortest:.3g} s (half of the '
+            raise ValueError(f'lag of {name} is {value:g} s, must be {shortest:.3g} s (half of a '
                              f'sample interval) to {LONGEST_DEAD_TIME:g} s, 0 for none, or -1 to '
                              'find it')
         if value and any(one.linear and one.linear[names.index(name)] for one in episodes):

@@ -52,8 +52,8 @@ class TrainingTask:
     input_matrix_degree: int = 0
     #: dead time of inputs by name, in s; of those not named it is found from the record
     dead_time: Mapping[str, float] = field(default_factory=dict)
-    #: first-order lag with which inputs follow their commands, by name, in s: 0 for none, -1 to find
-    #: it from a record of all states. The applied input is a state of the model then.
+    #: time constant with which inputs follow their commands, by name, in s: 0 for none, -1 to find
+    #: it from a record of all states; the applied input is a state of the model
     lag: Mapping[str, float] = field(default_factory=dict)
     #: those of the inputs that are measured and not manipulated; they have no dead time and no lag
     disturbances: tuple[str, ...] = ()

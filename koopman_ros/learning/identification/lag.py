@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import contextlib
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -17,6 +17,7 @@ from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.learning.identification.drift import (
     box_of,
     Drift,
+    DriftModel,
     fitted_starts,
     longest_step,
     Segments,
@@ -30,13 +31,14 @@ from koopman_ros.model import APPLIED, Box, Coordinates
 # Times after a change, in time constants, between which an applied input is nearly linear; at the
 # last one it has settled.
 _KNOTS = np.arange(0.25, 8.0, 0.25)
-# Samples of a segment that is simulated.
-_SAMPLES = 240
 # A search tries lags from an interval between samples on, with this ratio, up to this share of an
 # episode, then between, to this share of the lag.
-_RATIO, _SHARE, _TOLERANCE = 2.0, 40.0, 0.02
-# Drifts that are tried with each: degrees from 1 on, and windows of the weak form, in samples.
-_DEGREES, _WINDOWS = 3, (20, 80)
+_RATIO, _SHARE, _TOLERANCE = 2.0, 20.0, 0.05
+# The drift of a search: its degree, with at most so many coefficients, and samples of a window of
+# the weak form that it begins with.
+_DEGREE, _MOST_COEFFICIENTS, _WINDOW = 3, 60, 40
+# Samples of a segment that is simulated.
+_SAMPLES = 240
 # A lag must reduce the squared error by so many standard errors of the difference.
 _SIGMAS = 2.0
 
@@ -165,53 +167,53 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
     """
     Find the lags (n_u,) of inputs by simulations of a record of all states.
 
-    For each lag of a search a polynomial drift is estimated by the weak form. The lag with the
-    least mean squared error of simulations is taken if it errs less than none by more than two
-    standard errors of the difference, over segments of the record, both refined by output error.
-    Several inputs are searched one after the other.
+    A polynomial drift is refined by output error for each lag of a search, one input after the
+    other. The lag with the least mean squared error is taken if it errs less than none by more
+    than two standard errors of the difference, over segments of the record.
 
     :param lag: (n_u,) those that are known, in time units.
     :param sought: indices of the inputs whose lag is to be found.
     :param watch: called now and then; it may raise to end the search.
     """
     lag = lag.copy()
-    period = float(np.median(np.concatenate([np.diff(one.time) for one in episodes])))
-    longest = max(one.time[-1] - one.time[0] for one in episodes) / _SHARE
-
-    def simulated(j: int, tried: float, *, refine: bool = False) -> Array:
-        watch()
-        return _squares(plant, [lagged(one, np.where(np.arange(len(lag)) == j, tried, lag))
-                                for one in episodes], refine)
-
-    for j in sought:
-        grid = period * _RATIO ** np.arange(max(1.0, np.log(longest / period) / np.log(_RATIO)))
-        costs = [float(np.mean(simulated(j, tried))) for tried in grid]
-        best = float(np.log(grid[int(np.argmin(costs))]))
-        found = float(np.exp(minimize_scalar(
-            lambda tried, j=j: float(np.mean(simulated(j, np.exp(tried)))), method='bounded',
-            bounds=(best - np.log(_RATIO), best + np.log(_RATIO)),
-            options={'xatol': _TOLERANCE}).x))
-        less = simulated(j, 0.0, refine=True) - simulated(j, found, refine=True)
-        if np.mean(less) > _SIGMAS * np.std(less) / np.sqrt(len(less)):
-            lag[j] = found
-    return lag
-
-
-def _squares(plant: PlantDescription, episodes: Sequence[Episode], refine: bool) -> Array:
-    """Return the mean squared errors (M,) of segments, simulated by the best drift."""
     parts = cut([replace(one, x=one.interpolated()) for one in episodes], _SAMPLES)
     box, step = box_of(plant, parts), longest_step(parts)
-    segments, scale = Segments.of(parts, step), box.states.scale
+    period = float(np.median(np.concatenate([np.diff(one.time) for one in parts])))
+    longest = max(one.time[-1] - one.time[0] for one in episodes) / _SHARE
     inputs = InputModel.of(plant, box, np.concatenate([one.x for one in parts]))
-    best, least = np.full(len(parts), np.inf), None
-    for degree in usual_degrees(len(scale))[:_DEGREES]:
-        for window in _WINDOWS:
-            with contextlib.suppress(ValueError, np.linalg.LinAlgError):
-                drift = weak_form(parts, box, degree, inputs.weights, window, inputs.degree)
-                squares = np.mean(fitted_starts(drift.rate, segments, scale)[1] / scale ** 2, 1)
-                if np.mean(squares) < np.mean(best):
-                    best, least = squares, drift
-    if refine and least is not None:
-        drift = output_error(least, segments, learn_input_matrix=inputs.weights is None)
-        best = np.mean(fitted_starts(drift.rate, segments, scale)[1] / scale ** 2, 1)
-    return best
+    n_x = len(box.states)
+    degree = max(d for d in usual_degrees(n_x) if d <= _DEGREE and (
+        d == 1 or n_x * math.comb(n_x + d, d) <= _MOST_COEFFICIENTS))
+    drift: DriftModel | None = None
+
+    def squares(j: int, tried: float) -> Array:
+        """Return the mean squared errors (M,) of segments, simulated by a drift that is fitted."""
+        nonlocal drift
+        watch()
+        behind = np.where(np.arange(len(lag)) == j, tried, lag)
+        parts = cut([lagged(one, behind) for one in episodes], _SAMPLES)
+        segments = Segments.of(parts, step)
+        if drift is None:
+            drift = weak_form([replace(one, x=one.interpolated()) for one in parts], box, degree,
+                              inputs.weights, _WINDOW, inputs.degree)
+        drift = output_error(drift, segments, learn_input_matrix=inputs.weights is None)
+        return np.mean(fitted_starts(drift.rate, segments, box.states.scale)[1]
+                       / box.states.scale ** 2, axis=1)
+
+    for j in sought:
+        without, best, tried = squares(j, 0.0), period, period
+        least = np.inf
+        while tried <= longest:
+            if (cost := np.mean(squares(j, tried))) < least:
+                least, best = cost, tried
+            elif tried > _RATIO ** 2 * best:
+                break
+            tried *= _RATIO
+        found = best * math.exp(minimize_scalar(
+            lambda log, j=j, best=best: np.mean(squares(j, best * math.exp(log))),
+            bounds=(-math.log(_RATIO), math.log(_RATIO)), method='bounded',
+            options={'xatol': _TOLERANCE}).x)
+        less = without - squares(j, found)
+        if np.mean(less) > _SIGMAS * np.std(less) / math.sqrt(len(less)):
+            lag[j] = found
+    return lag
