@@ -216,7 +216,10 @@ class Tuning:
         signals = {'states': states, 'measured': measured, 'controlled': controlled,
                    'inputs': inputs, 'disturbances': model.disturbances.names}
         made = for_signals(replace(self, controlled=controlled), signals)
-        made = replace(made, plugins={
+        tolerance = made.tracking_tolerance.copy()
+        # the applied input is a state of the model there
+        tolerance[list(model.lagged)] = UNBOUNDED
+        made = replace(made, tracking_tolerance=tolerance, plugins={
             name: for_signals(own, signals) for name, own in self.plugins.items()})
         if not np.any(made.state_weight > 0.0):
             raise ValueError('state_weight must not be 0 for all states')

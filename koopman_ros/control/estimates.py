@@ -101,8 +101,7 @@ class StateEstimation:
 
         That is the command, unless a measurement (n_u,) of the input says that it was not
         reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences
-        below `tracking_tolerance` count for nothing: a bias would come into the loop. Behind a lag
-        of the model the command counts.
+        below `tracking_tolerance` count for nothing: a bias would come into the loop.
 
         :return: the state, and whether the applied input follows the command.
         """
@@ -110,8 +109,6 @@ class StateEstimation:
         if command is None or measured is None or not np.isfinite(measured).all():
             return state, True
         u = np.minimum(np.maximum(command, measured - tolerance), measured + tolerance)
-        lagged = list(self.model.lagged)
-        u[lagged] = command[lagged]
         return (replace(state, applied=state.applied.corrected(u)), bool((u == command).all()))
 
     def feed_forward(self, state: State) -> Array | None:

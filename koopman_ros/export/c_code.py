@@ -104,7 +104,10 @@ def _check(controller: Controller) -> None:
             f'the estimator {type(estimator).__name__} cannot be exported: set estimator to '
             'disturbance_observer, measured_state or extended_kalman_filter')
     tuning = controller.tuning
+    observed = controller.measured.determine_state or isinstance(estimator, ExtendedKalmanFilter)
     for what, given, remedy in (
+            ('applied inputs that are not measured', not observed,
+             'measure them, or set estimator to extended_kalman_filter'),
             ('measured disturbances', len(controller.model.disturbances),
              'train a model without them'),
             ('safe_latch', tuning.safe_latch, 'set it to false'),
@@ -196,7 +199,8 @@ def _tables(controller: Controller) -> dict[str, Any]:
         'WEIGHT': hidden[0], 'BIAS': hidden[1], 'AT_ZERO': hidden[2], 'POWERS': powers,
         'LIFT': np.concatenate((states_first, output), axis=1),
         'DRIFT': np.zeros((n, 0)) if model.readout is None else model.readout,
-        'DYNAMICS': model.A, 'INPUT_MATRIX': model.B, 'INPUT_INVERSE': model.input_inverse(),
+        'DYNAMICS': model.A, 'INPUT_MATRIX': model.B,
+        'INPUT_INVERSE': estimator.as_input(np.eye(n)),
         'SLOPE': model.linearised.A, 'PRE_FEEDBACK': model.pre_feedback_slope,
         'TERMS': np.zeros(0) if terms is None else terms.coefficients,
         'TERM_POWERS': np.zeros(0, dtype=int) if terms is None else (

@@ -192,13 +192,20 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         watch()
         behind = np.where(np.arange(len(lag)) == j, tried, lag)
         parts = cut([lagged(one, behind) for one in episodes], _SAMPLES)
-        segments = Segments.of(parts, step)
-        if drift is None:
-            drift = weak_form([replace(one, x=one.interpolated()) for one in parts], box, degree,
-                              inputs.weights, _WINDOW, inputs.degree)
-        drift = output_error(drift, segments, learn_input_matrix=inputs.weights is None)
-        return np.mean(fitted_starts(drift.rate, segments, box.states.scale)[1]
-                       / box.states.scale ** 2, axis=1)
+        segments, found = Segments.of(parts, step), np.full(len(parts), np.inf)
+        # a polynomial of lower degree where one diverges
+        for d in range(degree, 0, -1):
+            start = drift or weak_form([replace(one, x=one.interpolated()) for one in parts], box,
+                                       d, inputs.weights, _WINDOW, inputs.degree)
+            refined = output_error(start, segments, learn_input_matrix=inputs.weights is None)
+            squares = fitted_starts(refined.rate, segments, box.states.scale)[1]
+            found = np.mean(squares / box.states.scale ** 2, axis=1)
+            if np.isfinite(found).all():
+                drift = refined
+                break
+            if drift is not None:
+                break
+        return found
 
     for j in sought:
         without, best, tried = squares(j, 0.0), period, period
