@@ -256,13 +256,13 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                 for episode in record.episodes]
     _check_disturbances(plant, episodes)
     lag = _given_lag(task, plant, episodes) / seconds
-    dead_time = _dead_time(task, plant, [lagged(one, lag) for one in episodes], progress)
+    dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
     sought = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
     if sought:
         lag = find_lags(plant, _delayed(episodes, dead_time / seconds), lag, sought,
                         watch=lambda: progress.estimating(0, 1, 'lag'))
-        dead_time = _dead_time(task, plant, [lagged(one, lag) for one in episodes], progress)
-    episodes = [lagged(one, lag) for one in _delayed(episodes, dead_time / seconds)]
+        dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
+    episodes = _behind(_delayed(episodes, dead_time / seconds), lag)
     found = _estimate(task, plant, episodes, methods, progress, backend)
     found = replace(found, dead_time=found.dead_time + dead_time / seconds,
                     disturbances=plant.disturbance_names)
@@ -371,6 +371,14 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
 
 def _delayed(episodes: Sequence[Episode], dead_time: Array) -> list[Episode]:
     return [late for one in episodes if (late := one.delayed(dead_time)) is not None]
+
+
+def _behind(episodes: Sequence[Episode], lag: Array) -> list[Episode]:
+    """Return episodes with inputs behind lags (n_u,), in time units; ValueError for none."""
+    found = [late for one in episodes if (late := lagged(one, lag)) is not None]
+    if episodes and not found:
+        raise ValueError(f'no episode is longer than four lags of {max(lag):g}: record longer')
+    return found
 
 
 def _given_lag(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode]) -> Array:

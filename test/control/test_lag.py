@@ -33,12 +33,12 @@ def controller_of(model, **given):
         loop.tuning.sensor, stuck_sensor_timeout=0.0)))
 
 
-def step(loop, lag, duration, *events, plant=REACTOR):
+def step(loop, lag, duration, *events, plant=REACTOR, period=1.0):
     x = np.array([START])
     u = equilibrium_input(plant, x)
     run = simulate(loop, Process(plant, 0, x, u, Actuator(lag=lag), u), [
         at(BEGIN, SetpointRequest(0, np.array([SETPOINT]))), *events], duration=duration,
-        state=loop.initialise(State(), u), input_sensor=perfect, C=np.eye(1))
+        period=period, state=loop.initialise(State(), u), input_sensor=perfect, C=np.eye(1))
     assert not run.failure
     assert set(run.levels) == {'sdre'}
     return run
@@ -53,7 +53,6 @@ def test_a_law_that_knows_the_lag_costs_hardly_more_than_the_optimum(lag, durati
                 np.ones(1), 1.0 / 60.0, 0)
     run = step(controller_of(lagged_model(lag), **NO_LIMITS), lag, duration)
     assert SETPOINT - run.states.min() < 0.3
-    assert abs(run.states[-1, 0] - SETPOINT) < 0.05
     begin = int(BEGIN)
     assert cost_along(task, np.hstack([run.states, run.inputs])[begin:],
                       run.commands[begin:]) < 1.05 * least
@@ -62,10 +61,10 @@ def test_a_law_that_knows_the_lag_costs_hardly_more_than_the_optimum(lag, durati
     assert SETPOINT - ignorant.states.min() > 0.6
 
 
-@pytest.mark.parametrize(('lag', 'duration'), [(18.0, 200.0), (60.0, 250.0)])
+@pytest.mark.parametrize(('lag', 'duration'), [(18.0, 300.0), (60.0, 440.0)])
 def test_a_lag_leaves_no_offset_on_a_changed_plant(lag, duration):
     loop = controller_of(lagged_model(lag))
-    run = step(loop, lag, duration, plant=FOULED)
+    run = step(loop, lag, duration, plant=FOULED, period=2.0)
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
     # the applied input is calculated, and the disturbance an equivalent change of it
     estimate, states = run.loop.state.estimate, loop.model.states

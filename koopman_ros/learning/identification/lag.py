@@ -31,9 +31,11 @@ from koopman_ros.model import APPLIED, Box, Coordinates
 # Times after a change, in time constants, between which an applied input is nearly linear; at the
 # last one it has settled.
 _KNOTS = np.arange(0.25, 8.0, 0.25)
+# Time constants after which an applied input depends on nothing before.
+_FADED = 4.0
 # A search tries lags from an interval between samples on, with this ratio, up to this share of an
 # episode, then between, to this share of the lag.
-_RATIO, _SHARE, _TOLERANCE = 2.0, 20.0, 0.05
+_RATIO, _SHARE, _TOLERANCE = 2.0, 30.0, 0.05
 # The drift of a search: its degree, with at most so many coefficients, and samples of a window of
 # the weak form that it begins with.
 _DEGREE, _MOST_COEFFICIENTS, _WINDOW = 3, 60, 40
@@ -43,10 +45,20 @@ _SAMPLES = 240
 _SIGMAS = 2.0
 
 
-def lagged(episode: Episode, lag: Array) -> Episode:
-    """Return the episode with each input as it acts behind its lag (n_u,), from rest."""
+def lagged(episode: Episode, lag: Array, longest: float = 0.0) -> Episode | None:
+    """
+    Return the episode with each input as it acts behind its lag (n_u,).
+
+    It begins when what was applied before the first input has faded; None where nothing is left.
+
+    :param longest: a lag for which it has faded, too.
+    """
+    first = np.searchsorted(episode.time, episode.input_time[0] + _FADED * max(
+        longest, np.max(lag, initial=0.0)))
+    if len(episode) - first < 2:
+        return None
     if not lag.any():
-        return episode
+        return episode.part(int(first), len(episode)) if longest else episode
     begin, times = episode.input_time, [episode.input_time, episode.time]
     end = np.append(begin[1:], max(begin[-1], episode.time[-1]))
     for seconds in lag[lag > 0.0].tolist():
@@ -61,7 +73,8 @@ def lagged(episode: Episode, lag: Array) -> Episode:
             value = command + share * (value - command)
             applied.append(value)
         u[:, j], linear[j] = applied, True
-    return Episode(episode.time, episode.x, knots, u, tuple(linear))
+    return Episode(episode.time, episode.x, knots, u, tuple(linear)).part(
+        int(first), len(episode))
 
 
 def _commanded(episode: Episode, lag: Array) -> Episode:
@@ -176,10 +189,16 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
     :param watch: called now and then; it may raise to end the search.
     """
     lag = lag.copy()
-    parts = cut([replace(one, x=one.interpolated()) for one in episodes], _SAMPLES)
-    box, step = box_of(plant, parts), longest_step(parts)
-    period = float(np.median(np.concatenate([np.diff(one.time) for one in parts])))
+    step = longest_step(episodes)
     longest = max(one.time[-1] - one.time[0] for one in episodes) / _SHARE
+
+    def cut_behind(lag: Array) -> list[Episode]:
+        return cut([late for one in episodes if (
+            late := lagged(replace(one, x=one.interpolated()), lag, longest)) is not None],
+            _SAMPLES)
+
+    parts = cut_behind(0.0 * lag)
+    box = box_of(plant, parts)
     inputs = InputModel.of(plant, box, np.concatenate([one.x for one in parts]))
     n_x = len(box.states)
     degree = max(d for d in usual_degrees(n_x) if d <= _DEGREE and (
@@ -191,12 +210,11 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         nonlocal drift
         watch()
         behind = np.where(np.arange(len(lag)) == j, tried, lag)
-        parts = cut([lagged(one, behind) for one in episodes], _SAMPLES)
+        parts = cut_behind(behind)
         segments, found = Segments.of(parts, step), np.full(len(parts), np.inf)
         # a polynomial of lower degree where one diverges
         for d in range(degree, 0, -1):
-            start = drift or weak_form([replace(one, x=one.interpolated()) for one in parts], box,
-                                       d, inputs.weights, _WINDOW, inputs.degree)
+            start = drift or weak_form(parts, box, d, inputs.weights, _WINDOW, inputs.degree)
             refined = output_error(start, segments, learn_input_matrix=inputs.weights is None)
             squares = fitted_starts(refined.rate, segments, box.states.scale)[1]
             found = np.mean(squares / box.states.scale ** 2, axis=1)
@@ -208,7 +226,8 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         return found
 
     for j in sought:
-        without, best, tried = squares(j, 0.0), period, period
+        best = tried = 0.5 * step
+        without = squares(j, 0.0)
         least = np.inf
         while tried <= longest:
             if (cost := np.mean(squares(j, tried))) < least:
