@@ -239,7 +239,18 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
             lambda log, j=j, best=best: np.mean(squares(j, best * math.exp(log))),
             bounds=(-math.log(_RATIO), math.log(_RATIO)), method='bounded',
             options={'xatol': _TOLERANCE}).x)
-        less = without - squares(j, found)
-        if np.mean(less) > _SIGMAS * np.std(less) / math.sqrt(len(less)):
-            lag[j] = found
+        errors = squares(j, found)
+        if not _clearly_less(errors, without):
+            continue
+        assert drift is not None
+        # in a linear plant the lag and a time constant may be exchanged: the actuator is the faster
+        times = 1.0 / np.maximum(-np.linalg.eigvals(drift.slope(box.states.center)).real, 1e-9)
+        lag[j] = next((other for other in sorted(times.tolist()) if step / 4.0 < other < found
+                       and not _clearly_less(errors, squares(j, other))), found)
     return lag
+
+
+def _clearly_less(errors: Array, others: Array) -> bool:
+    """Whether mean squared errors (M,) are less than others, not by chance."""
+    less = others - errors
+    return bool(np.mean(less) > _SIGMAS * np.std(less) / math.sqrt(len(less)))
