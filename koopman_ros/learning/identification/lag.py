@@ -243,7 +243,7 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         if not _clearly_less(errors, without):
             continue
         assert drift is not None
-        # in a linear plant the lag and a time constant may be exchanged: the actuator is the faster
+        # a linear plant may exchange the lag for a time constant: the actuator is the faster one
         times = 1.0 / np.maximum(-np.linalg.eigvals(drift.slope(box.states.center)).real, 1e-9)
         lag[j] = next((other for other in sorted(times.tolist()) if step / 4.0 < other < found
                        and not _clearly_less(errors, squares(j, other))), found)
