@@ -230,14 +230,14 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         without = squares(j, 0.0)
         least = np.inf
         while tried <= longest:
-            if (cost := np.mean(squares(j, tried))) < least:
+            if (cost := float(np.mean(squares(j, tried)))) < least:
                 least, best = cost, tried
             elif tried > _RATIO ** 2 * best:
                 break
             tried *= _RATIO
         found = best * math.exp(minimize_scalar(
             lambda log, j=j, best=best: np.mean(squares(j, best * math.exp(log))),
-            bounds=(-math.log(_RATIO), math.log(_RATIO)), method='bounded',
+            bounds=(-math.log(_RATIO), math.log(min(_RATIO, longest / best))), method='bounded',
             options={'xatol': _TOLERANCE}).x)
         errors = squares(j, found)
         if not _clearly_less(errors, without):
