@@ -206,7 +206,8 @@ class Tuning:
         :raises ValueError: naming the mismatch.
         """
         states, inputs = model.states.names, model.inputs.names
-        controlled = tuple(filter(None, self.controlled)) or states
+        controlled = tuple(filter(None, self.controlled)) or tuple(
+            name for i, name in enumerate(states) if i not in model.lagged.values())
         if list(controlled) != [name for name in states if name in controlled]:
             raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
                              f'once and in this order, got {", ".join(controlled)}')
@@ -217,7 +218,10 @@ class Tuning:
         signals = {'states': states, 'measured': measured, 'controlled': controlled,
                    'inputs': inputs, 'disturbances': model.disturbances.names}
         made = for_signals(replace(self, controlled=controlled), signals)
-        made = replace(made, plugins={
+        tolerance = made.tracking_tolerance.copy()
+        # the applied input is a state of the model there
+        tolerance[list(model.lagged)] = UNBOUNDED
+        made = replace(made, tracking_tolerance=tolerance, plugins={
             name: for_signals(own, signals) for name, own in self.plugins.items()})
         if not np.any(made.state_weight > 0.0):
             raise ValueError('state_weight must not be 0 for all states')
@@ -238,12 +242,13 @@ class Tuning:
         """
         Return a tuning with weights, ranges and safe inputs of a model, except the given ones.
 
-        The weights are 1 on deviations scaled by the model, the inputs' limits their trained
-        range, and the safe inputs the nominal ones.
+        The weights are 1 on deviations scaled by the model, but 0 on applied inputs behind a lag,
+        the inputs' limits their trained range, and the safe inputs the nominal ones.
         """
-        inputs = model.inputs
+        inputs, weights = model.inputs, 1.0 / model.states.scale ** 2
+        weights[list(model.lagged.values())] = 0.0
         return cls(**{
-            'state_weight': 1.0 / model.states.scale ** 2,
+            'state_weight': weights,
             'input_weight': 1.0 / inputs.scale ** 2,
             'limits': InputLimits(inputs.lower, inputs.upper),
             'safe_value': inputs.center, **given})

@@ -30,7 +30,8 @@ class Configuration:
 
     model: LiftedModel  #: the lift
     tuning: Tuning  #: with one number for each signal
-    outputs: Outputs | None = None  #: measured outputs; every state by default
+    #: measured outputs; by default every state but the applied inputs behind a lag
+    outputs: Outputs | None = None
 
     __repr__ = short_repr
 
@@ -44,8 +45,10 @@ class Configuration:
     @cached_property
     def measured(self) -> Outputs:
         """The measured outputs: y = C x."""
-        states = self.model.states
-        return self.outputs or Outputs(states.names, states.units, np.eye(self.model.n_x))
+        states, applied = self.model.states, self.model.lagged.values()
+        rows = [i for i in range(len(states)) if i not in applied]
+        own = states.only([states.names[i] for i in rows])
+        return self.outputs or Outputs(own.names, own.units, np.eye(len(states))[rows])
 
     @cached_property
     def levels(self) -> dict[str, FallbackLevel]:

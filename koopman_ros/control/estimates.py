@@ -251,7 +251,13 @@ class StateEstimation:
 
     def _started(self, state: State, xi: Array, u: Array | None) -> Estimate:
         """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
-        estimator = self.level(state.supervisor).estimator
+        estimator, model = self.level(state.supervisor).estimator, self.model
+        if u is not None and model.lagged:
+            xi = xi.copy()
+            for j, i in model.lagged.items():
+                if not self.outputs.C[:, i].any():
+                    xi[i] = ((model.inputs.to_physical(u) - model.states.center[i])[j]
+                             / model.states.scale[i])
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:
             return started

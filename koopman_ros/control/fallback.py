@@ -256,7 +256,7 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
         not suffice.
     """
     name = tuning.estimator or (
-        'extended_kalman_filter' if not outputs.determine_state else
+        'extended_kalman_filter' if not outputs.determine(model.lagged.values()) else
         'disturbance_observer' if tuning.observer_bandwidth > 0.0 else 'measured_state')
     levels = {}
     for law_name in tuning.fallback_order:

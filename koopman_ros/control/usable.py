@@ -52,7 +52,8 @@ def _failing_step(controller: Controller) -> str:
         # of this thread alone, for a busy machine says nothing of a model
         begun = time.thread_time()
         try:
-            state, _, report = controller.step(state, model.states.center, k * NANOSECONDS)
+            state, _, report = controller.step(
+                state, controller.measured.of(model.states.center), k * NANOSECONDS)
             if report.reason is not None and report.reason.code is StatusCode.CALCULATION_FAILED:
                 raise ValueError(report.reason.values['error'])
             controller.equivalent_bias(state)

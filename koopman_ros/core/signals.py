@@ -3,7 +3,7 @@
 
 """Signals: one number for each by name, and the measured outputs of the state."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -61,8 +61,12 @@ class Outputs:
     @cached_property
     def determine_state(self) -> bool:
         """Whether they leave nothing of the state open."""
-        return self.C.shape[0] == self.C.shape[1] and (
-            np.linalg.matrix_rank(self.C) == len(self.C))
+        return self.determine(())
+
+    def determine(self, known: Collection[int]) -> bool:
+        """Whether they leave nothing open beside some states that are known without them."""
+        rest = [i for i, column in enumerate(self.C.T) if i not in known or column.any()]
+        return len(rest) == len(self.C) == np.linalg.matrix_rank(self.C)
 
     @cached_property
     def _inverse(self) -> Array:

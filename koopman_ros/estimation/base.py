@@ -188,7 +188,22 @@ class Estimator(ABC):
 
     def as_input(self, w: Array) -> Array:
         """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
-        return self.model.input_inverse().dot(w)
+        return self._inverse.dot(w)
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """(n_u, n_x); an input behind a lag acts like its applied value."""
+        model, lagged = self.model, self.model.lagged
+        if not lagged:
+            return model.input_inverse()
+        slope, effect, rows = model.drift_jacobian(np.zeros(model.n_x)), model.B.copy(), [
+            *lagged.values()]
+        for j, i in lagged.items():
+            effect[:, j] = slope[:, i] * model.inputs.scale[j] / model.states.scale[i]
+        effect[rows] = 0.0
+        found = np.asarray(np.linalg.pinv(effect), dtype=np.float64)
+        found[:, rows] = model.input_inverse()[:, rows]
+        return found
 
     def at_bound(self, w: Array) -> bool:
         """Return whether a disturbance is at `max_disturbance`, but for rounding."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The disturbance observer, and the measured state itself, where all states are measured."""
+"""The disturbance observer, and the measured state itself, where the states are measured."""
 
 import math
 from typing import Any, ClassVar
@@ -38,19 +38,24 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
 
 class DisturbanceObserver(Estimator):
     """
-    Two equal poles for each state, set by `observer_bandwidth`; every state is measured.
+    Two equal poles for each measured state, set by `observer_bandwidth`.
+
+    Only applied inputs behind a lag need no measurement: they follow from the commands, without a
+    disturbance of their own.
 
     With p = exp(-bandwidth dt) the state takes 1 - p^2 of the difference between a measurement and
     its prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error
     at p where the model's own motion within a sample is small.
 
-    :raises ValueError: where the outputs leave a state open.
+    :raises ValueError: where the outputs leave another state open.
     """
 
     def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
                  ) -> None:
         super().__init__(model, outputs, tuning, parameters)
-        if not outputs.determine_state:
+        #: (n_x,) whether a state is measured, and has a disturbance
+        self._measured = np.any(outputs.C != 0.0, axis=0)
+        if not outputs.determine(model.lagged.values()):
             raise ValueError(f'{", ".join(outputs.names)} are measured, which does not determine '
                              f'all {model.n_x} states: measure as many, or set estimator to a '
                              'Kalman filter')
@@ -74,6 +79,10 @@ class DisturbanceObserver(Estimator):
         if u is None:
             return Estimate(x, np.zeros_like(x))
         return Estimate(x, self.bounded(-self.model.rate_under(u)(x)))
+
+    def bounded(self, w: Array) -> Array:
+        """Return the part of a disturbance that acts on measured states, within the bound."""
+        return super().bounded(np.where(self._measured, w, 0.0))
 
 
 class MeasuredState(DisturbanceObserver):

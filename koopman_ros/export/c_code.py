@@ -120,6 +120,9 @@ def _fields(controller: Controller, code: str) -> dict[str, Any]:
         raise ExportError(
             f'the estimator {type(estimator).__name__} cannot be exported: set estimator to '
             'disturbance_observer, measured_state or extended_kalman_filter')
+    if not (controller.measured.determine_state or isinstance(estimator, ExtendedKalmanFilter)):
+        raise ExportError('applied inputs that are not measured cannot be exported: measure them, '
+                          'or set estimator to extended_kalman_filter')
     degree = max(getattr(model.observables, 'degree', 0), model.input_matrix_degree)
     if degree > _MAX_DEGREE:
         raise ExportError(f'a polynomial of degree {degree} cannot be exported: train a model of '
@@ -213,7 +216,7 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'INPUT_WEIGHT': np.diag(best.law.weights.R),
         'AT_ZERO': lift.value_at_zero if network else none,
         'POWERS': none if network else lift.exponents[n:], 'LIFT': psi, 'RATE': model.A @ psi,
-        'INPUT_INVERSE': model.input_inverse(), 'SLOPE': linear.A,
+        'INPUT_INVERSE': estimator.as_input(np.eye(n)), 'SLOPE': linear.A,
         'PRE_FEEDBACK': model.pre_feedback_slope, 'NODES': NODES, 'SHARES': WEIGHTS,
         'TERM_POWERS': none if terms is None else PolynomialObservables.total_degree(
             n, terms.degree).exponents}

@@ -20,6 +20,7 @@ from koopman_ros.learning.identification import (
     DriftModel,
     fitted_starts,
     Identified,
+    LaggedDrift,
     longest_step,
 )
 from koopman_ros.learning.identification.alternatives import TransformedDrift
@@ -150,7 +151,9 @@ def alternative_models(found: Identified, plant: PlantDescription) -> list[Lifte
     """
     models = []
     for drift in found.alternatives:
-        own = drift.drift if isinstance(drift, TransformedDrift) else drift
+        own = drift
+        while isinstance(own, LaggedDrift | TransformedDrift):
+            own = own.drift
         # one that holds no steady state, or does not follow the record, is no model
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
             if isinstance(own, DriftModel):

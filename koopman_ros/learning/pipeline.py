@@ -35,13 +35,17 @@ from koopman_ros.learning.identification import (
     DriftModel,
     estimate_parameters,
     find_dead_times,
+    find_lags,
     IdentificationMethod,
     Identified,
     identify,
     identify_structure,
     identify_unmeasured,
+    lagged,
+    LaggedDrift,
     methods_of,
     Stopped,
+    with_lag,
 )
 from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.scaling import checked_device
@@ -55,7 +59,7 @@ from koopman_ros.learning.record import (
     TrainingRecord,
 )
 from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
-from koopman_ros.model import LiftedModel, load, save
+from koopman_ros.model import LiftedModel, load, LONGEST_DEAD_TIME, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
@@ -112,6 +116,13 @@ class Retrained:
         """Dead times (n_u,) of the inputs, in s."""
         return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * self.found.dead_time
 
+    @property
+    def lag(self) -> Array:
+        """Lags (n_u,) of the inputs, in s."""
+        drift = self.found.drift
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * drift.lag if isinstance(
+            drift, LaggedDrift) else np.zeros(len(drift.box.inputs))
+
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""
         box = self.found.drift.box
@@ -158,6 +169,7 @@ class Retrained:
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
             'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
+            'lag': dict(zip(inputs.names, self.lag.tolist(), strict=True)),
             'constants': {one.name: {
                 'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
@@ -251,12 +263,19 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
     _check_disturbances(plant, episodes)
-    dead_time = _dead_time(task, plant, episodes, progress)
-    episodes = [late for episode in episodes
-                if (late := episode.delayed(dead_time / seconds)) is not None]
+    lag = _given_lag(task, plant, episodes) / seconds
+    dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
+    sought = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
+    if sought:
+        lag = find_lags(plant, _delayed(episodes, dead_time / seconds), lag, sought,
+                        watch=lambda: progress.estimating(0, 1, 'lag'))
+        dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
+    episodes = _behind(_delayed(episodes, dead_time / seconds), lag)
     found = _estimate(task, plant, episodes, methods, progress, backend)
     found = replace(found, dead_time=found.dead_time + dead_time / seconds,
                     disturbances=plant.disturbance_names)
+    if lag.any():
+        found = with_lag(found, lag)
     dead_time = seconds * found.dead_time
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(one for one in record.episodes if one.delayed(dead_time) is not None),
@@ -352,14 +371,45 @@ def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
     if late := ', '.join(name for name in task.disturbances if task.dead_time.get(name)):
         raise ValueError(f'dead_time names {late}: a measured disturbance has none')
     known = [name in task.dead_time or name in task.disturbances for name in names]
-    episodes = [one for episode in episodes
-                if (one := episode.delayed(given / seconds)) is not None]
+    episodes = _delayed(episodes, given / seconds)
     if not episodes:
         raise ValueError(f'no episode is longer than dead_time = {max(given):g} s: record longer')
     if task.physical_model or all(known):
         return given
     return given + seconds * find_dead_times(
         episodes, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
+
+
+def _delayed(episodes: Sequence[Episode], dead_time: Array) -> list[Episode]:
+    return [late for one in episodes if (late := one.delayed(dead_time)) is not None]
+
+
+def _behind(episodes: Sequence[Episode], lag: Array) -> list[Episode]:
+    """Return episodes with inputs behind lags (n_u,), in time units; ValueError for none."""
+    found = [late for one in episodes if (late := lagged(one, lag)) is not None]
+    if episodes and not found:
+        raise ValueError(f'no episode is longer than four lags of {max(lag):g}: record longer')
+    return found
+
+
+def _given_lag(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode]) -> Array:
+    """Return the lags (n_u,) that the task has, in s; 0 for one that is to be found."""
+    names = plant.input_names
+    if wrong := ', '.join(name for name in task.lag if name not in names or (
+            name in task.disturbances and task.lag[name])):
+        raise ValueError(f'lag names {wrong}: choose from the manipulated inputs '
+                         f'{", ".join(name for name in names if name not in task.disturbances)}')
+    shortest = 0.5 * SECONDS_PER_TIME_UNIT[plant.time_unit] * float(np.median(np.concatenate(
+        [np.diff(one.time) for one in episodes])))
+    for name, value in task.lag.items():
+        if not (value in (-1.0, 0.0) or shortest <= value <= LONGEST_DEAD_TIME):
+            raise ValueError(f'lag of {name} is {value:g} s, must be {shortest:.3g} s (half of a '
+                             f'sample interval) to {LONGEST_DEAD_TIME:g} s, 0 for none, or -1 to '
+                             'find it')
+        if value and any(one.linear and one.linear[names.index(name)] for one in episodes):
+            raise ValueError(f'the record has the applied {name}: set its lag to 0, or record its '
+                             'commands')
+    return np.array([max(task.lag.get(name, 0.0), 0.0) for name in names])
 
 
 def _free_runs(model: AnyModel, recorded: Record, test: Record | None, offsets: Array

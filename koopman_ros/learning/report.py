@@ -78,8 +78,9 @@ def _sections(retrained: Retrained) -> Iterator[str]:
           'each)' for (first, second), share in retrained.coverage.items()),
         *(f'noise of {name} from sample to sample: {noise:.3g} {unit}' for name, noise, unit in
           zip(states.names, found.noise, states.units, strict=True)),
-        *(f'dead time of {name}: {seconds:.4g} s'
-          for name, seconds in zip(inputs.names, retrained.dead_time.tolist(), strict=True)),
+        *(f'{what} of {name}: {seconds:.4g} s' for what, values in (
+            ('dead time', retrained.dead_time), ('lag', retrained.lag))
+          for name, seconds in zip(inputs.names, values.tolist(), strict=True)),
         f'{len(found.fitted)} segments for training, {len(found.held_out)} held out for testing'])
     yield '## Estimates of the drift'
     yield (f'Selected: {found.method}, {found.drift.form}, with the input matrix B'

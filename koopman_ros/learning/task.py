@@ -52,7 +52,10 @@ class TrainingTask:
     input_matrix_degree: int = 0
     #: dead time of inputs by name, in s; of those not named it is found from the record
     dead_time: Mapping[str, float] = field(default_factory=dict)
-    #: those of the inputs that are measured and not manipulated; they have no dead time
+    #: time constant with which inputs follow their commands, by name, in s: 0 for none, -1 to find
+    #: it from a record of all states; the applied input is a state of the model
+    lag: Mapping[str, float] = field(default_factory=dict)
+    #: those of the inputs that are measured and not manipulated; they have no dead time and no lag
     disturbances: tuple[str, ...] = ()
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
     #: not compared with the present one, which has other states. -1: as many as free runs of the
@@ -115,13 +118,15 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
         some = [name for name in current.states.names
                 if name in {state.name for state in states}]
         # the others are estimated
-        partly = bool(task.physical_model) and 0 < len(some) < len(current.states)
+        partly = bool(task.physical_model or task.lag) and 0 < len(some) < len(current.states)
         states = _in_order(states, current.states.only(some) if partly else current.states,
                            'state', task.model)
         inputs = _in_order(inputs, current.inputs, 'input', task.model)
         plant = current.plant if not partly else replace(
             _unknown(replace(task, states=tuple(states), inputs=tuple(inputs))),
             name=current.plant.name, time_unit=current.plant.time_unit)
+    # what lags is the actuator, as far as its applied input was recorded: that is calculated
+    inputs = [replace(one, measured=None) if task.lag.get(one.name) else one for one in inputs]
     return replace(plant, B=_known_gain(task, plant),
                    input_matrix_degree=task.input_matrix_degree,
                    disturbance_names=task.disturbances), states, inputs

@@ -35,6 +35,8 @@ from koopman_ros.model_classes import (
 )
 
 LONGEST_DEAD_TIME = 3600.0  #: s
+#: of the state that is the applied value of an input behind a lag, before the input's name
+APPLIED = 'applied_'
 
 # Figures on held-out data in words, by their names in files.
 _FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
@@ -141,8 +143,9 @@ class LiftedModel:
                     of.names, of.units, of.lower.tolist(), of.upper.tolist(), strict=True):
                 lines.append(f'{role} {name}: trained from {shown(low, unit):.6g} to '
                              f'{shown(high, unit):.6g} {display_unit(unit)}')
-        lines += [f'dead time of {name}: {seconds:.6g} s' for name, seconds in zip(
-            self.inputs.names, self.dead_time.tolist(), strict=True) if seconds > 0.0]
+        lines += [f'{what} of {name}: {seconds:.6g} s' for what, values in (
+            ('dead time', self.dead_time), ('lag', self.lag)) for name, seconds in zip(
+                self.inputs.names, values.tolist(), strict=True) if seconds > 0.0]
         rates = self.eigenvalues.real
         lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
                   *(f'{title[0].lower()}{title[1:]}: {value:.3g}'
@@ -224,6 +227,21 @@ class LiftedModel:
                     NEURAL_DRIFT if self.readout is not None and self.n_z == self.n_x else
                     IDENTITY_LIFT)
         return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
+
+    @cached_property
+    def lagged(self) -> dict[int, int]:
+        """Indices of the inputs behind a lag, each with that of the state it applies."""
+        names = self.states.names
+        return {j: names.index(APPLIED + name) for j, name in enumerate(self.inputs.names)
+                if APPLIED + name in names}
+
+    @property
+    def lag(self) -> Array:
+        """Time constant (n_u,) of each input in s; 0 without a lag."""
+        slope, found = self.drift_jacobian(np.zeros(self.n_x)), np.zeros(self.n_u)
+        for j, i in self.lagged.items():
+            found[j] = -self.seconds_per_time_unit / slope[i, i]
+        return found
 
     @property
     def plant(self) -> PlantDescription:

@@ -221,8 +221,10 @@ class ControllerNode(ManagedNode):
             return
         report = outcome.report
         acting = outcome.state.disturbances
+        # behind a lag of the model the command counts
+        recent = replace(event, applied=None) if self._loop.controller.model.lagged else event
         self._recent.add(
-            event, report.measurement, before.command, self._settings.model_check_length,
+            recent, report.measurement, before.command, self._settings.model_check_length,
             None if acting is None else acting.value)
         self._measured = sample.values
         self._counts.take(report)

@@ -54,7 +54,8 @@ class ControllerParameters:
         '', 'Name of a bundled model, or path of a .safetensors model file.')
     states_measured: tuple[str, ...] = parameter(
         ('',), 'Measured signals with their units, e.g. level [m]. The model must have them; its '
-               'other states are estimated. An empty name: all states.', read_only=True)
+               'other states are estimated. An empty name: all states but applied inputs behind '
+               'a lag.', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
         ('',), 'Inputs with their units, e.g. pump [V]. The model must have them. An empty name: '
                'all inputs.', read_only=True)
@@ -182,7 +183,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
              for kind in ('states_measured', 'inputs_commanded')]
     expected = Signals(named[0] or found.states, named[1] or found.inputs,
                        disturbances=found.disturbances)
-    if expected.inputs != found.inputs or not expected.states.items() <= found.states.items():
+    if expected.inputs != found.inputs or not expected.states.items() <= found.every.items():
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
             'system, correct states_measured and inputs_commanded, or set system to the plant of '

@@ -93,7 +93,7 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and own.disturbances == signals.disturbances
-                                    and signals.states.items() <= own.states.items()):
+                                    and signals.states.items() <= own.every.items()):
         raise ModelFileError(
             f'{path} has {own}, but this controller was started for {signals}: choose a model of '
             'the same signals, or restart the controller')

@@ -182,12 +182,13 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     Return the signals of a model.
 
     :param controlled: names of states; all that are measured by default.
-    :param measured: names of states, in any order; all by default.
+    :param measured: names of states, in any order; by default all but applied inputs behind a lag.
     """
     every, inputs, disturbances = (dict(zip(of.names, of.units, strict=True))
                                    for of in (model.states, model.inputs, model.disturbances))
     # in the order of the states, as the control step wants them
-    states = {name: unit for name, unit in every.items() if name in (measured or every)}
+    states = {name: unit for i, (name, unit) in enumerate(every.items()) if (
+        name in measured if measured else i not in model.lagged.values())}
     named = tuple(filter(None, controlled))
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),

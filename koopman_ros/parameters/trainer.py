@@ -210,6 +210,10 @@ class TrainerParameters:
     dead_time: Array = column(
         'inputs', -1.0, 'Dead time between the applied input and its effect; -1: found from the '
         'record.', 's', -1.0, 3600.0)
+    lag: Array = column(
+        'inputs', 0.0, 'Time constant with which the applied input follows the command, and is a '
+        'state of the model; -1: found from a record of all other states; 0: none.', 's', -1.0,
+        3600.0)
 
     def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
         """
@@ -268,6 +272,8 @@ class TrainerParameters:
                 'most_samples': self.training_samples,
                 'dead_time': {name: seconds for name, seconds in zip(
                     signals.inputs, self.dead_time.tolist(), strict=True) if seconds >= 0.0},
+                'lag': {name: seconds for name, seconds in zip(
+                    signals.inputs, self.lag.tolist(), strict=True) if seconds},
                 'input_matrix_degree': self.input_matrix_degree,
                 'disturbances': tuple(signals.disturbances),
                 'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
@@ -300,9 +306,13 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
         place.topic for places in (wiring.measured_disturbances, wiring.quality)
         for place in places.values()))))
     if present is not None:
-        states, inputs = present.states, present.inputs
+        inputs = present.inputs
+        states = present.states.only([name for name in present.states.names if (
+            name in signals.states or not present.lagged)])
         defaults |= {
             'input_matrix_degree': present.input_matrix_degree,
+            **{f'{name}.lag': seconds for name, seconds in zip(
+                inputs.names, present.lag.tolist(), strict=True)},
             **box_defaults(states, experiment_min=states.lower, experiment_max=states.upper,
                            setpoint_min=states.lower, setpoint_max=states.upper),
             **box_defaults(inputs, experiment_min=inputs.lower, experiment_max=inputs.upper,

@@ -23,19 +23,12 @@ from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.plants import (
     Actuator,
     equilibrium_input,
-    one_state_reactor,
     Process,
-    ReactorParameters,
 )
 from koopman_ros.tuning import Tuning
-from support.closed_loops import COOLANT, REACTOR, SECOND, SETPOINT, shipped, START
+from support.closed_loops import COOLANT, FOULED, REACTOR, SECOND, SETPOINT, shipped, START
 
 REACTOR_MODEL = shipped('reactor_nz4')
-FOULED = one_state_reactor(
-    replace(ReactorParameters(),
-            heat_transfer_coefficient=0.8 * ReactorParameters().heat_transfer_coefficient),
-    REACTOR.nominal_state)
-
 
 # K^2 min of the step by a coolant that moves by 1 K/s at most, found by least squares.
 LEAST = 33.85

@@ -3,6 +3,7 @@
 
 """Plant and controller in a loop: any order of start, no offset, and no bump."""
 
+from pathlib import Path
 import signal
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -12,9 +13,11 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo import reactor
+from koopman_ros.model import save
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_status import TASKS
 from koopman_ros.testing import Harness
+from support.lagged_reactor import lagged_model
 from support.nodes import seconds, temperature, value
 
 FOULED = 0.8 * reactor.constant('heat_transfer_coefficient')  # W/K
@@ -102,6 +105,18 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
     assert np.max(np.abs(np.diff([message.temperature for message in commands]))) < 0.05
     # of the set-point it knows nothing: it holds what it finds
     loop.rest()
+
+
+def test_a_lag_that_the_model_has_brings_no_overshoot(ros: Harness, tmp_path: Path) -> None:
+    """The applied coolant is a state of the model, which no topic tells."""
+    save(lagged_model(30.0), tmp_path / 'lagged.safetensors')
+    loop = Loop(ros)
+    loop.controller = ros.start('controller', {'model': str(tmp_path / 'lagged.safetensors')})
+    ros.speak(Temperature, reactor.SETPOINT, to='controller').publish(temperature(SETPOINT))
+    ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 2, 'speed': 200.0,
+                        'lockstep_timeout': 0.3, 'coolant_temperature.lag': 30.0})
+    loop.rest()
+    assert min(message.temperature for message in loop.measured) > SETPOINT - 0.3
 
 
 def test_each_node_tells_of_all_its_tasks_in_one_message_and_names_the_plant(ros: Harness) -> None:

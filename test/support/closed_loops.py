@@ -27,6 +27,9 @@ from koopman_ros.tuning import Tuning
 Law = Callable[..., control.Feedback]
 
 REACTOR = plants.one_state_reactor()
+FOULED = plants.one_state_reactor(replace(
+    plants.ReactorParameters(), heat_transfer_coefficient=(
+        0.8 * plants.ReactorParameters().heat_transfer_coefficient)), REACTOR.nominal_state)
 START = float(REACTOR.nominal_state[0])
 SETPOINT = START - 10.0
 COOLANT = float(plants.equilibrium_input(REACTOR, [SETPOINT])[0])

@@ -34,6 +34,7 @@ from koopman_ros.learning.identification.identify import (
     Score,
     Stopped,
 )
+from koopman_ros.learning.identification.lag import find_lags, lagged, LaggedDrift, with_lag
 from koopman_ros.learning.identification.output_error import output_error
 from koopman_ros.learning.identification.total_variation import (
     noise_level,
@@ -56,6 +57,7 @@ __all__ = [
     'EstimatedConstant',
     'IdentificationMethod',
     'Identified',
+    'LaggedDrift',
     'Score',
     'Segments',
     'Stopped',
@@ -65,10 +67,12 @@ __all__ = [
     'box_of',
     'estimate_parameters',
     'find_dead_times',
+    'find_lags',
     'fitted_starts',
     'identify',
     'identify_structure',
     'identify_unmeasured',
+    'lagged',
     'longest_step',
     'methods_of',
     'noise_level',
@@ -76,4 +80,5 @@ __all__ = [
     'prediction_error',
     'total_variation',
     'weak_form',
+    'with_lag',
 ]

@@ -130,7 +130,7 @@ class Identified:
 
     drift: Drift  #: the estimate
     method: str  #: how it was found
-    linear: DriftModel  #: the best linear model of the same episodes, by output error
+    linear: Drift  #: the best linear model of the same episodes, by output error
     scores: tuple[Score, ...]  #: of all estimates, in the order of their making
     #: (n_x,) standard deviation of the measurement noise, from sample to sample; NaN of a state
     #: that is measured too rarely
