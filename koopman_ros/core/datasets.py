@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 import hashlib
 import itertools
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array, frozen, real, short_repr
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.units import check_time_unit, check_unit
 
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
@@ -45,6 +46,9 @@ class PlantDescription:
     #: inputs that are not manipulated: measured disturbances, with an effect that does not depend
     #: on the state
     disturbance_names: tuple[str, ...] = ()
+    #: static characteristics of inputs by name, none of an input that acts linearly; B is the gain
+    #: of their effects
+    characteristics: Mapping[str, Characteristic] = field(default_factory=dict)
 
     __repr__ = short_repr
 

@@ -105,6 +105,8 @@ def _check(controller: Controller) -> None:
             'disturbance_observer, measured_state or extended_kalman_filter')
     tuning = controller.tuning
     for what, given, remedy in (
+            ('a characteristic of an input', len(controller.model.inputs.characteristics),
+             'learn with <input>.characteristic: linear, and export the table with the valve'),
             ('measured disturbances', len(controller.model.disturbances),
              'train a model without them'),
             ('safe_latch', tuning.safe_latch, 'set it to false'),

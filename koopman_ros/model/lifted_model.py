@@ -132,6 +132,8 @@ class LiftedModel:
                              f'{shown(high, unit):.6g} {display_unit(unit)}')
         lines += [f'dead time of {name}: {seconds:.6g} s' for name, seconds in zip(
             self.inputs.names, self.dead_time.tolist(), strict=True) if seconds > 0.0]
+        lines += [f'characteristic of {name}: {one}'
+                  for name, one in self.inputs.characteristics.items()]
         rates = self.eigenvalues.real
         lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
                   *(f'held-out {name}: {value:.3g}' for name, value in about.metrics.items()),
@@ -210,7 +212,8 @@ class LiftedModel:
         return PlantDescription(self.provenance.plant, self.states.names, self.states.units,
                                 self.inputs.names, self.inputs.units, self.time_unit,
                                 self.states.center,
-                                self.inputs.center, None, self.input_matrix_degree)
+                                self.inputs.center, None, self.input_matrix_degree,
+                                characteristics=self.inputs.characteristics)
 
     @cached_property
     def seconds_per_time_unit(self) -> float:
