@@ -49,7 +49,7 @@ class Characteristic:
         :raises ValueError: for effects that fall.
         """
         u, g = (np.asarray(one, dtype=np.float64) for one in (values, effects))
-        if len(u) != len(g) or np.any(np.diff(g) < 0.0) or not g[-1] > g[0]:
+        if len(u) != len(g) or len(u) < 2 or np.any(np.diff(g) < 0.0) or not g[-1] > g[0]:
             raise ValueError('the effects of a characteristic must not fall from value to value, '
                              f'got {g.tolist()} at {u.tolist()}')
         line, g = (u - u[0]) / (u[-1] - u[0]), (g - g[0]) / (g[-1] - g[0])

@@ -37,9 +37,9 @@ from koopman_ros.learning.identification import (
     find_dead_times,
     IdentificationMethod,
     Identified,
-    identify,
     identify_structure,
     identify_unmeasured,
+    identify_with_characteristics,
     methods_of,
     Stopped,
 )
@@ -155,6 +155,8 @@ class Retrained:
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
             'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
+            'characteristics': {name: [one.values.tolist(), one.effects.tolist()]
+                                for name, one in inputs.characteristics.items()},
             'constants': {one.name: {
                 'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
@@ -427,12 +429,15 @@ def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
         return estimate_parameters(plant, episodes, plant_class(task.physical_model),
                                    task.constants, seed=seed, watch=watch)
     if task.unmeasured_states < 0 and not task.model:
-        return identify_structure(plant, episodes, methods=methods, seed=seed, watch=watch,
-                                  backend=backend, dead_times=not task.dead_time)
+        return identify_structure(plant, episodes, given=task.characteristics, methods=methods,
+                                  seed=seed, watch=watch, backend=backend,
+                                  dead_times=not task.dead_time)
     if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
                                    watch=watch, backend=backend, dead_times=not task.dead_time)
-    return identify(plant, episodes, methods=methods, seed=seed, watch=watch, backend=backend)
+    return identify_with_characteristics(
+        plant, episodes, given=task.characteristics, methods=methods, seed=seed, watch=watch,
+        backend=backend)
 
 
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,

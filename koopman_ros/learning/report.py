@@ -80,6 +80,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
           zip(states.names, found.noise, states.units, strict=True)),
         *(f'dead time of {name}: {seconds:.4g} s'
           for name, seconds in zip(inputs.names, retrained.dead_time.tolist(), strict=True)),
+        *(f'characteristic of {name}: {one}' for name, one in inputs.characteristics.items()),
         f'{len(found.fitted)} segments for training, {len(found.held_out)} held out for testing'])
     yield '## Estimates of the drift'
     yield (f'Selected: {found.method}, {found.drift.form}, with the input matrix B'

@@ -37,7 +37,7 @@ class Coordinates:
     lower: Array  #: (n,) lower corner of the training box, in units
     upper: Array  #: (n,) upper corner of the training box, in units
     #: static characteristics by name, none of a signal that acts linearly
-    characteristics: Mapping[str, Characteristic] = field(default_factory=dict)
+    characteristics: Mapping[str, Characteristic] = field(default_factory=dict, kw_only=True)
 
     __repr__ = short_repr
 
@@ -96,14 +96,14 @@ class Coordinates:
         chosen = [self.names.index(name) for name in names]
         return Coordinates(tuple(names), tuple(self.units[i] for i in chosen), *(
             value[chosen] for value in (self.center, self.scale, self.lower, self.upper)),
-            self.characteristics)
+            characteristics=self.characteristics)
 
     def followed_by(self, others: Coordinates) -> Coordinates:
         """Return these coordinates, and after them others."""
         return Coordinates(self.names + others.names, self.units + others.units, *(
             np.concatenate([getattr(self, name), getattr(others, name)])
             for name in ('center', 'scale', 'lower', 'upper')),
-            {**self.characteristics, **others.characteristics})
+            characteristics={**self.characteristics, **others.characteristics})
 
     def text(self, values: Array, number_format: str = '.6g') -> str:
         """Write values (n,) with names and units, e.g. 'temperature 46.5 degC, level 2 m'."""
@@ -114,13 +114,14 @@ class Coordinates:
     def to_deviation(self, value: Array) -> Array:
         """Map physical values (..., n) to scaled deviations (..., n)."""
         if self.characteristics:
-            return (self._mapped(value, Characteristic.effect) - self._effect_at_center) / self.scale
+            return (self._effects(value) - self._effects(self.center)) / self.scale
         return (value - self.center) / self.scale
 
     def to_physical(self, deviation: Array) -> Array:
         """Map scaled deviations (..., n) to physical values (..., n)."""
         if self.characteristics:
-            return self._mapped(self._effect_at_center + deviation * self.scale, Characteristic.value)
+            effects = self._effects(self.center) + deviation * self.scale
+            return self._mapped(effects, Characteristic.value)
         return self.center + deviation * self.scale
 
     def slope(self, value: Array) -> Array:
@@ -138,9 +139,8 @@ class Coordinates:
             mapped[..., j] = by(one, value[..., j])
         return mapped
 
-    @cached_property
-    def _effect_at_center(self) -> Array:
-        return self._mapped(self.center, Characteristic.effect)
+    def _effects(self, value: Array) -> Array:
+        return self._mapped(value, Characteristic.effect)
 
     def violation(self, value: Array) -> float:
         """

@@ -275,7 +275,7 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
 def _coordinates(about: dict[str, Any]) -> Coordinates:
     names, units, *values = (_of_type(list, about, name) for name in _COORDINATES)
     return Coordinates(tuple(names), tuple(units), *(
-        np.array(value, dtype=np.float64) for value in values), {
+        np.array(value, dtype=np.float64) for value in values), characteristics={
             name: Characteristic(*(np.array(one, dtype=np.float64) for one in points))
             for name, points in about.get('characteristics', {}).items()})
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 import itertools
@@ -18,6 +18,7 @@ from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.learning.identification.alternatives import in_coordinates_of
 from koopman_ros.learning.identification.base import IdentificationMethod
+from koopman_ros.learning.identification.characteristics import identify_with_characteristics
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.dead_time import (
     LinearModels,
@@ -39,7 +40,6 @@ from koopman_ros.learning.identification.episode_offsets import (
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
-    identify,
     NEARLY,
     OUTPUT_ERROR,
     Score,
@@ -177,20 +177,24 @@ class _Choice:
 
 
 def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
+                       given: Collection[str] = (),
                        methods: Mapping[str, IdentificationMethod] | None = None,
                        dead_times: bool = True, seed: int = 0, watch: Watch = lambda *_: False,
                        backend: Backend | None = None) -> Identified:
     """
     Estimate a drift with as many states as free runs of the record need.
 
-    An estimate of measured states by :func:`identify` is kept if its simulations of the whole
-    record err by little more than noise, or by less than 1 % of the motion. Otherwise it competes
-    with those of :func:`identify_unmeasured`.
+    An estimate of measured states by :func:`identify_with_characteristics` is kept if its
+    simulations of the whole record err by little more than noise, or by less than 1 % of the
+    motion. Otherwise it competes with those of :func:`identify_unmeasured`.
 
+    :param given: inputs whose characteristic the plant has already.
     :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
     """
-    measured = identify(plant, episodes, methods=methods, seed=seed, backend=backend,
-                        watch=lambda done, total, text: watch(done, 4 * total, text))
+    measured = identify_with_characteristics(
+        plant, episodes, given=given, methods=methods, seed=seed, backend=backend,
+        watch=lambda done, total, text: watch(done, 4 * total, text))
+    plant = replace(plant, characteristics=measured.drift.box.inputs.characteristics)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes):
         return measured
