@@ -69,9 +69,9 @@ class PlantDescription:
             if nominal.shape != (len(names),):
                 raise ValueError(f'incompatible nominal_{kind}: expected one number for each of '
                                  f'{list(names)}, got {nominal.tolist()}')
-            for field, value in ((f'{kind}_names', names), (f'{kind}_units', units),
+            for attribute, value in ((f'{kind}_names', names), (f'{kind}_units', units),
                                  (f'nominal_{kind}', nominal)):
-                object.__setattr__(self, field, value)
+                object.__setattr__(self, attribute, value)
         if unknown := [name for name in self.disturbance_names if name not in self.input_names]:
             raise ValueError(f'disturbance_names has {", ".join(unknown)}, must be some of the '
                              f'inputs {", ".join(self.input_names)}')
