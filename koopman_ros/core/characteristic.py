@@ -46,12 +46,13 @@ class Characteristic:
         """
         Return the one through points whose effects have any scale and may be equal.
 
-        :raises ValueError: for effects that fall.
+        :raises ValueError: for values that do not rise, or effects that fall.
         """
         u, g = (np.asarray(one, dtype=np.float64) for one in (values, effects))
-        if len(u) != len(g) or len(u) < 2 or np.any(np.diff(g) < 0.0) or not g[-1] > g[0]:
-            raise ValueError('the effects of a characteristic must not fall from value to value, '
-                             f'got {g.tolist()} at {u.tolist()}')
+        if not (1 < len(u) == len(g) and np.all(np.diff(u) > 0.0) and np.all(np.diff(g) >= 0.0)
+                and g[-1] > g[0]):
+            raise ValueError('a characteristic needs rising values and effects that do not fall, '
+                             f'got the effects {g.tolist()} at {u.tolist()}')
         line, g = (u - u[0]) / (u[-1] - u[0]), (g - g[0]) / (g[-1] - g[0])
         g = u[0] + (u[-1] - u[0]) * ((1.0 - _LEAST_SLOPE) * g + _LEAST_SLOPE * line)
         g[-1] = u[-1]

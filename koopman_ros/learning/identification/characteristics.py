@@ -37,7 +37,7 @@ _POINTS, _FEW_POINTS = 11, 5  # of a characteristic, and of functions beside sta
 # A larger model must err less by so many standard errors of the difference.
 _SIGMAS = 2.0
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
-_FEW_STEPS, _MOST_STEPS = 3, 40  # of refinements
+_FEW_STEPS, _MOST_STEPS = 10, 40  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
 
 
