@@ -26,7 +26,7 @@ from koopman_ros.core.declaration import (
     value_column,
 )
 from koopman_ros.core.plugins import short_name
-from koopman_ros.core.units import display_unit
+from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
@@ -279,7 +279,8 @@ class TrainerParameters:
                 'most_samples': self.training_samples,
                 'dead_time': {name: seconds for name, seconds in zip(
                     signals.inputs, self.dead_time.tolist(), strict=True) if seconds >= 0.0},
-                'characteristics': {name: one.characteristic for name, one in self.inputs.items()
+                'characteristics': {name: _in_unit(one.characteristic, signals.units[name])
+                                    for name, one in self.inputs.items()
                                     if one.characteristic != (0.0,)},
                 'input_matrix_degree': self.input_matrix_degree,
                 'disturbances': tuple(signals.disturbances),
@@ -290,6 +291,12 @@ class TrainerParameters:
                                       if name in map(short_name, self.identification_methods)},
                 'margin': self.acceptance_margin, 'condition': self.max_condition_number,
                 'executor': self.executor, 'device': self.device}
+
+
+def _in_unit(characteristic: tuple[float, ...], unit: str) -> tuple[float, ...]:
+    """Return a characteristic with its values in a unit, from that in which people read it."""
+    convert = conversion(display_unit(unit), unit)
+    return tuple(one if i % 2 else convert(one) for i, one in enumerate(characteristic))
 
 
 def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
