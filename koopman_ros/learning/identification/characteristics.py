@@ -33,7 +33,7 @@ from koopman_ros.learning.identification.output_error import (
 from koopman_ros.learning.identification.weak_form import weak_form
 from koopman_ros.model import Coordinates
 
-_POINTS, _FEW_POINTS = 11, 5  # of a characteristic, and of functions beside states
+_POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions beside states
 # A larger model must err less by so many standard errors of the difference.
 _SIGMAS = 2.0
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
