@@ -106,7 +106,7 @@ def _check(controller: Controller) -> None:
     tuning = controller.tuning
     for what, given, remedy in (
             ('a characteristic of an input', len(controller.model.inputs.characteristics),
-             'learn with <input>.characteristic: linear, and export the table with the valve'),
+             'invert it in the actuator, and learn a model of the linear input'),
             ('measured disturbances', len(controller.model.disturbances),
              'train a model without them'),
             ('safe_latch', tuning.safe_latch, 'set it to false'),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 import contextlib
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -66,9 +66,8 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
     other = _not_affine(found)
     return found if other is None else replace(
         found, alternatives=(other, *found.alternatives), warnings=(
-            *found.warnings, f'{", ".join(plant.input_names)}: a {other.form} explains the record '
-            'better, which no static characteristic does; if the model is rejected, use as input '
-            'the quantity that acts, or record a narrower range of the inputs'))
+            *found.warnings, f'a {other.form} explains the record better than static '
+            f'characteristics do: if the model is rejected, {NonAffineDrift.remedy}'))
 
 
 def _characteristic(found: Identified, name: str) -> Characteristic | None:
@@ -188,13 +187,16 @@ class NonAffineDrift(Drift):
 
     drift: DriftModel  #: of the inputs and functions of them
     functions: _Functions
+    #: of a law that does not control it
+    remedy: ClassVar[str] = ('use the quantity that acts as the input, or record a narrower range '
+                             'of the inputs')
 
     __repr__ = short_repr
 
     @property
     def form(self) -> str:
         """The kind of model, in words."""
-        return f'{self.drift.form}, not affine in the inputs'
+        return f'{self.drift.form}, not affine in {", ".join(self.functions.knots)}'
 
     @property
     def varying_input_matrix(self) -> bool:

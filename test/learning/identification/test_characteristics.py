@@ -10,9 +10,14 @@ import pytest
 
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.message_fields import place
+from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_with_characteristics
 from koopman_ros.learning.identification.characteristics import NonAffineDrift
+from koopman_ros.model import load
+from koopman_ros.records import read, RecordedInput, RecordedState
 from support.known_plants import methods
+from support.quick_retraining import quick_retraining
 
 PERIOD, SAMPLES, HOLD, NOISE = 0.2, 600, 6, 0.01
 PLANT = PlantDescription('tank', ('level',), ('m',), ('valve',), ('1',), 's', np.full(1, np.nan),
@@ -62,6 +67,27 @@ def test_a_linear_input_has_none(seed):
     assert (found.warnings, found.alternatives) == ((), ())
 
 
+@pytest.mark.parametrize('given', [{}, {'valve': [0.0, 0.0, 0.5, 0.25, 1.0, 1.0]}],
+                         ids=['found', 'given'])
+def test_the_model_file_has_it_and_the_free_run_uses_it(given, tmp_path):
+    episode = record(lambda x, u: -x + u * u, 0.0, 1.0)
+    task = TrainingTask(
+        (), str(tmp_path / 'model.safetensors'), '',
+        (RecordedState('level', 'm', place('level', 'level', 'm')),),
+        (RecordedInput('valve', '1', place('valve', 'valve', '1')),), model_class='linear',
+        dead_time={'valve': 0.0}, characteristics=given)
+    with quick_retraining(4, degrees=(1,)):
+        retrained = retrain(task, record=read({
+            'time [s]': episode.time, 'level [m]': episode.x[:, 0], 'valve [1]': episode.u[:, 0]},
+            'level', 'valve'))
+    assert retrained.accepted
+    model = load(retrained.model_file)
+    assert str(model.inputs.characteristics['valve']) in str(model)
+    assert len(model.inputs.characteristics['valve'].values) == (3 if given else 21)
+    assert retrained.summary()['characteristics'].keys() == {'valve'}
+    assert retrained.free_runs['record'].fit[0] > (90.0 if given else 98.0)
+
+
 def test_one_that_is_given_is_kept():
     episode = record(lambda x, u: -x + u * u, 0.0, 1.0)
     line = {'valve': Characteristic.of([0.0, 1.0], [0.0, 1.0])}
@@ -80,7 +106,7 @@ def test_a_drift_that_is_not_affine_in_the_input_competes():
         return -x + u - 0.8 * x * u * u
 
     found = identified(record(rate, -1.0, 1.0))
-    assert 'not affine' in found.warnings[-1]
+    assert 'not affine in valve' in found.warnings[-1]
     other = found.alternatives[0]
     assert isinstance(other, NonAffineDrift)
     x, u = (np.random.default_rng(0).uniform(-0.4, 0.4, (2, 50, 1)))
