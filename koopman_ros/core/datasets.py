@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 import hashlib
 import itertools
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array, frozen, real, short_repr
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.units import check_time_unit, named_units
 
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
@@ -45,6 +46,9 @@ class PlantDescription:
     #: inputs that are not manipulated: measured disturbances, with an effect that does not depend
     #: on the state
     disturbance_names: tuple[str, ...] = ()
+    #: static characteristics of inputs by name, none of an input that acts linearly; B is the gain
+    #: of their effects
+    characteristics: Mapping[str, Characteristic] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -57,9 +61,9 @@ class PlantDescription:
             if nominal.shape != (len(names),):
                 raise ValueError(f'incompatible nominal_{kind}: expected one number for each of '
                                  f'{list(names)}, got {nominal.tolist()}')
-            for field, value in ((f'{kind}_names', names), (f'{kind}_units', units),
+            for attribute, value in ((f'{kind}_names', names), (f'{kind}_units', units),
                                  (f'nominal_{kind}', nominal)):
-                object.__setattr__(self, field, value)
+                object.__setattr__(self, attribute, value)
         if unknown := [name for name in self.disturbance_names if name not in self.input_names]:
             raise ValueError(f'disturbance_names has {", ".join(unknown)}, must be some of the '
                              f'inputs {", ".join(self.input_names)}')

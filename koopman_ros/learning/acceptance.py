@@ -32,6 +32,7 @@ from koopman_ros.learning.identification import (
     longest_step,
     Stopped,
 )
+from koopman_ros.learning.identification.characteristics import NonAffineDrift
 from koopman_ros.learning.identification.drift import prediction_error, Segments
 from koopman_ros.learning.lift.metrics import lifted_rate, LiftMetrics
 from koopman_ros.learning.lift.training import Trained
@@ -192,10 +193,10 @@ def _displaced(drift: Drift, inputs: Array, offset: Array, x: Array, u: Array) -
     return drift.rate(x, u + inputs) + offset
 
 
-def uncontrolled(drift: str, check: ClosedLoopTest) -> str:
+def uncontrolled(drift: str, check: ClosedLoopTest, remedy: str = (
+        'set model_class to best, or record more in that range')) -> str:
     """Say that a law does not control a drift, and what to try."""
-    return (f'its law does not control {drift}: {check}; set model_class to best, or record more '
-            'in that range')
+    return f'its law does not control {drift}: {check}; {remedy}'
 
 
 @dataclass(frozen=True)
@@ -257,6 +258,8 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
         reasons = (*filter(None, [beside]), *reasons)
     further = () if reasons else held_out.further_checks(model, loops, watch, backend)
     reasons = (*reasons, *dict.fromkeys(
+        uncontrolled(f'a {drift.form} that explains the record better{words}', check,
+                     drift.remedy) if isinstance(drift, NonAffineDrift) else
         uncontrolled(f'a {drift.form} that explains the record equally well{words}', check)
         for drift, check, words in further if check.loops and not check.accepted))
     points = operating_points(model, np.vstack([

@@ -139,6 +139,7 @@ def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescrip
     drift = found.drift
     return replace(plant, state_names=states.names, state_units=states.units,
                    nominal_state=x, nominal_input=u, input_matrix_degree=0,
+                   characteristics=drift.box.inputs.characteristics,
                    B=drift.input_matrix_at if drift.varying_input_matrix else (
                        drift.input_matrix)), samples
 

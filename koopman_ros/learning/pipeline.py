@@ -38,9 +38,9 @@ from koopman_ros.learning.identification import (
     find_lags,
     IdentificationMethod,
     Identified,
-    identify,
     identify_structure,
     identify_unmeasured,
+    identify_with_characteristics,
     lagged,
     LaggedDrift,
     methods_of,
@@ -170,6 +170,8 @@ class Retrained:
             'noise': by_state(self.found.noise),
             'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
             'lag': dict(zip(inputs.names, self.lag.tolist(), strict=True)),
+            'characteristics': {name: [one.values.tolist(), one.effects.tolist()]
+                                for name, one in inputs.characteristics.items()},
             'constants': {one.name: {
                 'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
@@ -271,7 +273,9 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                         watch=lambda: progress.estimating(0, 1, 'lag'))
         dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
     episodes = _behind(_delayed(episodes, dead_time / seconds), lag)
-    found = _estimate(task, plant, episodes, methods, progress, backend)
+    # behind a lag no characteristic is sought
+    found = _estimate(task, plant, episodes, methods, progress, backend,
+                      plant.input_names if lag.any() else tuple(task.characteristics))
     found = replace(found, dead_time=found.dead_time + dead_time / seconds,
                     disturbances=plant.disturbance_names)
     if lag.any():
@@ -497,20 +501,27 @@ class _Progress:
 
 
 def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episode],
-              methods: Mapping[str, IdentificationMethod], progress: _Progress,
-              backend: Backend) -> Identified:
-    """Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations."""
+              methods: Mapping[str, IdentificationMethod], progress: _Progress, backend: Backend,
+              linear: tuple[str, ...]) -> Identified:
+    """
+    Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations.
+
+    :param linear: inputs of which no characteristic is sought.
+    """
     seed, watch = task.seed, progress.estimating
     if task.physical_model:
         return estimate_parameters(plant, episodes, plant_class(task.physical_model),
                                    task.constants, seed=seed, watch=watch)
     if task.unmeasured_states < 0 and not task.model:
-        return identify_structure(plant, episodes, methods=methods, seed=seed, watch=watch,
-                                  backend=backend, dead_times=not task.dead_time)
+        return identify_structure(plant, episodes, given=linear, methods=methods,
+                                  seed=seed, watch=watch, backend=backend,
+                                  dead_times=not task.dead_time)
     if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
                                    watch=watch, backend=backend, dead_times=not task.dead_time)
-    return identify(plant, episodes, methods=methods, seed=seed, watch=watch, backend=backend)
+    return identify_with_characteristics(
+        plant, episodes, given=linear, methods=methods, seed=seed, watch=watch,
+        backend=backend)
 
 
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
@@ -52,13 +53,16 @@ class TrainingTask:
     input_matrix_degree: int = 0
     #: dead time of inputs by name, in s; of those not named it is found from the record
     dead_time: Mapping[str, float] = field(default_factory=dict)
+    #: static characteristics of inputs by name, as values and effects in turn, in any unit of the
+    #: effect; the ends of a line where it acts linearly; of those not named it is found
+    characteristics: Mapping[str, Sequence[float]] = field(default_factory=dict)
     #: time constant with which inputs follow their commands, by name, in s: 0 for none, -1 to find
     #: it from a record of all states; the applied input is a state of the model
     lag: Mapping[str, float] = field(default_factory=dict)
     #: those of the inputs that are measured and not manipulated; they have no dead time and no lag
     disturbances: tuple[str, ...] = ()
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
-    #: not compared with the present one, which has other states. -1: as many as free runs of the
+    #: not compared with the current one, which has other states. -1: as many as free runs of the
     #: record need, see :func:`identify_structure`; none if there is a current model
     unmeasured_states: int = 0
     #: class of a plant whose equations are fitted, as :func:`koopman_ros.plants.plant_class` takes
@@ -107,6 +111,9 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     if task.physical_model and (task.unmeasured_states > 0 or task.input_gain):
         raise ValueError(f'physical_model = {task.physical_model!r} defines the states and the '
                          'effect of the inputs: set unmeasured_states to 0 and give no input_gain')
+    if task.physical_model and task.characteristics:
+        raise ValueError(f'characteristics name {", ".join(task.characteristics)}, but '
+                         f'physical_model = {task.physical_model!r} defines how inputs act')
     if task.constants and not task.physical_model:
         raise ValueError(f'constants name {", ".join(task.constants)}, but no physical_model is '
                          'given')
@@ -129,7 +136,9 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     inputs = [replace(one, measured=None) if task.lag.get(one.name) else one for one in inputs]
     return replace(plant, B=_known_gain(task, plant),
                    input_matrix_degree=task.input_matrix_degree,
-                   disturbance_names=task.disturbances), states, inputs
+                   disturbance_names=task.disturbances, characteristics={} if (
+                       task.physical_model) else {
+                       **plant.characteristics, **_characteristics(task, plant)}), states, inputs
 
 
 _Signal = TypeVar('_Signal', RecordedState, RecordedInput)
@@ -158,6 +167,18 @@ def _unknown(task: TrainingTask) -> PlantDescription:
                             tuple(signal.name for signal in inputs),
                             tuple(signal.unit for signal in inputs), 's',
                             np.full(len(states), np.nan), np.full(len(inputs), np.nan), None)
+
+
+def _characteristics(task: TrainingTask, plant: PlantDescription) -> dict[str, Characteristic]:
+    if unknown := ', '.join(name for name in task.characteristics
+                            if name not in plant.input_names):
+        raise ValueError(f'characteristics name {unknown}: the inputs are '
+                         f'{", ".join(plant.input_names)}')
+    if both := ', '.join(name for name in task.characteristics if task.lag.get(name)):
+        raise ValueError(f'lag and characteristic are both given of {both}: give one of them, the '
+                         'one with the larger effect')
+    return {name: Characteristic.of(points[::2], points[1::2])
+            for name, points in task.characteristics.items()}
 
 
 def _known_gain(task: TrainingTask, plant: PlantDescription) -> Array | None:

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, frozen, real, short_repr
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import quantity_text
 
@@ -23,9 +24,10 @@ class Coordinates:
     """
     Names, units, scaling and training box of the states or of the inputs.
 
-    A physical value v maps to the deviation (v - center) / scale that the lift sees.
+    A physical value v maps to the deviation (v - center) / scale that the lift sees; an input with
+    a static characteristic g to (g(v) - g(center)) / scale.
 
-    :raises ValueError: on inconsistent sizes, a scale that is not positive or an empty box.
+    :raises ValueError: on inconsistent sizes, a scale that is not positive, or an empty box.
     """
 
     names: tuple[str, ...]  #: one name a coordinate, e.g. ``('temperature',)``
@@ -34,6 +36,8 @@ class Coordinates:
     scale: Array  #: (n,) positive, in units
     lower: Array  #: (n,) lower corner of the training box, in units
     upper: Array  #: (n,) upper corner of the training box, in units
+    #: static characteristics by name, none of a signal that acts linearly
+    characteristics: Mapping[str, Characteristic] = field(default_factory=dict, kw_only=True)
 
     __repr__ = short_repr
 
@@ -48,6 +52,9 @@ class Coordinates:
         if np.any(self.lower >= self.upper):
             raise ValueError(
                 f'the box is empty: lower {self.lower.tolist()}, upper {self.upper.tolist()}')
+        object.__setattr__(self, 'characteristics', {
+            name: self.characteristics[name] for name in self.names
+            if name in self.characteristics})
 
     @classmethod
     def spanning(cls, names: tuple[str, ...], units: tuple[str, ...], lower: Array, upper: Array,
@@ -88,13 +95,15 @@ class Coordinates:
                              f'{", ".join(self.names)}')
         chosen = [self.names.index(name) for name in names]
         return Coordinates(tuple(names), tuple(self.units[i] for i in chosen), *(
-            value[chosen] for value in (self.center, self.scale, self.lower, self.upper)))
+            value[chosen] for value in (self.center, self.scale, self.lower, self.upper)),
+            characteristics=self.characteristics)
 
     def followed_by(self, others: Coordinates) -> Coordinates:
         """Return these coordinates, and after them others."""
         return Coordinates(self.names + others.names, self.units + others.units, *(
             np.concatenate([getattr(self, name), getattr(others, name)])
-            for name in ('center', 'scale', 'lower', 'upper')))
+            for name in ('center', 'scale', 'lower', 'upper')),
+            characteristics={**self.characteristics, **others.characteristics})
 
     def text(self, values: Array, number_format: str = '.6g') -> str:
         """Write values (n,) with names and units, e.g. 'temperature 46.5 degC, level 2 m'."""
@@ -104,11 +113,34 @@ class Coordinates:
 
     def to_deviation(self, value: Array) -> Array:
         """Map physical values (..., n) to scaled deviations (..., n)."""
+        if self.characteristics:
+            return (self._effects(value) - self._effects(self.center)) / self.scale
         return (value - self.center) / self.scale
 
     def to_physical(self, deviation: Array) -> Array:
         """Map scaled deviations (..., n) to physical values (..., n)."""
+        if self.characteristics:
+            effects = self._effects(self.center) + deviation * self.scale
+            return self._mapped(effects, Characteristic.value)
         return self.center + deviation * self.scale
+
+    def slope(self, value: Array) -> Array:
+        """Return the slope (..., n) of the characteristics at physical values (..., n)."""
+        found = np.ones_like(value)
+        for name, one in self.characteristics.items():
+            j = self.names.index(name)
+            found[..., j] = one.slope(value[..., j])
+        return found
+
+    def _mapped(self, value: Array, by: Callable[[Characteristic, Array], Array]) -> Array:
+        mapped = np.array(value)
+        for name, one in self.characteristics.items():
+            j = self.names.index(name)
+            mapped[..., j] = by(one, value[..., j])
+        return mapped
+
+    def _effects(self, value: Array) -> Array:
+        return self._mapped(value, Characteristic.effect)
 
     def violation(self, value: Array) -> float:
         """
@@ -167,6 +199,7 @@ class Box:
             for names, units, center, values in (
                 (plant.state_names, plant.state_units, plant.nominal_state, x),
                 (plant.input_names, plant.input_units, plant.nominal_input, u)))
+        inputs = replace(inputs, characteristics=plant.characteristics)
         return Box(states, inputs, plant.time_unit)
 
     def input_matrix(self, B: Array) -> Array:

@@ -146,6 +146,8 @@ class LiftedModel:
         lines += [f'{what} of {name}: {seconds:.6g} s' for what, values in (
             ('dead time', self.dead_time), ('lag', self.lag)) for name, seconds in zip(
                 self.inputs.names, values.tolist(), strict=True) if seconds > 0.0]
+        lines += [f'characteristic of {name}: {one}'
+                  for name, one in self.inputs.characteristics.items()]
         rates = self.eigenvalues.real
         lines += [f'rates of A: {rates[-1]:.4g} to {rates[0]:.4g} per {self.time_unit}',
                   *(f'{title[0].lower()}{title[1:]}: {value:.3g}'
@@ -249,7 +251,8 @@ class LiftedModel:
         return PlantDescription(self.provenance.plant, self.states.names, self.states.units,
                                 self.inputs.names, self.inputs.units, self.time_unit,
                                 self.states.center,
-                                self.inputs.center, None, self.input_matrix_degree)
+                                self.inputs.center, None, self.input_matrix_degree,
+                                characteristics=self.inputs.characteristics)
 
     @cached_property
     def seconds_per_time_unit(self) -> float:

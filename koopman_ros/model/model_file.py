@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 import safetensors.numpy
 
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.paths import write_atomically
 from koopman_ros.core.units import check_unit
 from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
@@ -40,6 +41,7 @@ _MAX_NAME = 100  # characters; a SHA-256 in hexadecimal has 64
 _MAX_SENTENCE = 4000
 _MAX_SEED = 1 << 128  # numpy's own seeds have up to 128 bits
 _MAX_ENTRIES = 100  # metrics, or reasons
+_COORDINATES = ('names', 'units', 'center', 'scale', 'lower', 'upper')
 _MAX_REASON = 300  # characters of a refusal, which may quote the file
 
 Tensors = dict[str, NDArray[Any]]
@@ -160,8 +162,13 @@ def _description(model: LiftedModel) -> dict[str, Any]:
     return about
 
 
-def _signals(signals: Coordinates) -> dict[str, list[Any]]:
-    return {one.name: np.asarray(getattr(signals, one.name)).tolist() for one in fields(signals)}
+def _signals(signals: Coordinates) -> dict[str, Any]:
+    about: dict[str, Any] = {name: np.asarray(getattr(signals, name)).tolist()
+                             for name in _COORDINATES}
+    if signals.characteristics:
+        about['characteristics'] = {name: [one.values.tolist(), one.effects.tolist()]
+                                    for name, one in signals.characteristics.items()}
+    return about
 
 
 def _tensors(model: LiftedModel) -> Tensors:
@@ -266,9 +273,11 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
 
 
 def _coordinates(about: dict[str, Any]) -> Coordinates:
-    names, units, *values = (_of_type(list, about, one.name) for one in fields(Coordinates))
+    names, units, *values = (_of_type(list, about, name) for name in _COORDINATES)
     return Coordinates(tuple(names), tuple(units), *(
-        np.array(value, dtype=np.float64) for value in values))
+        np.array(value, dtype=np.float64) for value in values), characteristics={
+            name: Characteristic(*(np.array(one, dtype=np.float64) for one in points))
+            for name, points in about.get('characteristics', {}).items()})
 
 
 def _of_type(kind: type, about: dict[str, Any], name: str) -> Any:

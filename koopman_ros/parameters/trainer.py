@@ -14,6 +14,7 @@ import numpy as np
 
 from koopman_ros.control.experiment import Experiment
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.declaration import (
     column,
     NO_LOWER,
@@ -25,7 +26,7 @@ from koopman_ros.core.declaration import (
     value_column,
 )
 from koopman_ros.core.plugins import short_name
-from koopman_ros.core.units import display_unit
+from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.execution import executor_refusal
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
@@ -55,6 +56,16 @@ from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
 FIRST = 'first'  # as `warm_start_model`, the first plant of a fleet whose lift is accepted
+
+
+@dataclass(frozen=True)
+class TrainedInput(InputPlaces):
+    """The same with its static characteristic."""
+
+    characteristic: tuple[float, ...] = parameter(
+        (0.0,), 'Static characteristic: values of the input and their effects in turn, e.g. [0, '
+        '0, 50, 20, 100, 100]; the effects may have any unit; two points: linear; a single 0: '
+        'found from the record.')
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +207,7 @@ class TrainerParameters:
         'states', 0.0, 'Lowest set-point of an experiment on set-points.')
     setpoint_max: Array = value_column(
         'states', 0.0, 'Highest set-point of an experiment on set-points.')
-    inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    inputs: Mapping[str, TrainedInput] = per_signal(TrainedInput)
     disturbances: Mapping[str, MeasuredPlace] = per_signal(MeasuredPlace)
     experiment_min: Array = value_column('inputs', 0.0, 'Lowest value of a step.')
     experiment_max: Array = value_column('inputs', 0.0, 'Highest value of a step.')
@@ -274,6 +285,9 @@ class TrainerParameters:
                     signals.inputs, self.dead_time.tolist(), strict=True) if seconds >= 0.0},
                 'lag': {name: seconds for name, seconds in zip(
                     signals.inputs, self.lag.tolist(), strict=True) if seconds},
+                'characteristics': {name: _in_unit(one.characteristic, signals.units[name])
+                                    for name, one in self.inputs.items()
+                                    if one.characteristic != (0.0,)},
                 'input_matrix_degree': self.input_matrix_degree,
                 'disturbances': tuple(signals.disturbances),
                 'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
@@ -283,6 +297,12 @@ class TrainerParameters:
                                       if name in map(short_name, self.identification_methods)},
                 'margin': self.acceptance_margin, 'condition': self.max_condition_number,
                 'executor': self.executor, 'device': self.device}
+
+
+def _in_unit(characteristic: tuple[float, ...], unit: str) -> tuple[float, ...]:
+    """Return a characteristic with its values in a unit, from that in which people read it."""
+    convert = conversion(display_unit(unit), unit)
+    return tuple(one if i % 2 else convert(one) for i, one in enumerate(characteristic))
 
 
 def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
@@ -400,6 +420,12 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.physical_model and values.input_matrix != (0.0,):
         return ('input_matrix must be a single 0 if physical_model is set, which defines the '
                 'effect of the inputs')
+    for name, one in values.inputs.items():
+        if one.characteristic != (0.0,):
+            try:
+                Characteristic.of(one.characteristic[::2], one.characteristic[1::2])
+            except ValueError as error:
+                return f'{name}.characteristic = {list(one.characteristic)}: {error}'
     return (refused(values.physical_model, values.estimated_constants)
             or SignalTopics.of(signals, values).check())
 

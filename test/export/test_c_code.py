@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Controller
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.paths import model_path
 from koopman_ros.export import c_code, ExportError
 from koopman_ros.export.command_line import main
@@ -116,6 +117,11 @@ def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
     with pytest.raises(ExportError, match='acados'):
         c_code(Controller(controller.model, replace(
             controller.tuning, fallback_order=('mpc', 'sdre'))), 1.0)
+    inputs = controller.model.inputs
+    curved = replace(controller.model, inputs=replace(inputs, characteristics={
+        inputs.names[0]: Characteristic.of([inputs.lower[0], 290.0, inputs.upper[0]], [0, 1, 3])}))
+    with pytest.raises(ExportError, match='characteristic'):
+        c_code(Controller(curved, controller.tuning), 1.0)
     powers = PolynomialObservables(np.array([[1], [11]]))
     model = replace(controller.model, observables=powers, A=-np.eye(2))
     with pytest.raises(ExportError, match='degree 11'):

@@ -71,7 +71,8 @@ def accepted(bag, tmp_path_factory):
 @pytest.fixture
 def estimated(accepted, monkeypatch):
     """Let a retraining go on from what the accepted one has estimated."""
-    monkeypatch.setattr(task_module, 'identify', lambda *_, **__: accepted[0].found)
+    monkeypatch.setattr(
+        task_module, 'identify_with_characteristics', lambda *_, **__: accepted[0].found)
 
 
 @pytest.fixture
@@ -165,7 +166,7 @@ def test_models_of_alternative_drifts_are_kept_beside_the_model(
         bag, accepted, tmp_path, monkeypatch):
     """That of a training before goes."""
     drift = accepted[0].found.drift
-    monkeypatch.setattr(task_module, 'identify', lambda *_, **__: replace(
+    monkeypatch.setattr(task_module, 'identify_with_characteristics', lambda *_, **__: replace(
         accepted[0].found, alternatives=(
             TransformedDrift(drift.box, drift, np.eye(1), np.zeros(1)),
             replace(drift, coefficients=1.02 * drift.coefficients))))

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.model import (
     InputTerms,
     linearised_model,
@@ -66,6 +67,8 @@ MODELS = {
     'untrained': with_origin(seed=None, metrics={}),
     'dead time': replace(random_lift(n_u=2), dead_time=np.array([0.0, 12.3])),
     'disturbances': random_lift(n_u=3).with_disturbances(('u2', 'u0')),
+    'characteristic': replace(PLAIN, inputs=replace(PLAIN.inputs, characteristics={
+        PLAIN.inputs.names[0]: Characteristic.of([-1.0, 0.1, 2.0], [0.0, 0.7, 1.0])})),
     'largest': random_lift(32, 32, identity=False, n_free=32, n_u=32),
     'linear': linearised_model(np.diag([-1.0, -2.0]), np.ones((2, 1)), PLAIN.states,
                                PLAIN.inputs, 's', PLAIN.provenance),

@@ -340,6 +340,7 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
         ({'physical_model': 'quadruple_tank'},
          'marks no constants as estimated'),
         ({'estimated_constants': ['volume']}, 'estimated_constants names volume, but there'),
+        ({'coolant_temperature.characteristic': [10.0, 1.0, 20.0, 0.0]}, 'do not fall'),
         ({'physical_model': 'two_state', 'unmeasured_states': 1},
          'unmeasured_states is 1, must be 0'),
         ({'physical_model': 'two_state', 'input_matrix': [2.0]},
@@ -381,6 +382,15 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
     for given, words in (('spin [1]', 'not a constant of reactor'), ('volume [K]', 'volume: ')):
         with pytest.raises(ConfigurationError, match=words):
             PlantTable({**named, 'disturbances_measured': (given,)})
+
+
+def test_a_characteristic_comes_into_the_task_in_the_unit_of_the_model() -> None:
+    table = trainer_table(load(model_path(reactor.MODEL)))
+    signals = trainer_signals(load(model_path(reactor.MODEL)), {})
+    assert table.snapshot({}).training(signals)['characteristics'] == {}
+    values = table.snapshot({'coolant_temperature.characteristic': [10.0, 0.0, 20.0, 1.0]})
+    assert values.training(signals)['characteristics']['coolant_temperature'] == pytest.approx(
+        (283.15, 0.0, 293.15, 1.0))
 
 
 def test_equations_of_a_trainer_are_those_of_its_task() -> None:

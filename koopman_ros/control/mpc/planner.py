@@ -120,8 +120,10 @@ class Planner:
         if later is not None:
             grid = grid.with_nodes(after)
         begins = np.searchsorted(grid.times, after - 1e-6 * grid.sample)
-        change = grid.since_change * self._rate
-        change[begins, np.arange(model.n_u)] = grid.sample * self._rate
+        rates = self._rate * model.inputs.slope(
+            model.inputs.center if previous is None else previous)
+        change = grid.since_change * rates
+        change[begins, np.arange(model.n_u)] = grid.sample * rates
         # B(x) changes the slope with the input
         end = target.after(float(grid.times[-1]) * model.seconds_per_time_unit)
         fastest, terminal = self._cost_to_go(

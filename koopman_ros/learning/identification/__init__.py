@@ -14,6 +14,7 @@ from koopman_ros.learning.identification.base import (
     DriftProblem,
     IdentificationMethod,
 )
+from koopman_ros.learning.identification.characteristics import identify_with_characteristics
 from koopman_ros.learning.identification.dead_time import DeadTimes, find_dead_times
 from koopman_ros.learning.identification.drift import (
     box_of,
@@ -72,6 +73,7 @@ __all__ = [
     'identify',
     'identify_structure',
     'identify_unmeasured',
+    'identify_with_characteristics',
     'lagged',
     'longest_step',
     'methods_of',

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 import itertools
 import time
@@ -16,6 +16,7 @@ from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.identification.alternatives import in_coordinates_of
 from koopman_ros.learning.identification.base import IdentificationMethod
+from koopman_ros.learning.identification.characteristics import identify_with_characteristics
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.dead_time import (
     LinearModels,
@@ -39,7 +40,6 @@ from koopman_ros.learning.identification.episode_offsets import (
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
-    identify,
     Stopped,
     usual_degrees,
     Watch,
@@ -77,31 +77,34 @@ _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is
 
 
 def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
+                       given: Collection[str] = (),
                        methods: Mapping[str, IdentificationMethod] | None = None,
                        dead_times: bool = True, seed: int = 0, watch: Watch = lambda *_: False,
                        backend: Backend | None = None) -> Identified:
     """
     Estimate a drift with as many states as free runs of the record need.
 
-    An estimate of measured states by :func:`identify` is kept if its simulations of the whole
-    record err by little more than noise. Otherwise B(x) of degree 1 is tried, which is taken where
-    free runs of the segments held out err less by more than two standard errors. If the
-    simulations then err by more than noise and than 1 % of the motion, the estimate competes with
-    those of :func:`identify_unmeasured`.
+    An estimate of measured states by :func:`identify_with_characteristics` is kept if its
+    simulations of the whole record err by little more than noise. Otherwise B(x) of degree 1 is
+    tried, which is taken where free runs of the segments held out err less by more than two
+    standard errors. If the simulations then err by more than noise and than 1 % of the motion, the
+    estimate competes with those of :func:`identify_unmeasured`.
 
+    :param given: inputs whose characteristic the plant has already.
     :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
     """
-    def estimate(plant: PlantDescription, before: int) -> Identified:
-        return identify(
-            plant, episodes, methods=methods, seed=seed, backend=backend,
+    def estimate(plant: PlantDescription, given: Collection[str], before: int) -> Identified:
+        return identify_with_characteristics(
+            plant, episodes, given=given, methods=methods, seed=seed, backend=backend,
             watch=lambda done, total, text: watch(before * total + done, 5 * total, text))
 
-    measured = estimate(plant, 0)
+    measured = estimate(plant, given, 0)
+    plant = replace(plant, characteristics=measured.drift.box.inputs.characteristics)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes, 0.0):
         return measured
     if plant.B is None and not plant.disturbance_names:
-        varying = estimate(replace(plant, input_matrix_degree=1), 1)
+        varying = estimate(replace(plant, input_matrix_degree=1), plant.input_names, 1)
         better, words = compared(_held_out_errors(varying), _held_out_errors(measured))
         steps = measured.drift.form, f'{varying.drift.form}: {words}'
         measured = replace(varying if better else measured, linear=measured.linear, steps=steps,

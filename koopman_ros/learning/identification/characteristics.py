@@ -1,0 +1,220 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Static characteristics of inputs, found from a record, and drifts that are not affine in u."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+import contextlib
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.characteristic import Characteristic
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
+from koopman_ros.identification_methods import WeakFormParameters
+from koopman_ros.learning.identification.drift import (
+    Drift,
+    DriftModel,
+    longest_step,
+    prediction_error,
+    Segments,
+)
+from koopman_ros.learning.identification.identify import Identified, identify
+from koopman_ros.learning.identification.innovations_form import SETTLING
+from koopman_ros.learning.identification.output_error import (
+    innovations_form,
+    PolynomialCoefficients,
+    Refined,
+)
+from koopman_ros.learning.identification.weak_form import weak_form
+from koopman_ros.model import Coordinates
+
+_POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions beside states
+# A larger model must err less by so many standard errors of the difference.
+_SIGMAS = 2.0
+_SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
+_FEW_STEPS, _MOST_STEPS = 10, 40  # of refinements
+_FALL = 0.1  # share of the range by which the effect of no characteristic falls
+
+
+def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Episode], *,
+                                  given: Collection[str] = (), **options: Any) -> Identified:
+    """
+    Estimate a drift as :func:`identify`, with a characteristic of each input that needs one.
+
+    Functions of an input are added to the drift as further inputs, piecewise linear between the
+    quantiles of the record. They are kept if they lower the errors at samples that are left out of
+    the fit by more than two standard errors; the part that all states have in common is the
+    characteristic. At last products of such functions and states are tried in the same way. A
+    drift with them is not affine in the inputs, and competes as an alternative.
+
+    :param plant: see :func:`identify`, like the options. Where it knows B nothing is tried.
+    :param given: inputs whose characteristic the plant has already.
+    :raises ValueError: for an input whose effect rises and falls.
+    """
+    found = identify(plant, episodes, **options)
+    if plant.B is not None:
+        return found
+    for name in plant.input_names:
+        if name not in given and (one := _characteristic(found, name)) is not None:
+            plant = replace(plant, characteristics={**plant.characteristics, name: one})
+            found = identify(plant, episodes, **options)
+    other = _not_affine(found)
+    return found if other is None else replace(
+        found, alternatives=(other, *found.alternatives), warnings=(
+            *found.warnings, f'a {other.form} explains the record better than static '
+            f'characteristics do: if the model is rejected, {NonAffineDrift.remedy}'))
+
+
+def _characteristic(found: Identified, name: str) -> Characteristic | None:
+    """Return the characteristic of an input; None where the record does not need one."""
+    drift, inputs = found.drift, found.drift.box.inputs
+    assert isinstance(drift, DriftModel)
+    functions = _Functions.of(found, (name,), _POINTS)
+    better = functions and _better(found, functions, drift)
+    if not functions or not better:
+        return None
+    u = functions.knots[name]
+    v = np.tile(inputs.center, (len(u), 1))
+    v[:, inputs.names.index(name)] = u
+    effects = better.box.inputs.to_deviation(functions.beside(v)) @ (
+        better.scaled_input_matrix(np.zeros(len(drift.box.states))).T)
+    # the part that all states have in common
+    effects -= effects[0]
+    g = effects @ np.linalg.svd(effects)[2][0]
+    g /= g[-1] if abs(g[-1]) > _FALL * np.max(np.abs(g)) else np.max(np.abs(g))
+    if np.max(np.maximum.accumulate(g) - g) > _FALL:
+        raise ValueError(
+            f'the effect of {name} rises and falls between {u[0]:.6g} and {u[-1]:.6g} '
+            f'{inputs.units[inputs.names.index(name)]}, so that no control law can invert it: '
+            'record a range in which it only rises or only falls')
+    one = Characteristic.of(u, np.maximum.accumulate(g))
+    change = one.effects - inputs.characteristics.get(name, Characteristic.of(
+        u[[0, -1]], u[[0, -1]])).effect(u)
+    return one if np.max(np.abs(change)) > _SLIGHT * (u[-1] - u[0]) else None
+
+
+def _not_affine(found: Identified) -> NonAffineDrift | None:
+    """Return a drift with products of states and functions of the inputs, if it is better."""
+    drift = found.drift
+    assert isinstance(drift, DriftModel)
+    functions = _Functions.of(found, drift.box.inputs.names, _FEW_POINTS)
+    products = drift if drift.varying_input_matrix else replace(drift, B=np.hstack(
+        [drift.B] + [0.0 * drift.B] * len(drift.box.states)))
+    better = functions and _better(found, functions, products)
+    return NonAffineDrift(drift.box, better, functions) if functions and better else None
+
+
+@dataclass(frozen=True)
+class _Functions:
+    """Functions of inputs that are linear between knots, as further inputs."""
+
+    names: tuple[str, ...]  #: of all inputs
+    knots: dict[str, Array]
+
+    @classmethod
+    def of(cls, found: Identified, names: Sequence[str], count: int) -> _Functions | None:
+        """Return those of some inputs, with knots at quantiles; None for inputs of two levels."""
+        inputs = found.drift.box.inputs
+        u = np.concatenate([one.inputs_at(one.time) for one in (*found.fitted, *found.held_out)])
+        knots = {name: np.unique(np.quantile(u[:, inputs.names.index(name)], np.linspace(
+            0.0, 1.0, count))) for name in names}
+        knots = {name: own for name, own in knots.items() if len(own) > 2}
+        return cls(inputs.names, knots) if knots else None
+
+    def beside(self, u: Array) -> Array:
+        """Return inputs (..., n_u) with the functions of them."""
+        more = [np.interp(u[..., self.names.index(name)], own, row)
+                for name, own in self.knots.items() for row in np.eye(len(own))[1:-1]]
+        return np.concatenate((u, np.stack(more, axis=-1)), axis=-1)
+
+    def after(self, inputs: Coordinates) -> Coordinates:
+        """Return the coordinates of the inputs and the functions of them."""
+        count = sum(len(own) - 2 for own in self.knots.values())
+        return inputs.followed_by(Coordinates.spanning(
+            tuple(f'function {k}' for k in range(count)), ('1',) * count, np.zeros(count),
+            np.ones(count)))
+
+
+def _better(found: Identified, functions: _Functions, drift: DriftModel) -> DriftModel | None:
+    """Return a drift with functions of inputs added; None if it does not err less."""
+    episodes, step = [*found.fitted, *found.held_out], longest_step(found.fitted)
+    more = [replace(one, u=functions.beside(one.u), linear=()) for one in episodes]
+    box = replace(drift.box, inputs=functions.after(drift.box.inputs))
+    n_x, n_u = len(box.states), len(drift.box.inputs)
+    blocks = drift.B.reshape(n_x, -1, n_u)
+    start = replace(drift, box=box, B=np.pad(
+        blocks, ((0, 0), (0, 0), (0, len(box.inputs) - n_u))).reshape(n_x, -1))
+    segments = Segments.of(more, step)
+    without = _refined(drift, Segments.of(episodes, step)).left_out(SETTLING)
+
+    def gains(one: Refined[PolynomialCoefficients]) -> bool:
+        gain = np.array([np.mean(block) for block in np.array_split(
+            (without ** 2 - one.left_out(SETTLING) ** 2) / np.mean(without ** 2, axis=0),
+            max(2, len(without) // SETTLING))])
+        return bool(np.mean(gain) > _SIGMAS * np.std(gain) / np.sqrt(len(gain)))
+
+    # without a need for them nothing is left to gain after a few steps
+    if not gains(_refined(start, segments, _FEW_STEPS)):
+        return None
+    starts = [start]
+    with contextlib.suppress(ValueError, np.linalg.LinAlgError):
+        # free of what the drift without them took for the effect of states
+        starts += [weak_form([replace(one, x=one.interpolated()) for one in more], box,
+                             drift.degree, None, int(window), drift.input_degree)
+                   for window in WeakFormParameters().windows]
+    better = _refined(min(starts, key=lambda one: float(np.sum((prediction_error(
+        one.rate, segments, box.states.scale) / box.states.scale) ** 2))), segments)
+    return better.model.drift if gains(better) else None
+
+
+def _refined(drift: DriftModel, segments: Segments, steps: int = _MOST_STEPS
+             ) -> Refined[PolynomialCoefficients]:
+    states = drift.box.states
+    return innovations_form(
+        PolynomialCoefficients(drift, learn_input_matrix=True), np.zeros((len(states),) * 2),
+        segments, states.to_deviation(segments.x[0]), np.ones(len(states)), smooth=True,
+        iterations=steps)
+
+
+@dataclass(frozen=True)
+class NonAffineDrift(Drift):
+    """A drift that is not affine in its inputs."""
+
+    drift: DriftModel  #: of the inputs and functions of them
+    functions: _Functions
+    #: of a law that does not control it
+    remedy: ClassVar[str] = ('use the quantity that acts as the input, or record a narrower range '
+                             'of the inputs')
+
+    __repr__ = short_repr
+
+    @property
+    def form(self) -> str:
+        """The kind of model, in words."""
+        return f'{self.drift.form}, not affine in {", ".join(self.functions.knots)}'
+
+    @property
+    def varying_input_matrix(self) -> bool:
+        """Whether B depends on the state."""
+        return True
+
+    def _with_functions(self, v: Array) -> Array:
+        return self.drift.box.inputs.to_deviation(
+            self.functions.beside(self.box.inputs.to_physical(v)))
+
+    def scaled_rate(self, xi: Array, v: Array) -> Array:
+        """Evaluate the rate in deviations; see :class:`Drift`."""
+        return self.drift.scaled_rate(xi, self._with_functions(v))
+
+    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
+        """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
+        return self.drift.scaled_slope(xi, None if v is None else self._with_functions(v))
+
+    def scaled_input_matrix(self, xi: Array) -> Array:
+        """Evaluate the part of B(x) that is linear in the inputs; see :class:`Drift`."""
+        return self.drift.scaled_input_matrix(xi)[..., :len(self.box.inputs)]

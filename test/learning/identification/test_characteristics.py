@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Characteristics of inputs that records show, and drifts that are not affine in the inputs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from koopman_ros.core.characteristic import Characteristic
+from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.message_fields import place
+from koopman_ros.learning import retrain, TrainingTask
+from koopman_ros.learning.identification import identify_with_characteristics
+from koopman_ros.learning.identification.characteristics import NonAffineDrift
+from koopman_ros.model import load
+from koopman_ros.records import read, RecordedInput, RecordedState
+from support.known_plants import methods
+from support.quick_retraining import quick_retraining
+
+PERIOD, SAMPLES, HOLD, NOISE = 0.2, 600, 6, 0.01
+PLANT = PlantDescription('tank', ('level',), ('m',), ('valve',), ('1',), 's', np.full(1, np.nan),
+                         np.full(1, np.nan), None)
+
+
+def record(rate, low, high, seed=0):
+    """Return a noisy record of dx/dt = rate(x, u) under random steps of u."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(low, high, SAMPLES // HOLD), HOLD)
+    x = np.zeros(SAMPLES)
+    for k in range(SAMPLES - 1):
+        x[k + 1] = x[k]
+        for _ in range(20):
+            middle = x[k + 1] + 0.005 * rate(x[k + 1], u[k])
+            x[k + 1] += 0.01 * rate(middle, u[k])
+    time = PERIOD * np.arange(SAMPLES)
+    return Episode(time, (x + NOISE * np.std(x) * rng.standard_normal(SAMPLES))[:, None],
+                   time, u[:, None])
+
+
+def identified(episode, plant=PLANT, **options):
+    return identify_with_characteristics(plant, [episode], degrees=(1,), methods=methods(20),
+                                         **options)
+
+
+@pytest.mark.parametrize(('g', 'low', 'high'), [
+    (lambda u: np.tanh(2.0 * u), -1.0, 1.0),
+    (lambda u: u * u, 0.0, 1.0),
+    (lambda u: 30.0 ** (u - 1.0), 0.0, 1.0),
+    (lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.2, 0.0), -1.0, 1.0),
+    (lambda u: -np.clip(u, -0.6, 0.6), -1.0, 1.0)],
+    ids=['tanh', 'square', 'equal percentage', 'dead zone', 'reverse, saturated'])
+def test_a_characteristic_is_found(g, low, high):
+    found = identified(record(lambda x, u: -x + g(u), low, high))
+    one = found.drift.box.inputs.characteristics['valve']
+    u = np.linspace(one.values[0], one.values[-1], 101)
+    true = (g(u) - g(u[0])) / (g(u[-1]) - g(u[0]))
+    assert (one.effect(u) - u[0]) / (u[-1] - u[0]) == pytest.approx(true, abs=0.04)
+    assert not any(isinstance(one, NonAffineDrift) for one in found.alternatives)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_linear_input_has_none(seed):
+    found = identified(record(lambda x, u: -x + u, -1.0, 1.0, seed))
+    assert not found.drift.box.inputs.characteristics
+    assert (found.warnings, found.alternatives) == ((), ())
+
+
+@pytest.mark.parametrize('given', [{}, {'valve': [0.0, 0.0, 0.5, 0.25, 1.0, 1.0]}],
+                         ids=['found', 'given'])
+def test_the_model_file_has_it_and_the_free_run_uses_it(given, tmp_path):
+    episode = record(lambda x, u: -x + u * u, 0.0, 1.0)
+    task = TrainingTask(
+        (), str(tmp_path / 'model.safetensors'), '',
+        (RecordedState('level', 'm', place('level', 'level', 'm')),),
+        (RecordedInput('valve', '1', place('valve', 'valve', '1')),), model_class='linear',
+        dead_time={'valve': 0.0}, characteristics=given)
+    with quick_retraining(4, degrees=(1,)):
+        retrained = retrain(task, record=read({
+            'time [s]': episode.time, 'level [m]': episode.x[:, 0], 'valve [1]': episode.u[:, 0]},
+            'level', 'valve'))
+    assert retrained.accepted
+    model = load(retrained.model_file)
+    assert str(model.inputs.characteristics['valve']) in str(model)
+    assert len(model.inputs.characteristics['valve'].values) == (3 if given else 21)
+    assert retrained.summary()['characteristics'].keys() == {'valve'}
+    assert retrained.free_runs['record'].fit[0] > (90.0 if given else 98.0)
+
+
+def test_one_that_is_given_is_kept():
+    episode = record(lambda x, u: -x + u * u, 0.0, 1.0)
+    line = {'valve': Characteristic.of([0.0, 1.0], [0.0, 1.0])}
+    found = identified(episode, replace(PLANT, characteristics=line), given=line)
+    assert found.drift.box.inputs.characteristics.keys() == line.keys()
+    assert len(found.drift.box.inputs.characteristics['valve'].values) == 2
+
+
+def test_an_effect_that_rises_and_falls_is_refused():
+    with pytest.raises(ValueError, match='valve rises and falls'):
+        identified(record(lambda x, u: -x + u * u, -1.0, 1.0))
+
+
+def test_a_drift_that_is_not_affine_in_the_input_competes():
+    def rate(x, u):
+        return -x + u - 0.8 * x * u * u
+
+    found = identified(record(rate, -1.0, 1.0))
+    assert 'not affine in valve' in found.warnings[-1]
+    other = found.alternatives[0]
+    assert isinstance(other, NonAffineDrift)
+    x, u = (np.random.default_rng(0).uniform(-0.4, 0.4, (2, 50, 1)))
+    errors = [np.std(one.rate(x, u) - rate(x, u)) for one in (other, found.drift)]
+    assert errors[0] < 0.5 * errors[1]
