@@ -35,8 +35,9 @@ class SimulatedPlant:
 
     def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
         x = system.nominal_state + self._column('initial_offset')
-        return plants.Process(system, time_ns, x, system.nominal_input,
-                              self._table.actuator(self._parameters), system.nominal_input)
+        actuator = self._table.actuator(self._parameters)
+        u = actuator.position(system.nominal_input)
+        return plants.Process(system, time_ns, x, u, actuator, u)
 
     def _column(self, attribute: str) -> Array:
         """Return a parameter of all states (n_x,)."""
