@@ -3,6 +3,7 @@
 
 """The plant node: a simulated plant that publishes measurements and takes commands."""
 
+from collections import deque
 from enum import Enum
 from functools import partial
 import math
@@ -15,6 +16,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from koopman_ros import plants
+from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import (
     LAST_STAMP_SECONDS,
@@ -49,6 +51,32 @@ class RunPhase(Enum):
     OUT_OF_STAMPS = (f'finished: message stamps end at {LAST_STAMP_SECONDS} s; restart the plant '
                      'with a smaller start_time')
     TRIPPED = 'stopped'
+
+
+class Analyser:
+    """
+    An analyser that measures a state rarely, and knows its value late.
+
+    :param index: of the state.
+    :param period_ns: from sample to sample.
+    :param delay_ns: from a sample to its value, which has the stamp of the sample.
+    """
+
+    def __init__(self, publisher: SignalPublisher, index: int, period_ns: int, delay_ns: int
+                 ) -> None:
+        self._publisher, self._index = publisher, index
+        self._period_ns, self._delay_ns = period_ns, delay_ns
+        self._due_ns = 0
+        self._samples: deque[tuple[int, float]] = deque()
+
+    def sample(self, time_ns: int, measured: Array, frame_id: str) -> None:
+        """Take a sample of the states (n_x,) if one is due; publish the values known by now."""
+        if time_ns >= self._due_ns:
+            self._due_ns = time_ns + self._period_ns
+            self._samples.append((time_ns, float(measured[self._index])))
+        while self._samples and self._samples[0][0] + self._delay_ns <= time_ns:
+            stamp_ns, value = self._samples.popleft()
+            self._publisher.send(np.array([value]), stamp_message(stamp_ns), frame_id)
 
 
 class PlantNode(ManagedNode):
@@ -97,9 +125,19 @@ class PlantNode(ManagedNode):
         self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
         self._disturbances = SignalPublisher(
             wiring.measured_disturbances, signals.disturbances, endpoints.publish)
-        self._states = SignalPublisher(wiring.measured, signals.states, endpoints.publish)
+        analysers = {name: state for name, state in parameters.states.items()
+                     if state.analysis_period > 0.0}
+        self._analysers = [
+            Analyser(SignalPublisher({name: wiring.measured[name]}, signals.states,
+                                     endpoints.publish), list(signals.states).index(name),
+                     round(state.analysis_period * NANOSECONDS),
+                     round(state.analysis_delay * NANOSECONDS))
+            for name, state in analysers.items()]
+        sensors = {name: place for name, place in wiring.measured.items() if name not in analysers}
+        self._sensed = [name in sensors for name in signals.states]
+        self._states = SignalPublisher(sensors, signals.states, endpoints.publish)
         counted = {wiring.measured[name].topic
-                   for name in tuple(filter(None, parameters.measured)) or signals.states}
+                   for name in tuple(filter(None, parameters.measured)) or sensors}
         self._counted = [publisher for publisher in self._states.publishers
                          if publisher.topic_name in map(self.resolve_topic_name, counted)]
         self.diagnostics.hardware_id = self._plant.process.system.name
@@ -223,6 +261,10 @@ class PlantNode(ManagedNode):
         self._applied.send(self._plant.process.applied, stamp, frame_id)
         self._disturbances.send(self._table.measured_disturbances(self._settings), stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
+        for analyser in self._analysers:
+            analyser.sample(self._plant.process.time_ns, measured, frame_id)
+        measured, variance, resolution = (
+            of[self._sensed] for of in (measured, variance, resolution))
         self._states.send(measured, stamp, frame_id, variance, resolution)
 
     def _advance(self, time_ns: int) -> bool:

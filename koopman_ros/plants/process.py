@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
+from typing import cast
 
 import numpy as np
 
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.plants.simulation import advance
-from koopman_ros.plants.system import ControlAffineSystem
+from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem
 
 # After so many time constants exp(-40) of a step is left, less than a double can tell.
 _SETTLED = 40.0
@@ -150,7 +151,7 @@ def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Arr
 def _with_input_lag(system: ControlAffineSystem, time_constants: Array,
                     effect: Callable[[Array], Array]) -> ControlAffineSystem:
     """
-    Put a first-order lag before each input: d[x; v]/dt = [f(x) + B(x) g(v); -v / tau] + [0; u/tau].
+    Put a lag before each input: d[x; v]/dt = [f(x) + B(x) g(v); -v / tau] + [0; u / tau].
 
     The positions v become states; the time constants tau (n_u,) are in time units. An input
     without lag, of which tau is 0, stays where it is.
@@ -170,7 +171,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array,
         state_names=(*system.state_names, *system.input_names),
         state_units=(*system.state_units, *system.input_units),
         drift=drift,
-        drift_jacobian=None,
+        drift_jacobian=cast(ArrayFunction, None),
         B=np.concatenate([np.zeros((n_x, n_u)), np.diag(rate)]),
         nominal_state=np.concatenate([system.nominal_state, system.nominal_input]),
         state_lower=np.concatenate([system.state_lower, -unbounded]),

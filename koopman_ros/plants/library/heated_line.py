@@ -52,7 +52,8 @@ class HeatedLine(Constants):
         """Build it, nominal at 50 °C; concentration in mol/L, valve in percent of hot water."""
         gain = 0.01 * self._exchange * (self.hot_temperature - self.cold_temperature)
         # held where the concentration does not change
-        kept = self._dilution / (self._dilution + self._rate(np.asarray(_NOMINAL_TEMPERATURE)))
+        rate = float(self._rate(np.array(_NOMINAL_TEMPERATURE)))
+        kept = self.dilution_rate / (self.dilution_rate + rate)
         x = np.array([self.feed_concentration * kept, _NOMINAL_TEMPERATURE])
         return ControlAffineSystem(
             name='heated line',
@@ -71,7 +72,8 @@ class HeatedLine(Constants):
         )
 
     @cached_property
-    def _dilution(self) -> float:
+    def dilution_rate(self) -> float:
+        """The flow rate over the volume, q/V, in 1/s."""
         return self.flow_rate / self.volume
 
     @cached_property
@@ -92,12 +94,12 @@ class HeatedLine(Constants):
         reaction = self._rate(x[..., 1]) * x[..., 0]
         feed = np.array([self.feed_concentration, self.feed_temperature])
         heating = self._exchange * (self.cold_temperature - x[..., 1])
-        return self._dilution * (feed - x) + along_last(
+        return self.dilution_rate * (feed - x) + along_last(
             -reaction, self._warming * reaction + heating)
 
     def _drift_jacobian(self, x: Array) -> Array:
         rate = self._rate(x[..., 1])
         slope = along_last(rate, rate * x[..., 0] * self.activation_temperature / x[..., 1] ** 2)
         jacobian: Array = np.stack([-slope, self._warming * slope], axis=-2) - np.diag(
-            [self._dilution, self._dilution + self._exchange])
+            [self.dilution_rate, self.dilution_rate + self._exchange])
         return jacobian
