@@ -16,12 +16,14 @@ import sys
 
 import numpy as np
 
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.model import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import (
+    Actuator,
     box_episodes,
     ControlAffineSystem,
     describe,
@@ -82,7 +84,7 @@ LIFTS = {
 }
 FEED = 'reactor_feed'  # the reactor of one state, its feed temperature measured
 LINE = 'heated_line'
-LINE_DEAD_TIME = 45.0  # s
+LINE_VALVE = Actuator(0.0, 100.0, dead_time=45.0, rangeability=20.0)
 # shares of hot water, and temperatures of the feed in K
 LINE_TRAINING = RandomStepDesign(
     input_lower=[2.0, 283.15], input_upper=[98.0, 303.15], state_lower=[0.1, 303.15],
@@ -189,8 +191,12 @@ def feed_model(loops: int = LOOPS) -> LiftedModel:
 def line_model(loops: int = LOOPS) -> LiftedModel:
     """Learn a lift of the heated line by the effect of its valve; line and valve are known."""
     samples = box_episodes(line_with_feed(), LINE_TRAINING, 240, 240.0, SEED)
-    return replace(_fed_lift(line_with_feed(), samples, _FREE, loops),
-                   dead_time=np.array([LINE_DEAD_TIME]))
+    model = _fed_lift(line_with_feed(), samples, _FREE, loops)
+    valve = np.linspace(0.0, 100.0, 41)
+    curve, inputs = Characteristic.of(valve, LINE_VALVE.effect(valve)), model.inputs
+    return replace(model, dead_time=np.array([LINE_VALVE.dead_time]), inputs=replace(
+        inputs, characteristics={'valve': curve}, **{
+            name: curve.value(getattr(inputs, name)) for name in ('center', 'lower', 'upper')}))
 
 
 def saddle_model() -> LiftedModel:

@@ -143,7 +143,7 @@ def _written(value: Any) -> Any:
 
 def _read(name: str, value: Any) -> Any:
     """Return a field of an event from its written form."""
-    if name == 'value':
+    if name == 'value' and isinstance(value, str):
         return float(value)
     if name == 'mode':
         return Mode[value.upper()]
