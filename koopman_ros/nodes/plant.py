@@ -3,7 +3,6 @@
 
 """The plant node: a simulated plant that publishes measurements and takes commands."""
 
-from collections import deque
 from enum import Enum
 from functools import partial
 import math
@@ -16,7 +15,6 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from koopman_ros import plants
-from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import (
     LAST_STAMP_SECONDS,
@@ -34,7 +32,7 @@ from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
-from koopman_ros.ros.simulated_plant import SimulatedPlant
+from koopman_ros.ros.simulated_plant import Analyser, SimulatedPlant
 from koopman_ros.ros.time_conversion import stamp_message
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
@@ -51,32 +49,6 @@ class RunPhase(Enum):
     OUT_OF_STAMPS = (f'finished: message stamps end at {LAST_STAMP_SECONDS} s; restart the plant '
                      'with a smaller start_time')
     TRIPPED = 'stopped'
-
-
-class Analyser:
-    """
-    An analyser that measures a state rarely, and knows its value late.
-
-    :param index: of the state.
-    :param period_ns: from sample to sample.
-    :param delay_ns: from a sample to its value, which has the stamp of the sample.
-    """
-
-    def __init__(self, publisher: SignalPublisher, index: int, period_ns: int, delay_ns: int
-                 ) -> None:
-        self._publisher, self._index = publisher, index
-        self._period_ns, self._delay_ns = period_ns, delay_ns
-        self._due_ns = 0
-        self._samples: deque[tuple[int, float]] = deque()
-
-    def sample(self, time_ns: int, measured: Array, frame_id: str) -> None:
-        """Take a sample of the states (n_x,) if one is due; publish the values known by now."""
-        if time_ns >= self._due_ns:
-            self._due_ns = time_ns + self._period_ns
-            self._samples.append((time_ns, float(measured[self._index])))
-        while self._samples and self._samples[0][0] + self._delay_ns <= time_ns:
-            stamp_ns, value = self._samples.popleft()
-            self._publisher.send(np.array([value]), stamp_message(stamp_ns), frame_id)
 
 
 class PlantNode(ManagedNode):
