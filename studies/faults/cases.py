@@ -550,7 +550,7 @@ _HEATED_LINE = (
                   partial(processes.plant_again, number=signal.SIGKILL)),
     *(_line_process(f'reloaded-{seconds:g}', f'the model is reloaded with a dead time of '
                     f'{seconds:g} s, while the set-point steps',
-                    partial(late.reloaded, seconds=seconds)) for seconds in (0.0, 32.0, 58.0)),
+                    partial(late.reloaded, seconds=seconds)) for seconds in (32.0, 58.0)),
     _line_operator('modes', 'between manual and automatic mode every 15 s, while the set-point '
                    'steps', late.modes_in_a_step),
     _line_operator('mode-storm', f'{REQUESTS} changes between automatic and manual mode',

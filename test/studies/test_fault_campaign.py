@@ -180,7 +180,7 @@ def test_report_and_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert json.loads((tmp_path / 'summary.json').read_text())['results']['bias'][
         'time_to_recover_s'] is None
     assert write(tmp_path, {'good': good, 'skipped': skipped})
-    assert len(CASES) == 192
+    assert len(CASES) == 191
     assert main(['sensor', 'feed-warm', '--list']) == 0
     assert 'nan-short' in capsys.readouterr().out
     with pytest.raises(SystemExit):
