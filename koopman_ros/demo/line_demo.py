@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The demo of an input that acts late, beside its optimum, PI control and a Smith predictor.
+The demo of an input that acts late, compared with its optimum, PI and a Smith predictor.
 
 The tank of the plant `heated_line` is heated through a line, by a valve of equal percentage. Its
 temperature steps up and down, then the feed gets colder, which is measured.
@@ -143,7 +143,8 @@ def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
           estimated: tuple[Array, Array]) -> None:
     """Draw temperature, valve, concentration and feed over minutes."""
     minutes, best = seconds / 60.0, courses['optimum'].cost
-    with drawing(path, 4, 1, sharex=True, size=(9.0, 9.6)) as (figure, panels):
+    with drawing(path, 4, 1, sharex=True, size=(9.0, 9.0), gridspec_kw={
+            'height_ratios': (3, 2, 2, 1)}) as (figure, panels):
         temperature, valve, concentration, cold = panels
         edges = [*(at for at, _ in STEPS), seconds[-1]]
         for (at, kelvin), end in zip(STEPS, edges[1:], strict=True):
@@ -155,9 +156,9 @@ def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
             valve.step(minutes, course.commands[:, 0], where='post', label=name, **_STYLES[name])
         draw_limits(valve, (0.0, 100.0), 'limits')
         concentration.plot(minutes, courses['learned'].states[:, 0], color='tab:gray',
-                           label='true')
-        concentration.plot(estimated[0] / 60.0, estimated[1], color='tab:green',
-                           label='estimated')
+                           linewidth=2.5, label='true')
+        concentration.plot(estimated[0] / 60.0, estimated[1], color='tab:purple',
+                           linewidth=1.0, label='estimated')
         concentration.plot(analysed[0] / 60.0, analysed[1], '.', color='tab:blue',
                            label='analyser, 2 min late')
         cold.step(feed[0] / 60.0, shown(feed[1], 'K'), where='post', color='tab:blue')

@@ -44,6 +44,7 @@ class Day:
     models: tuple[str, ...]  #: one of which there is not
     #: longest manual mode, in s, in which no law controls the plant
     manual: float = 60.0
+    faults: tuple[str, ...] = ()  #: of its other messages, that may happen, too
 
 
 DAYS = {
@@ -62,7 +63,9 @@ DAYS = {
         'constants.feed_temperature': (14.0, 26.0),
         'constants.heat_transfer_coefficient': (2700.0, 3300.0),
         'temperature.measurement_noise': (0.0, 0.05), 'valve.dead_time': (32.0, 58.0)},
-        ('heated_line', '/nowhere.safetensors'))}
+        ('heated_line', '/nowhere.safetensors'), faults=tuple(
+            f'{what}: {alteration}' for what in ('disturbances', 'late')
+            for alteration in ('NaN', 'lost', 'late', 'doubled')))}
 
 
 def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None:
@@ -172,7 +175,8 @@ def _let_happen(loop: FaultHarness, day: Day, hours: float, happened: Counter[st
     for number in range(1, _LOOKS + 1):
         while due < number * look:
             loop.run_until(due)
-            event = EVENTS[random.integers(len(EVENTS))]
+            events = EVENTS + day.faults
+            event = events[random.integers(len(events))]
             happened[event] += 1
             _happen(event, day, loop, random)
             due = loop.now + random.exponential(_EVENT_PERIOD)

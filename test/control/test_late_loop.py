@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from koopman_ros.control import Mode, SetpointRequest, State
-from koopman_ros.control import events
+from koopman_ros.control import events, Mode, SetpointRequest, State
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.event_log.records import decoded, encoded
@@ -70,7 +69,8 @@ class Loop:
             disturbances=None if feed is None else np.array([feed]),
             quality=None if quality is None else (quality,))).command
         if command is None:  # nothing is known yet
-            assert silent and self.state.command is None
+            assert silent
+            assert self.state.command is None
             return
         assert np.isfinite(command).all()
         assert 0.0 <= command[0] <= 100.0
