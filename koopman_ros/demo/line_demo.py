@@ -64,15 +64,16 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
                       wiring.signals, _DURATION)
     topics = [*wiring.topics, CONCENTRATION, CONTROLLER_INTERNALS, EVENT_LOG]
     with running_loop(scenario, logs, {'output': bag, 'topics': topics}, table.show) as operator:
-        for seconds, kelvin in STEPS[1:]:
-            operator.request_setpoints({TEMPERATURE: kelvin}, seconds)
+        for at, kelvin in STEPS[1:]:
+            operator.request_setpoints({TEMPERATURE: kelvin}, at)
         operator.run_until(FEED_TIME)
         operator.set('plant', **{f'constants.{FEED}': to_celsius(COLD)})
         operator.run_until(_DURATION)
 
     run, feed = read_run(wiring, bag), _series(bag, FEED, 'K', wiring.measured_disturbances[FEED])
     colder = feed[0][np.argmax(feed[1] < 0.5 * (feed[1][0] + COLD))]
-    commands = run.commanded[VALVE]
+    # the plant goes on until it is stopped
+    commands = run.commanded[VALVE][run.command_seconds <= _DURATION]
     courses = _courses(commands, round(colder / scenario.sample_period))
     best, seconds = courses['optimum'], scenario.sample_period * np.arange(len(commands))
     result: dict[str, object] = {'unit': 'K', 'feed_step': COLD - float(feed[1][0])} | {
@@ -144,7 +145,7 @@ def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
     """Draw temperature, valve, concentration and feed over minutes."""
     minutes, best = seconds / 60.0, courses['optimum'].cost
     with drawing(path, 4, 1, sharex=True, size=(9.0, 9.0), gridspec_kw={
-            'height_ratios': (3, 2, 2, 1)}) as (figure, panels):
+            'height_ratios': (6, 4, 4, 3)}) as (figure, panels):
         temperature, valve, concentration, cold = panels
         edges = [*(at for at, _ in STEPS), seconds[-1]]
         for (at, kelvin), end in zip(STEPS, edges[1:], strict=True):
@@ -162,9 +163,9 @@ def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
         concentration.plot(analysed[0] / 60.0, analysed[1], '.', color='tab:blue',
                            label='analyser, 2 min late')
         cold.step(feed[0] / 60.0, shown(feed[1], 'K'), where='post', color='tab:blue')
-        for panel, name, unit in zip(panels, (TEMPERATURE, VALVE, CONCENTRATION, FEED), (
+        for panel, name, unit in zip(panels, (TEMPERATURE, VALVE, CONCENTRATION, 'feed'), (
                 'K', 'percent', 'mol/L', 'K'), strict=True):
-            panel.set_ylabel(f'{name.replace("_", " ")} [{unit_label(display_unit(unit))}]')
+            panel.set_ylabel(f'{name} [{unit_label(display_unit(unit))}]')
         temperature.set_title('heated line, 45 s late. Cost over the optimum: ' + ', '.join(
             f'{name} {course.cost / best:.3f}' for name, course in courses.items()
             if name != 'optimum'), fontsize=9)
