@@ -155,7 +155,8 @@ def with_feed(system: ControlAffineSystem, dilution_rate: float, temperature: fl
     return replace(
         system, input_names=(*system.input_names, 'feed_temperature'),
         input_units=(*system.input_units, 'K'), drift=lambda x: system.drift(x)
-        - temperature * gain, B=np.column_stack([system.B, gain]),
+        - temperature * gain, B=np.column_stack(
+            [system.input_matrix(system.nominal_state), gain]),
         nominal_input=np.array([*system.nominal_input, temperature]))
 
 
@@ -195,8 +196,8 @@ def line_model(loops: int = LOOPS) -> LiftedModel:
     valve = np.linspace(0.0, 100.0, 41)
     curve, inputs = Characteristic.of(valve, LINE_VALVE.effect(valve)), model.inputs
     return replace(model, dead_time=np.array([LINE_VALVE.dead_time]), inputs=replace(
-        inputs, characteristics={'valve': curve}, **{
-            name: curve.value(getattr(inputs, name)) for name in ('center', 'lower', 'upper')}))
+        inputs, center=curve.value(inputs.center), lower=curve.value(inputs.lower),
+        upper=curve.value(inputs.upper), characteristics={'valve': curve}))
 
 
 def saddle_model() -> LiftedModel:

@@ -75,7 +75,7 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
     # the plant goes on until it is stopped
     commands = run.commanded[VALVE][run.command_seconds <= _DURATION]
     courses = _courses(commands, round(colder / scenario.sample_period))
-    best, seconds = courses['optimum'], scenario.sample_period * np.arange(len(commands))
+    best, seconds = courses['optimum'], scenario.sample_period * np.arange(float(len(commands)))
     result: dict[str, object] = {'unit': 'K', 'feed_step': COLD - float(feed[1][0])} | {
         f'{name.lower().replace(" ", "_")}': {
             'cost_by_optimum': course.cost / best.cost, **_figures(course, seconds, colder)}
