@@ -143,7 +143,7 @@ studies-records: $(VENV)/records.stamp  ## learning from measured records, compa
 bench: $(VENV)/bench.stamp  ## benchmarks against other programs, 20 min (BENCH=--quick: 2 min) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)
 
-faults: $(VENV)/mpc.stamp  ## inject 167 faults into running loops of five plants, run two reactors for a day, 45 min (FAULTS=--quick: 1 min; FAULTS=two_tanks: one plant) -> out/faults
+faults: $(VENV)/mpc.stamp  ## inject 191 faults into running loops of six plants, run three of them for a day, 60 min (FAULTS=--quick: 1 min; FAULTS=two_tanks: one plant) -> out/faults
 	$(BIN)/python -m studies.faults $(FAULTS)
 
 docs: $(VENV)/docs.stamp  ## build the documentation with the Python API reference, 30 s -> out/docs

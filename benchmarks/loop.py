@@ -9,7 +9,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from benchmarks import planning, process
+from benchmarks import pending, planning, process
 from koopman_ros.core.plots import table
 
 PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')
@@ -19,6 +19,9 @@ MEANING = {
     'plan_ratio_to_do_mpc': 'how many times as long do-mpc takes (IPOPT, targets given, the '
                             'true equations), by lift',
     'plan_ratio_to_sqp': "the same of casadi's SQP, as generated C where there is a compiler",
+    'pending_us': f'median processor time of the control step of {pending.PLANT} with 0 and with '
+                  f'{pending.PENDING} commands on their way, in turns, by law',
+    'pending_ratio': 'the latter by the former',
 }
 
 
@@ -38,6 +41,7 @@ def measure(plan: LoopPlan, figures: dict[str, Any], folder: Path) -> Iterator[s
     figures['meaning'] = MEANING
     with tempfile.TemporaryDirectory() as name:
         yield _plans(figures, plan, Path(name))
+        yield _pending(figures, plan, Path(name))
 
 
 def _found(job: Any, *arguments: Any, folder: Path) -> dict[str, Any]:
@@ -46,6 +50,16 @@ def _found(job: Any, *arguments: Any, folder: Path) -> dict[str, Any]:
     if outcome.failure:
         raise RuntimeError(f'{job.__module__} failed: {outcome.failure}')
     return {name: one for event in outcome.events for name, one in event.items()}
+
+
+def _pending(figures: dict[str, Any], plan: LoopPlan, folder: Path) -> str:
+    found = _found(pending.measure_pending, plan.plans, folder=folder)
+    none, some = '0', str(pending.PENDING)
+    figures.update(pending_us=found, pending_ratio={
+        law: one[some] / one[none] for law, one in found.items()})
+    return table(('step with', f'0 and {some} commands on their way [ms]', 'ratio'), [
+        (law, f'{1e-3 * one[none]:.2f}, {1e-3 * one[some]:.2f}', f'{one[some] / one[none]:.2g}')
+        for law, one in found.items()])
 
 
 def _plans(figures: dict[str, Any], plan: LoopPlan, folder: Path) -> str:

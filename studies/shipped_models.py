@@ -16,12 +16,14 @@ import sys
 
 import numpy as np
 
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.model import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import (
+    Actuator,
     box_episodes,
     ControlAffineSystem,
     describe,
@@ -30,6 +32,7 @@ from koopman_ros.plants import (
     RandomStepDesign,
     ReactorParameters,
 )
+from koopman_ros.plants.library.heated_line import HeatedLine
 from studies.paper.reactor import SYSTEM, TRAINING, training_samples
 from studies.progress import training_progress
 
@@ -80,7 +83,13 @@ LIFTS = {
         hold_time=(0.05, 0.1), sample_period=0.05), 120, 0.5, _FREE),
 }
 FEED = 'reactor_feed'  # the reactor of one state, its feed temperature measured
-NAMES = ('reactor', FEED, *LIFTS, SADDLE)
+LINE = 'heated_line'
+LINE_VALVE = Actuator(0.0, 100.0, dead_time=45.0, rangeability=20.0)
+# shares of hot water, and temperatures of the feed in K
+LINE_TRAINING = RandomStepDesign(
+    input_lower=[2.0, 283.15], input_upper=[98.0, 303.15], state_lower=[0.1, 303.15],
+    state_upper=[0.6, 343.15], hold_time=(60.0, 120.0), sample_period=30.0)
+NAMES = ('reactor', FEED, LINE, *LIFTS, SADDLE)
 
 
 def library_system(name: str) -> ControlAffineSystem:
@@ -137,26 +146,58 @@ def reactor_models() -> dict[str, LiftedModel]:
             'reactor_linear': linear_model(lifts[max(lifts)])}
 
 
+def with_feed(system: ControlAffineSystem, dilution_rate: float, temperature: float
+              ) -> ControlAffineSystem:
+    """Return a plant with its feed temperature, which acts on its last state, as an input."""
+    gain = np.zeros(system.n_x)
+    gain[-1] = dilution_rate
+    # B u counts it now
+    return replace(
+        system, input_names=(*system.input_names, 'feed_temperature'),
+        input_units=(*system.input_units, 'K'), drift=lambda x: system.drift(x)
+        - temperature * gain, B=np.column_stack(
+            [system.input_matrix(system.nominal_state), gain]),
+        nominal_input=np.array([*system.nominal_input, temperature]))
+
+
 def reactor_with_feed() -> ControlAffineSystem:
     """Return the one-state reactor with its feed temperature as a second input."""
     constants = ReactorParameters()
-    # B u counts it now
-    feed = constants.dilution_rate * constants.feed_temperature
-    return replace(
-        SYSTEM, input_names=(*SYSTEM.input_names, 'feed_temperature'), input_units=('K', 'K'),
-        drift=lambda x: SYSTEM.drift(x) - feed, drift_jacobian=SYSTEM.drift_jacobian,
-        B=np.array([[constants.cooling_rate, constants.dilution_rate]]),
-        nominal_input=np.array([*SYSTEM.nominal_input, constants.feed_temperature]))
+    return with_feed(SYSTEM, constants.dilution_rate, constants.feed_temperature)
+
+
+def line_with_feed() -> ControlAffineSystem:
+    """Return the heated line with its feed temperature as a second input."""
+    line = HeatedLine()
+    return with_feed(line.system(), line.dilution_rate, line.feed_temperature)
+
+
+def _fed_lift(system: ControlAffineSystem, samples: DriftSamples, recipe: IncrementalTraining,
+              loops: int) -> LiftedModel:
+    """Learn a lift, and the effects of the input and of the measured feed temperature."""
+    names = ('feed_temperature',)
+    plant = replace(describe(system), B=None, disturbance_names=names)
+    return train(plant, samples, recipe, seed=SEED, starts=1, loops=loops
+                 ).model.with_disturbances(names)
 
 
 def feed_model(loops: int = LOOPS) -> LiftedModel:
     """Learn a lift of the reactor, and the effects of its coolant and of its feed."""
-    system, names = reactor_with_feed(), ('feed_temperature',)
-    samples = box_episodes(system, replace(
+    samples = box_episodes(reactor_with_feed(), replace(
         TRAINING, input_lower=[281.3, 340.0], input_upper=[301.1, 360.0]), 240, 1.0, SEED)
-    plant = replace(describe(system), B=None, disturbance_names=names)
-    return train(plant, samples, IncrementalTraining(max(LIFTED_SIZES), tolerance=0.0), seed=SEED,
-                 starts=1, loops=loops).model.with_disturbances(names)
+    return _fed_lift(reactor_with_feed(), samples,
+                     IncrementalTraining(max(LIFTED_SIZES), tolerance=0.0), loops)
+
+
+def line_model(loops: int = LOOPS) -> LiftedModel:
+    """Learn a lift of the heated line by the effect of its valve; line and valve are known."""
+    samples = box_episodes(line_with_feed(), LINE_TRAINING, 240, 240.0, SEED)
+    model = _fed_lift(line_with_feed(), samples, _FREE, loops)
+    valve = np.linspace(0.0, 100.0, 41)
+    curve, inputs = Characteristic.of(valve, LINE_VALVE.effect(valve)), model.inputs
+    return replace(model, dead_time=np.array([LINE_VALVE.dead_time]), inputs=replace(
+        inputs, center=curve.value(inputs.center), lower=curve.value(inputs.lower),
+        upper=curve.value(inputs.upper), characteristics={'valve': curve}))
 
 
 def saddle_model() -> LiftedModel:
@@ -180,7 +221,8 @@ def main(args: list[str] | None = None) -> int:
                      f'{", ".join(NAMES)}')
     options.output.mkdir(parents=True, exist_ok=True)
     for plant in options.plants:
-        own = {SADDLE: saddle_model, FEED: feed_model}.get(plant, partial(train_lift, plant))
+        own = {SADDLE: saddle_model, FEED: feed_model, LINE: line_model}.get(
+            plant, partial(train_lift, plant))
         models = reactor_models() if plant == 'reactor' else {plant: own()}
         for name, model in models.items():
             save(model, options.output / f'{name}.safetensors')

@@ -172,7 +172,8 @@ class Controller(ControlStep):
         except BaseException as error:
             contained(error)
         return (state, reason(
-            StatusCode.ANALYSIS_REFUSED, signal=signal, age=(newest_ns - stamp_ns) / NANOSECONDS,
+            StatusCode.ANALYSIS_REFUSED, signal=signal, value=value,
+            age=(newest_ns - stamp_ns) / NANOSECONDS,
             reach=(newest_ns - oldest_ns) / NANOSECONDS)) if found is None else (found, None)
 
     def clear_safe_state(self, state: State) -> tuple[State, Reason | None]:

@@ -140,8 +140,8 @@ class StatusCode(Enum):
         '{most} set-points are already scheduled, the maximum: wait until some have taken effect, '
         'or send this one with stamp 0')
     ANALYSIS_REFUSED = 'analysis_refused', (
-        'the late value of {signal} is {age:.4g} s old, but estimates are kept for {reach:.4g} s '
-        'only: check its stamp, analysis_delay and estimator')
+        'the value {value:.6g} of {signal}, {age:.4g} s old, cannot correct the estimate, which '
+        'reaches back {reach:.4g} s: check the analyser, its stamp, analysis_delay and estimator')
     NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
         'manual command refused in automatic mode: switch to manual mode first')
     MANUAL_NOT_FINITE = 'manual_not_finite', (

@@ -23,6 +23,8 @@ from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, legend, wr
 from koopman_ros.core.units import conversion, display_unit, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.exported import ExportedLoop
+from koopman_ros.demo.line_demo import PLANT as LINE
+from koopman_ros.demo.line_demo import run_line
 from koopman_ros.demo.loop import Row, run_loop, running_loop, Scenario
 from koopman_ros.demo.results import DemoRun, read_run
 from koopman_ros.evaluation.optimal_cost import (
@@ -228,5 +230,6 @@ def main(args: list[str] | None = None) -> int:
     options = read_options(args, __doc__, 'out/demo', 60.0, plant=PLANT)
     demo: Callable[[Path, float], Mapping[str, object]] = (
         partial(run_with_panel, options.plant, options.port) if options.panel
+        else run_line if options.plant == LINE and not options.export
         else partial(run_plant, options.plant, options.export))
     return run_demo(demo, options, 'closed_loop.png, closed_loop.mcap and summary.json')

@@ -132,7 +132,9 @@ class ExtendedKalmanFilter(Estimator):
         n, H = self.model.n_x, self._H
         n_d = directions.shape[1]
         A = np.zeros((n + n_d, n + n_d))
-        A[:n, :n], A[:n, n:] = self._slope, directions
+        # how fast a disturbance wanders does not matter, and with a long dead time that is little
+        scale = float(np.max(self._rates)) / (float(np.linalg.norm(directions)) or 1.0)
+        A[:n, :n], A[:n, n:] = self._slope, scale * directions
         C = np.concatenate((H, np.zeros((len(H), n_d))), axis=1)
         # Hautus' test; modes that decay may stay unseen
         for value in np.linalg.eigvals(A):

@@ -136,11 +136,15 @@ def _written(value: Any) -> Any:
         return value.value
     if isinstance(value, Enum):
         return value.name.lower()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else repr(value)
     return numbers(value) if isinstance(value, np.ndarray) else value
 
 
 def _read(name: str, value: Any) -> Any:
     """Return a field of an event from its written form."""
+    if name == 'value' and isinstance(value, str):
+        return float(value)
     if name == 'mode':
         return Mode[value.upper()]
     if name == 'cause':

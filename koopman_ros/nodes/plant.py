@@ -32,7 +32,7 @@ from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
-from koopman_ros.ros.simulated_plant import SimulatedPlant
+from koopman_ros.ros.simulated_plant import Analyser, SimulatedPlant
 from koopman_ros.ros.time_conversion import stamp_message
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
@@ -97,9 +97,19 @@ class PlantNode(ManagedNode):
         self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
         self._disturbances = SignalPublisher(
             wiring.measured_disturbances, signals.disturbances, endpoints.publish)
-        self._states = SignalPublisher(wiring.measured, signals.states, endpoints.publish)
+        analysers = {name: state for name, state in parameters.states.items()
+                     if state.analysis_period > 0.0}
+        self._analysers = [
+            Analyser(SignalPublisher({name: wiring.measured[name]}, signals.states,
+                                     endpoints.publish), list(signals.states).index(name),
+                     round(state.analysis_period * NANOSECONDS),
+                     round(state.analysis_delay * NANOSECONDS))
+            for name, state in analysers.items()]
+        sensors = {name: place for name, place in wiring.measured.items() if name not in analysers}
+        self._sensed = [name in sensors for name in signals.states]
+        self._states = SignalPublisher(sensors, signals.states, endpoints.publish)
         counted = {wiring.measured[name].topic
-                   for name in tuple(filter(None, parameters.measured)) or signals.states}
+                   for name in tuple(filter(None, parameters.measured)) or sensors}
         self._counted = [publisher for publisher in self._states.publishers
                          if publisher.topic_name in map(self.resolve_topic_name, counted)]
         self.diagnostics.hardware_id = self._plant.process.system.name
@@ -223,6 +233,10 @@ class PlantNode(ManagedNode):
         self._applied.send(self._plant.process.applied, stamp, frame_id)
         self._disturbances.send(self._table.measured_disturbances(self._settings), stamp, frame_id)
         measured, variance, resolution = self._plant.measure(sample)
+        for analyser in self._analysers:
+            analyser.sample(self._plant.process.time_ns, measured, frame_id)
+        measured, variance, resolution = (
+            of[self._sensed] for of in (measured, variance, resolution))
         self._states.send(measured, stamp, frame_id, variance, resolution)
 
     def _advance(self, time_ns: int) -> bool:

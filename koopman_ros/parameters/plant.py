@@ -56,6 +56,12 @@ class StateParameters(MeasuredPlace):
     initial_offset: float = parameter(
         0.0, 'Initial offset from the steady state.', '{unit}', -UNBOUNDED, UNBOUNDED,
         read_only=True)
+    analysis_period: float = parameter(
+        0.0, 'Time between the samples of an analyser that measures the state; 0: a sensor that '
+        'measures all the time.', 's', 0.0, 86400.0, read_only=True)
+    analysis_delay: float = parameter(
+        0.0, 'Time from a sample of the analyser to its value.', 's', 0.0, 86400.0,
+        read_only=True)
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,9 @@ class InputParameters(CommandedPlaces):
     dead_time: float = parameter(
         0.0, 'Dead time between the applied input and its effect, which the measured input does '
         'not show.', 's', 0.0, 3600.0)
+    rangeability: float = parameter(
+        1.0, 'Largest by smallest gain of a valve of equal percentage from min to max; 1: linear.',
+        '', 1.0, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -185,7 +194,7 @@ class PlantTable(ParameterTable[PlantParameters]):
         tuned = values.inputs
         return Actuator(in_own_units(tuned, 'min', units), in_own_units(tuned, 'max', units),
                         *(np.array([getattr(tuned[name], one) for name in units])
-                          for one in ('delay', 'lag', 'dead_time')))
+                          for one in ('delay', 'lag', 'dead_time', 'rangeability')))
 
     def _build(self, values: PlantParameters) -> None:
         """Build the plant's process, including the tolerances of its integration."""
@@ -206,6 +215,10 @@ def _cross_check(signals: Signals, values: PlantParameters) -> str:
     if len(values.frame_id) > LONGEST_FRAME_ID:
         return (f'frame_id has {len(values.frame_id)} characters, the maximum is '
                 f'{LONGEST_FRAME_ID}: shorten it')
+    for name, given in values.inputs.items():
+        if given.rangeability > 1.0 and not -UNBOUNDED < given.min < given.max < UNBOUNDED:
+            return (f'{name}.rangeability = {given.rangeability:.10g} needs the range of the '
+                    f'valve: set {name}.min and {name}.max')
     if unknown := set(filter(None, values.measured)) - set(signals.states):
         return (f'measured = {list(values.measured)} names {", ".join(sorted(unknown))}: choose '
                 f'from the states {", ".join(signals.states)}')

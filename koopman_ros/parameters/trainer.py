@@ -510,5 +510,6 @@ def preset_wiring(system: str, disturbances: tuple[str, ...] = ()) -> SignalTopi
     """Return the places of the signals of a plant that is shipped, or None for another."""
     if not (own := plant_defaults(system, 'trainer')):
         return None
-    own |= {'disturbances_measured': disturbances}
+    if disturbances:
+        own |= {'disturbances_measured': disturbances}
     return _wiring(trainer_signals(None, own), own)

@@ -22,6 +22,7 @@ PLANTS = {
     'two_tanks': f'{_LIBRARY}.two_tanks:TwoTanks',
     'quadruple_tank': f'{_LIBRARY}.quadruple_tank:QuadrupleTank',
     'pendulum': f'{_LIBRARY}.pendulum:Pendulum',
+    'heated_line': f'{_LIBRARY}.heated_line:HeatedLine',
 }
 #: of packages that offer plants
 ENTRY_POINTS = 'koopman_ros.plants'

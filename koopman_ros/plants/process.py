@@ -5,15 +5,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
+from typing import cast
 
 import numpy as np
 
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.plants.simulation import advance
-from koopman_ros.plants.system import ControlAffineSystem
+from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem
 
 # After so many time constants exp(-40) of a step is left, less than a double can tell.
 _SETTLED = 40.0
@@ -28,6 +30,29 @@ class Actuator:
     delay: float | Array = 0.0  #: how long after it was given a command is applied, in s
     lag: float | Array = 0.0  #: time constant with which the input then follows, in s
     dead_time: float | Array = 0.0  #: how long after it was applied an input acts, in s
+    #: of a valve of equal percentage between finite `lower` and `upper`: its largest by its
+    #: smallest gain; 1 for one that acts linearly
+    rangeability: float | Array = 1.0
+
+    def effect(self, u: Array) -> Array:
+        """Return the inputs (..., n_u) that act on the plant at the given positions."""
+        return self._over_range(u, lambda share, R: np.expm1(share * np.log(R)) / (R - 1.0))
+
+    def position(self, effect: Array) -> Array:
+        """Return the positions (..., n_u) at which inputs act: the inverse of :meth:`effect`."""
+        return self._over_range(effect, lambda share, R: np.log1p(share * (R - 1.0)) / np.log(R))
+
+    def _over_range(self, u: Array, law: Callable[[Array, Array], Array]) -> Array:
+        """Apply a law to the shares of the range, where it is not the identity."""
+        curved = np.broadcast_to(np.greater(self.rangeability, 1.0), np.shape(u)[-1:])
+        if not curved.any():
+            return u
+        lower, upper, R = (np.broadcast_to(value, curved.shape)[curved]
+                           for value in (self.lower, self.upper, self.rangeability))
+        found = np.array(u)
+        found[..., curved] = lower + (upper - lower) * law(
+            np.clip((found[..., curved] - lower) / (upper - lower), 0.0, 1.0), R)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +62,7 @@ class Process:
     system: ControlAffineSystem  #: the plant
     time_ns: int  #: present time, in integer nanoseconds so that instants repeat exactly
     x: Array  #: present state (n_x,)
-    u: Array  #: input (n_u,) that acts, up to the present time
+    u: Array  #: position (n_u,) of the actuator that acts, up to the present time
     actuator: Actuator = Actuator()  #: between commands and input
     command: Array | None = None  #: (n_u,) that the input follows; None for u
     #: commands that take effect later, by rising time: (time in ns, number of the input, value)
@@ -105,14 +130,15 @@ class Process:
         u = np.where(lag > 0.0, self.u, goal)
         if settled_ns > self.time_ns and np.any(u != goal):
             end_ns = min(time_ns, settled_ns)
-            both = _with_input_lag(self.system, lag / self.system.seconds_per_time_unit)
+            both = _with_input_lag(
+                self.system, lag / self.system.seconds_per_time_unit, self.actuator.effect)
             reached = _moved(both, np.concatenate([self.x, u]), goal, end_ns - self.time_ns)
             x, u = np.split(reached, [self.system.n_x])
             now = replace(self, time_ns=end_ns, x=x, u=u)
             if time_ns < settled_ns:
                 return now
         return replace(now, time_ns=time_ns, u=goal, x=_moved(
-            self.system, now.x, goal, time_ns - now.time_ns))
+            self.system, now.x, self.actuator.effect(goal), time_ns - now.time_ns))
 
 
 def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Array:
@@ -122,11 +148,12 @@ def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Arr
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
 
 
-def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> ControlAffineSystem:
+def _with_input_lag(system: ControlAffineSystem, time_constants: Array,
+                    effect: Callable[[Array], Array]) -> ControlAffineSystem:
     """
-    Put a first-order lag before each input: d[x; v]/dt = [f(x) + B(x) v; -v / tau] + [0; u / tau].
+    Put a lag before each input: d[x; v]/dt = [f(x) + B(x) g(v); -v / tau] + [0; u / tau].
 
-    The inputs v that act become states; the time constants tau (n_u,) are in time units. An input
+    The positions v become states; the time constants tau (n_u,) are in time units. An input
     without lag, of which tau is 0, stays where it is.
     """
     n_x, n_u = system.n_x, system.n_u
@@ -135,15 +162,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> Contr
 
     def drift(state: Array) -> Array:
         x, v = state[..., :n_x], state[..., n_x:]
-        return np.concatenate([system.derivative(x, v), -rate * v], axis=-1)
-
-    def drift_jacobian(state: Array) -> Array:
-        jacobian = np.zeros((*state.shape, n_x + n_u))
-        x, v = state[..., :n_x], state[..., n_x:]
-        jacobian[..., :n_x, :n_x] = system.slope(x, v)
-        jacobian[..., :n_x, n_x:] = system.input_matrix(x)
-        jacobian[..., n_x:, n_x:] = -np.diag(rate)
-        return jacobian
+        return np.concatenate([system.derivative(x, effect(v)), -rate * v], axis=-1)
 
     unbounded = np.full(n_u, np.inf)
     return replace(
@@ -152,7 +171,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> Contr
         state_names=(*system.state_names, *system.input_names),
         state_units=(*system.state_units, *system.input_units),
         drift=drift,
-        drift_jacobian=drift_jacobian,
+        drift_jacobian=cast(ArrayFunction, None),
         B=np.concatenate([np.zeros((n_x, n_u)), np.diag(rate)]),
         nominal_state=np.concatenate([system.nominal_state, system.nominal_input]),
         state_lower=np.concatenate([system.state_lower, -unbounded]),

@@ -3,6 +3,7 @@
 
 """The plant that a plant node simulates: equations, actuators, sensors and their parameters."""
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.units import values_by_name
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
+from koopman_ros.ros.signals import SignalPublisher
+from koopman_ros.ros.time_conversion import stamp_message
 
 
 class SimulatedPlant:
@@ -35,8 +38,9 @@ class SimulatedPlant:
 
     def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
         x = system.nominal_state + self._column('initial_offset')
-        return plants.Process(system, time_ns, x, system.nominal_input,
-                              self._table.actuator(self._parameters), system.nominal_input)
+        actuator = self._table.actuator(self._parameters)
+        u = actuator.position(system.nominal_input)
+        return plants.Process(system, time_ns, x, u, actuator, u)
 
     def _column(self, attribute: str) -> Array:
         """Return a parameter of all states (n_x,)."""
@@ -84,3 +88,29 @@ class SimulatedPlant:
         inputs = {base_name(name, unit): unit for name, unit in self.signals.inputs.items()}
         return {**values_by_name(self.signals.states, self.process.x.tolist()),
                 **values_by_name(inputs, self.process.applied.tolist())}
+
+
+class Analyser:
+    """
+    An analyser that measures a state rarely, and knows its value late.
+
+    :param index: of the state.
+    :param period_ns: from sample to sample.
+    :param delay_ns: from a sample to its value, which has the stamp of the sample.
+    """
+
+    def __init__(self, publisher: SignalPublisher, index: int, period_ns: int, delay_ns: int
+                 ) -> None:
+        self._publisher, self._index = publisher, index
+        self._period_ns, self._delay_ns = period_ns, delay_ns
+        self._due_ns = 0
+        self._samples: deque[tuple[int, float]] = deque()
+
+    def sample(self, time_ns: int, measured: Array, frame_id: str) -> None:
+        """Take a sample of the states (n_x,) if one is due; publish the values known by now."""
+        if time_ns >= self._due_ns:
+            self._due_ns = time_ns + self._period_ns
+            self._samples.append((time_ns, float(measured[self._index])))
+        while self._samples and self._samples[0][0] + self._delay_ns <= time_ns:
+            stamp_ns, value = self._samples.popleft()
+            self._publisher.send(np.array([value]), stamp_message(stamp_ns), frame_id)

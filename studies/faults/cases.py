@@ -14,12 +14,13 @@ from typing import Any
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from studies.faults import interceptor, operators, processes, silence
+from studies.faults import interceptor, late, operators, processes, silence
 from studies.faults.case import FaultCase
 from studies.faults.interceptor import delayed, frozen, lost, noise, Packet, stamped, twice, value
 from studies.faults.operators import altered, changed_for_good, Maker, REQUESTS, scaled
 from studies.faults.plants import (
     FaultPlant,
+    HEATED_LINE,
     LOCKSTEP,
     PATIENT,
     PENDULUM,
@@ -510,6 +511,68 @@ _SILENCE = (
         '41.4 degC, and no plan of mpc meets its deadline', partial(
             altered, make=_excursion, seconds=200.0), between=True, controller=_NEVER_IN_TIME))
 
+def _line(group: str, name: str, does: str, make: Maker, seconds: float,
+          what: str = 'measurements', **details: Any) -> FaultCase:
+    return _on(HEATED_LINE, group, name, f'{does}, while the set-point steps, {seconds:g} s',
+               partial(altered, make=make, seconds=seconds, setpoint=HEATED_LINE.other,
+                       what=what), between=True, **details)
+
+
+_line_operator = partial(_on, HEATED_LINE, 'operators')
+_line_process = partial(_on, HEATED_LINE, 'processes')
+_HEATED_LINE = (
+    _line('sensor', 'nan', 'temperature: NaN', _shows(math.nan), 50.0,
+          code=StatusCode.NOT_FINITE),
+    _on(HEATED_LINE, 'sensor', 'quality-bad', 'temperature: of bad quality, 50 s',
+        partial(late.bad_quality, seconds=50.0), code=StatusCode.BAD_QUALITY,
+        controller={'temperature.quality_topic': late.QUALITY}),
+    _line('sensor', 'feed-nan', 'feed temperature: NaN', _shows(math.nan), 600.0, 'disturbances',
+          says=('^controller: .*feed_temperature is nan',)),
+    _line('sensor', 'feed-lost', 'feed temperature: no measurement', lost, 600.0, 'disturbances',
+          says=('^controller: control: .*no measurement of feed_temperature',)),
+    _line('sensor', 'feed-late', 'feed temperature: 12 samples late', lambda: delayed(12), 600.0,
+          'disturbances'),
+    _line('sensor', 'analyser-lost', 'analyser: no value', lost, 1200.0, 'late'),
+    _line('sensor', 'analyser-nan', 'analyser: NaN', _shows(math.nan), 1200.0, 'late',
+          code=StatusCode.ANALYSIS_REFUSED),
+    _line('sensor', 'analyser-late', 'analyser: each value later than analysis_delay',
+          lambda: delayed(2), 1200.0, 'late', code=StatusCode.ANALYSIS_REFUSED),
+    _line('messages', 'measurements-lost', '30 % of the measurements lost', lambda: lost(0.3),
+          600.0),
+    _line('messages', 'commands-lost', '30 % of the commands lost', lambda: lost(0.3), 600.0,
+          'commands'),
+    _line('clocks', 'clock-back', 'stamps jump an hour back, and then ahead', _stamps(-3600),
+          600.0, plant={**LOCKSTEP, 'start_time': 10_000.0}),
+    _line_process('controller-killed', 'the controller is killed while the set-point steps, and '
+                  'started again', processes.controller_in_a_step, plant=PATIENT),
+    _line_process('controller-killed-in-manual-mode', 'killed in manual mode, and started again',
+                  processes.controller_in_manual_mode, plant=PATIENT),
+    _line_process('plant-killed', 'the plant is killed and started again',
+                  partial(processes.plant_again, number=signal.SIGKILL)),
+    *(_line_process(f'reloaded-{seconds:g}', f'the model is reloaded with a dead time of '
+                    f'{seconds:g} s, while the set-point steps',
+                    partial(late.reloaded, seconds=seconds)) for seconds in (32.0, 58.0)),
+    _line_operator('modes', 'between manual and automatic mode every 15 s, while the set-point '
+                   'steps', late.modes_in_a_step),
+    _line_operator('mode-storm', f'{REQUESTS} changes between automatic and manual mode',
+                   operators.storm_of_modes),
+    _line_operator('bad-values-storm', f'{REQUESTS} parameters that cannot be',
+                   partial(operators.storm_of_parameters,
+                           make=lambda: _cycled(refused_values(HEATED_LINE)), refused=True)),
+    _line_operator('latched', 'NaN until the safe input is latched, which is cleared then',
+                   partial(late.latched, alteration=_shows(math.nan)(), seconds=200.0),
+                   between=True, controller={'safe_latch': True}),
+    *(_on(HEATED_LINE, 'disturbances', name, f'{does}, for good, and the set-point steps',
+          partial(changed_for_good, parameters=parameters, setpoint=HEATED_LINE.other), **details)
+      for name, does, parameters, details in (
+          ('later', 'dead time +30 %', {'valve.dead_time': 58.5}, {}),
+          ('earlier', 'dead time -30 %', {'valve.dead_time': 31.5}, {}),
+          ('feed-cold', 'feed 8 K colder', {'constants.feed_temperature': 12.0},
+           {'offset': 0.1}),
+          ('fouled', 'UA -15 %', {'constants.heat_transfer_coefficient': 2550.0},
+           {'offset': 0.1}))))
+
 CASES = {case.name: case for case in (
     *_MESSAGES, *_PROCESSES, *_OPERATORS, *_tanks(TWO_TANKS),
-    *(case for case in _tanks(QUADRUPLE_TANK) if case.name in _MANY), *_SADDLE, *_SILENCE)}
+    *(case for case in _tanks(QUADRUPLE_TANK) if case.name in _MANY), *_SADDLE, *_SILENCE,
+    *_HEATED_LINE)}

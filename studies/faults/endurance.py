@@ -24,7 +24,7 @@ from studies.faults.case import LoopTrace
 from studies.faults.harness import FaultHarness
 from studies.faults.interceptor import Alteration, value
 from studies.faults.judge import out_of_range, responses
-from studies.faults.plants import FaultPlant, LOCKSTEP, REACTOR, SADDLE
+from studies.faults.plants import FaultPlant, HEATED_LINE, LOCKSTEP, REACTOR, SADDLE
 
 HOURS = 24.0
 _EVENT_PERIOD = 300.0  # s, mean time between two events
@@ -32,7 +32,6 @@ _WALL_PER_HOUR = 240.0  # s, at most
 _LOOKS = 200  # at the memory
 _WARM = 0.25  # share of the run after which memory is to be flat
 _GROWTH = 4.0  # MB that a process may grow from then on
-_RECORDED = ('temperature', 'coolant_setpoint')
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,7 @@ class Day:
     models: tuple[str, ...]  #: one of which there is not
     #: longest manual mode, in s, in which no law controls the plant
     manual: float = 60.0
+    faults: tuple[str, ...] = ()  #: of its other messages, that may happen, too
 
 
 DAYS = {
@@ -58,7 +58,14 @@ DAYS = {
         'constants.feed_temperature': (74.0, 80.0),
         'constants.heat_transfer_coefficient': (800.0, 870.0),
         'temperature.measurement_noise': (0.02, 0.08)},
-        ('two_state_saddle', '/nowhere.safetensors'), manual=15.0)}
+        ('two_state_saddle', '/nowhere.safetensors'), manual=15.0),
+    'soak-line': Day(HEATED_LINE, (44.0, 60.0), {
+        'constants.feed_temperature': (14.0, 26.0),
+        'constants.heat_transfer_coefficient': (2700.0, 3300.0),
+        'temperature.measurement_noise': (0.0, 0.05), 'valve.dead_time': (32.0, 58.0)},
+        ('heated_line', '/nowhere.safetensors'), faults=tuple(
+            f'{what}: {alteration}' for what in ('disturbances', 'late')
+            for alteration in ('NaN', 'lost', 'late', 'doubled')))}
 
 
 def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None:
@@ -74,8 +81,9 @@ def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None
             celsius = float(random.choice([math.nan, 190.0, -1e9]))
             loop.ask(temperature=celsius)
         case 'weights':
+            name = f'{day.on.inputs[0]}.weight'
             loop.set_parameters('controller', **{
-                'coolant_temperature.weight': float(10.0 ** random.uniform(-1.0, 1.0)),
+                name: day.on.default(name) * float(10.0 ** random.uniform(-1.0, 1.0)),
                 'temperature.weight': float(random.choice([1.0, math.nan]))})
         case 'manual mode':
             loop.ros.set_bool('controller/set_automatic', False)
@@ -121,7 +129,7 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS,
     with FaultHarness(folder, 60.0 + _WALL_PER_HOUR * hours, check, True, day.on) as loop:
         try:
             loop.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
-                                   'topics': _RECORDED})
+                                   'topics': _recorded(day.on)})
             loop.start_loop(day.on.setpoint, LOCKSTEP, {})
             _let_happen(loop, day, hours, happened, looks)
             # what is on its way arrives, so that the counts can agree
@@ -152,6 +160,12 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS,
             'mean_error_K': round(mean_error, 6), 'memory_MB': memory}
 
 
+def _recorded(on: FaultPlant) -> tuple[str, str]:
+    """Return the topics of the measured state and of the input."""
+    wiring = on.wiring
+    return wiring.measured[on.states[0]].topic, wiring.commands[on.inputs[0]].topic
+
+
 def _let_happen(loop: FaultHarness, day: Day, hours: float, happened: Counter[str],
                 looks: dict[str, list[tuple[float, float]]]) -> None:
     """Run for so long; count the events, and note each process's memory by plant time."""
@@ -161,7 +175,8 @@ def _let_happen(loop: FaultHarness, day: Day, hours: float, happened: Counter[st
     for number in range(1, _LOOKS + 1):
         while due < number * look:
             loop.run_until(due)
-            event = EVENTS[random.integers(len(EVENTS))]
+            events = EVENTS + day.faults
+            event = events[random.integers(len(events))]
             happened[event] += 1
             _happen(event, day, loop, random)
             due = loop.now + random.exponential(_EVENT_PERIOD)
@@ -200,7 +215,7 @@ def _held_against(trace: LoopTrace, answers: dict[str, int], memory: dict[str, d
         if not seen['growth_when_warm'] <= _GROWTH:
             yield (f'{name} grew by {seen["growth_when_warm"]:.1f} MB after it was warm, '
                    f'{_GROWTH:g} MB are allowed')
-    for topic, sent in (('/temperature', len(trace.delivered)),
-                        ('/coolant_setpoint', len(trace.commands))):
-        if recorded.get(topic) != sent:
-            yield f'the bag holds {recorded.get(topic, 0)} of {sent} messages on {topic}'
+    for topic, sent in zip(_recorded(trace.on), (len(trace.delivered), len(trace.commands)),
+                           strict=True):
+        if recorded.get(f'/{topic}') != sent:
+            yield f'the bag holds {recorded.get(f"/{topic}", 0)} of {sent} messages on /{topic}'

@@ -277,12 +277,13 @@ class FaultHarness:
         yield
         self.trace.end = self.now
 
-    def alter(self, seconds: float, measurements: Alteration = unchanged,
-              commands: Alteration = unchanged) -> None:
-        """Alter messages on their way for a plant time."""
-        self.interceptor.measurements, self.interceptor.commands = measurements, commands
+    def alter(self, seconds: float, **what: Alteration) -> None:
+        """Alter `measurements`, `commands`, `disturbances` or `late` for a plant time."""
+        for name, alteration in what.items():
+            setattr(self.interceptor, name, alteration)
         self.run_for(seconds)
-        self.interceptor.measurements = self.interceptor.commands = unchanged
+        for name in what:
+            setattr(self.interceptor, name, unchanged)
 
     def expect(self, holds: bool, complaint: str) -> None:
         """Hold a sentence against the case where something does not hold."""

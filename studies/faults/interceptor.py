@@ -36,8 +36,10 @@ _BEHIND = 'plant/'  # before the topics of a plant whose messages are altered
 
 def remapped(on: FaultPlant) -> tuple[str, ...]:
     """Return the parameters of a plant whose messages are altered."""
-    topics_ = dict.fromkeys(place.topic for place in (
-        *on.wiring.measured.values(), *on.wiring.commands.values()))
+    wiring = on.wiring
+    topics_ = dict.fromkeys(place.topic for places in (
+        wiring.measured, wiring.commands, wiring.measured_disturbances, wiring.late)
+        for place in places.values())
     return tuple(word for topic in topics_ for word in ('-r', f'{topic}:={_BEHIND}{topic}'))
 
 
@@ -153,12 +155,16 @@ class Interceptor:
 
     :ivar measurements: alteration of measurements on their way to the controller.
     :ivar commands: alteration of commands on their way to the plant.
+    :ivar disturbances: alteration of measured disturbances.
+    :ivar late: alteration of the values of an analyser.
     """
 
     def __init__(self, node: Node, on: FaultPlant, between: bool) -> None:
         self.trace = LoopTrace(on)
         self.measurements: Alteration = unchanged
         self.commands: Alteration = unchanged
+        self.disturbances: Alteration = unchanged
+        self.late: Alteration = unchanged
         self.now = 0.0  # plant time in s since the first measurement
         self._node = node
         self._between = between
@@ -172,6 +178,10 @@ class Interceptor:
         if between:
             self._to_controller = self._publishers(wiring.measured)
             self._to_plant = self._publishers(wiring.commands, _BEHIND)
+            for kind, places in (('disturbances', wiring.measured_disturbances),
+                                 ('late', wiring.late)):
+                self._listen(places, partial(self._pass_on, kind, self._publishers(places)),
+                             before=_BEHIND)
         for kind, topic, callback, qos in (
                 (DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS),
                 (String, topics.EVENT_LOG, self._on_record,
@@ -242,6 +252,11 @@ class Interceptor:
             self._to_controller(arrived)
         if not expected:
             self._actuate([])
+
+    def _pass_on(self, kind: str, publish: Callable[[Packet], None], packet: Packet) -> None:
+        alter: Alteration = getattr(self, kind)
+        for arrived in alter(packet):
+            publish(arrived)
 
     def _expected(self, packet: Packet) -> int | None:
         """Return the stamp of the sample that a packet makes whole, or None."""

@@ -75,7 +75,7 @@ class FaultPlant:
         """Where its signals are."""
         signals = signals_of(load(model_path(self._model)), self.parameters.tuning.controlled,
                              self.parameters.states)
-        return SignalTopics(signals, self.parameters.states, self.parameters.inputs)
+        return SignalTopics.of(signals, self.parameters)
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -165,5 +165,9 @@ SADDLE = FaultPlant(
 PENDULUM = FaultPlant(
     'pendulum', setpoint=(0.0,), other=(0.1,), by_hand=(0.0,), band=math.inf, settle=4.0,
     afterwards=2.0, recovery=2.0, tuned={'states_measured': ('angle [rad]',)})
+# It acts late, a disturbance is measured, and one of its states comes from an analyser.
+HEATED_LINE = FaultPlant(
+    'heated_line', setpoint=(55.0,), other=(50.0,), by_hand=(70.0,), band=0.5, highest=75.0,
+    settle=400.0, afterwards=1500.0, recovery=1200.0)
 PLANTS = {plant.name: plant for plant in (
-    REACTOR, TWO_TANKS, QUADRUPLE_TANK, SADDLE, PENDULUM)}
+    REACTOR, TWO_TANKS, QUADRUPLE_TANK, SADDLE, PENDULUM, HEATED_LINE)}

@@ -62,9 +62,9 @@ def controller_again(loop: FaultHarness, setpoint: tuple[float, ...] = (), dead:
 
 def controller_in_a_step(loop: FaultHarness) -> None:
     """Kill the controller after a step of the set-point."""
-    loop.request(41.0)
+    loop.request(*loop.on.other)
     loop.run_for(15.0)
-    controller_again(loop, (41.0,))
+    controller_again(loop, loop.on.other)
 
 
 def controller_while_disturbed(loop: FaultHarness) -> None:

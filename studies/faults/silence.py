@@ -285,7 +285,7 @@ def silent_pendulum(loop: FaultHarness) -> None:
     """Measure nothing for longer than the filter can predict, then measure again."""
     random = np.random.default_rng(0)
     # as a camera shows one that stands still
-    loop.alter(1.0, value(lambda *_: float(random.normal(0.0, 0.026))))
+    loop.alter(1.0, measurements=value(lambda *_: float(random.normal(0.0, 0.026))))
     altered(loop, lost, 10.0)
     _expect_error(loop)
     before = len(loop.trace.commands)

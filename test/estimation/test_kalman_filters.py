@@ -162,6 +162,9 @@ def test_a_state_that_cannot_be_seen_is_refused(A, B, hidden):
             kalman(ExtendedKalmanFilter, model, first(model, 1))
     else:
         assert kalman(ExtendedKalmanFilter, model, first(model, 1))
+        # also where the disturbance hardly wanders, as by default with a long dead time
+        assert kalman(ExtendedKalmanFilter, model, first(model, 1),
+                      disturbance_noise=1e-9)
 
 
 def saddle(model: LiftedModel = TRUTH, **changes: object) -> Controller:

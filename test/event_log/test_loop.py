@@ -54,13 +54,15 @@ HAPPENS = st.one_of(
               st.sampled_from([0.0, 0.0, 3.5, 1e6])),
     st.tuples(st.just('manual'), st.floats(COOLANT - 30.0, COOLANT + 30.0) | st.just(np.inf)),
     st.tuples(st.just('mode'), st.sampled_from(Mode)),
-    st.tuples(st.just('clear')), st.tuples(st.just('analysis'), st.floats(0.0, 30.0), NEAR),
+    st.tuples(st.just('clear')),
+    st.tuples(st.just('analysis'), st.floats(0.0, 30.0), NEAR | st.sampled_from([np.nan, np.inf])),
     st.tuples(st.just('applied'), st.floats(COOLANT - 30.0, COOLANT + 30.0)),
     st.tuples(st.just('exchange'), st.sampled_from([
         {'model': 'reactor_nz3'}, {'model': 'reactor_nz4'}, {'coolant_temperature.weight': 0.3},
         {'model': 'reactor_linear', 'observer_bandwidth': 0.0}, {'observer_bandwidth': 0.1},
         {'setpoint_filter_time': 20.0, 'temperature.setpoint_ramp': 0.1},
         {'coolant_temperature.rate_limit': 0.2}, {'safe_latch': True},
+        {'coolant_temperature.dead_time': 20.0}, {'coolant_temperature.dead_time': 2.5},
         {'estimator': 'extended_kalman_filter', 'temperature.analysis_delay': 60.0}])),
     st.tuples(st.just('snapshot')))
 

@@ -16,7 +16,7 @@ import pytest
 import rclpy
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.demo import retraining_demo, setpoint_demo
+from koopman_ros.demo import line_demo, retraining_demo, setpoint_demo
 from koopman_ros.event_log.records import parse
 from koopman_ros.event_log.run import replay_records
 from koopman_ros.records import read_messages, summary
@@ -70,6 +70,22 @@ def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_le
             tmp_path / 'measured.mcap', [f'/{topics.EVENT_LOG}']))
     assert len(replayed.samples) > 240
     assert all(one.recorded == one.replayed for one in replayed.samples)
+
+
+def test_a_late_loop_costs_what_its_optimum_costs_and_less_than_pi_control(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, number in (('STEPS', ((20.0, 333.15), (300.0, 321.15))), ('FEED_TIME', 600.0),
+                         ('_DURATION', 900.0)):
+        monkeypatch.setattr(line_demo, name, number)
+    assert setpoint_demo.main(
+        ['--plant', 'heated_line', '--speed', '0', '--output', str(tmp_path)]) == 0
+    result = json.loads((tmp_path / 'summary.json').read_text())
+    learned, pi, smith = (result[name] for name in ('learned', 'pi', 'smith_predictor'))
+    assert 0.98 < learned['cost_by_optimum'] < 1.03
+    assert min(pi['cost_by_optimum'], smith['cost_by_optimum']) > 1.1
+    assert max(learned['overshoot_up'], learned['overshoot_down']) < 0.2
+    assert learned['feed_peak'] < 1.1 * result['optimum']['feed_peak']
+    assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
 
 
 def test_demo_says_in_one_line_why_it_cannot_run(

@@ -10,6 +10,7 @@ import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
@@ -22,6 +23,7 @@ from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.plants import sensor_noise
 from koopman_ros.ros import topics
+from koopman_ros.ros.simulated_plant import Analyser
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from support.nodes import seconds, temperature, value
@@ -187,6 +189,23 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
     # of one measurement one topic is heard first
     stamps = {seconds(message) for message in concentrations[:20]}
     ros.wait_until(lambda: stamps <= {seconds(message) for message in bench.measured})
+
+
+def test_an_analyser_measures_rarely_and_its_values_come_late() -> None:
+    sent: list[tuple[int, int, float]] = []
+    publisher = SimpleNamespace(send=lambda values, stamp, _: sent.append(
+        (now, stamp.sec, float(values[0]))))
+    analyser = Analyser(publisher, 1, 180 * 10 ** 9, 120 * 10 ** 9)
+    for now in range(0, 600, 7):
+        analyser.sample(now * 10 ** 9, np.array([-1.0, float(now)]), 'plant')
+    assert [(stamp, shown) for _, stamp, shown in sent] == [(0, 0.0), (182, 182.0), (364, 364.0)]
+    assert [came - stamp for came, stamp, _ in sent] == [126, 126, 126]
+
+
+def test_a_valve_of_equal_percentage_needs_its_range() -> None:
+    table = PlantTable({'system': 'heated_line'})
+    assert 'set valve.min and valve.max' in table.check(table.amended(
+        table.snapshot({}), **{'valve.max': 1e9}))
 
 
 def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> None:

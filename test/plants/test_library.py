@@ -74,6 +74,19 @@ def test_two_tanks_are_held_by_the_pumps_that_make_up_for_their_outflow():
                                [flow[0] / 3.3, (flow[1] - flow[0]) / 3.3], rtol=1e-12)
 
 
+def test_the_heated_line_conserves_energy_and_matter_at_rest():
+    # by hand, in mol, J and s: what is fed, and what leaves, reacts and is exchanged
+    system = plant('heated_line')
+    for celsius in (40.0, 50.0, 60.0):
+        (c, kelvin), (valve,) = steady_state(system, {'temperature': 273.15 + celsius})
+        reacted = 0.5e-3 * (2000.0 - 1000.0 * c)
+        assert reacted == pytest.approx(
+            0.3 * 4.41e5 * np.exp(-5650.0 / kelvin) * 1000.0 * c, rel=1e-9)
+        jacket = 15.0 + 0.8 * valve
+        assert 0.5e-3 * 4.18e6 * (celsius - 20.0) == pytest.approx(
+            3e3 * (jacket - celsius) + 5.8e4 * reacted, rel=1e-9)
+
+
 def test_a_pendulum_without_friction_keeps_its_energy_and_with_it_comes_to_hang():
     free = plant('pendulum', friction=0.0)
     run = simulate(free, [1.0, 0.5], np.zeros((100, 1)), 0.05)

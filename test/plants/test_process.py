@@ -161,6 +161,29 @@ def test_an_input_reaches_no_further_than_its_range_also_when_that_narrows() -> 
     assert replace(plant, actuator=Actuator()).until(3 * SECOND).u[0] == 2.0
 
 
+def test_a_valve_of_equal_percentage_multiplies_its_gain_from_end_to_end() -> None:
+    valve = Actuator(0.0, 100.0, rangeability=20.0)
+    u = np.linspace(0.0, 100.0, 101)[:, None]
+    effect = valve.effect(u)
+    np.testing.assert_allclose(effect[[0, -1], 0], [0.0, 100.0], atol=1e-12)
+    # equal percentage: the gain grows by the same factor for each percent, by 20 in all
+    np.testing.assert_allclose(np.diff(effect[:, 0], 2) / np.diff(effect[:-1, 0]),
+                               20.0 ** 0.01 - 1.0, rtol=1e-9)
+    np.testing.assert_allclose(valve.position(effect), u, atol=1e-9)
+    # of two inputs the other one is linear
+    two = Actuator(0.0, 100.0, rangeability=np.array([1.0, 20.0]))
+    np.testing.assert_allclose(two.effect(np.array([30.0, 30.0])), [30.0, effect[30, 0]])
+    # the plant shows the position and feels the effect, with a lag before it, too
+    plant = given(actuated(replace(valve, lag=1e-3)), 30.0).until(3600 * SECOND)
+    assert plant.u[0] == 30.0
+    assert plant.x[0] == pytest.approx(-effect[30, 0] * GAIN / SLOPE, rel=1e-9)
+    plant = given(actuated(replace(valve, lag=2.0)), 30.0).until(SECOND)
+    moved = np.linspace(0.0, 1.0, 2001)
+    acted = valve.effect(30.0 * (1.0 - np.exp(-moved / 2.0))[:, None])[:, 0]
+    assert plant.x[0] == pytest.approx(
+        np.trapezoid(GAIN * acted * np.exp(SLOPE * (1.0 - moved)), moved), rel=1e-6)
+
+
 # The sensor.
 
 def test_noise_repeats_by_seed_and_sample() -> None:

@@ -31,7 +31,8 @@ REACTORS = [one_state_reactor, two_state_reactor]
 PLANTS = {
     'two_state_example': [0.5, 1.5, -2.0], 'reactor': [310.0, 324.0, 360.0],
     'two_state': [310.0, 324.0, 360.0], 'two_tanks': [0.02, 0.1, 0.4],
-    'quadruple_tank': [0.02, 0.1, 0.4], 'pendulum': [-2.0, 0.1, 3.0], '': [0.3, 0.7, 2.0]}
+    'quadruple_tank': [0.02, 0.1, 0.4], 'pendulum': [-2.0, 0.1, 3.0],
+    'heated_line': [290.0, 323.0, 360.0], '': [0.3, 0.7, 2.0]}
 
 
 @pytest.fixture(params=PLANTS)
@@ -39,7 +40,7 @@ def plant_and_states(request):
     system = plant_class(request.param)().system() if request.param else scalar_example()
     rng = np.random.default_rng(0)
     states = np.array(PLANTS[request.param])[:, None] + rng.uniform(0.0, 0.5, (3, system.n_x))
-    if request.param == 'two_state':
+    if request.param in ('two_state', 'heated_line'):
         states[:, 0] = [0.9, 0.5, 0.1]
     return system, states
 
@@ -210,7 +211,8 @@ def test_training_is_told_everything_of_a_plant_but_its_drift():
     system = plant_class('two_tanks')().system()
     known = describe(system)
     # which it has of a B that is to be learned
-    names = {field.name for field in fields(known)} - {'input_matrix_degree', 'disturbance_names'}
+    names = {field.name for field in fields(known)} - {
+        'input_matrix_degree', 'disturbance_names', 'characteristics'}
     for name in names:
         np.testing.assert_array_equal(getattr(known, name), getattr(system, name))
     assert {field.name for field in fields(system)} - names == {

@@ -18,8 +18,11 @@ from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
 from studies.faults.cases import CASES, refused_values
 from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
+from studies.faults.interceptor import value
 from studies.faults.judge import judge
-from studies.faults.plants import FaultPlant, QUADRUPLE_TANK, REACTOR, TWO_TANKS
+from studies.faults.late import reloaded
+from studies.faults.plants import FaultPlant, HEATED_LINE, QUADRUPLE_TANK, REACTOR, TWO_TANKS
+from studies.faults.processes import second_controller
 from studies.faults.report import write
 from support.recorded_runs import Recorded, STEADY
 
@@ -120,6 +123,20 @@ def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_p
     assert judge(found, replace(case, missing=()))['reasons'] != []
 
 
+def test_a_late_loop_is_held_without_its_analyser_and_feed_and_with_another_dead_time(
+        tmp_path: Path) -> None:
+    case = CASES['heated_line-feed-nan']
+
+    def play(loop: FaultHarness) -> None:
+        loop.interceptor.late = value(lambda *_: math.nan)
+        reloaded(loop, 32.0)
+        case.play(loop)
+
+    result, _ = run(replace(case, play=play, settle=200.0, afterwards=100.0, recovery=0.0),
+                    tmp_path)
+    assert result['reasons'] == []
+
+
 def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
     found = run_endurance(tmp_path / 'soak', lambda: None, hours=0.03)
     assert found['reasons'] == []
@@ -127,7 +144,7 @@ def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
     assert set(found['recorded'].values()) == {found['answers']['answered']}
 
 
-@pytest.mark.parametrize('on', [REACTOR, TWO_TANKS, QUADRUPLE_TANK])
+@pytest.mark.parametrize('on', [REACTOR, TWO_TANKS, QUADRUPLE_TANK, HEATED_LINE])
 def test_refused_values_are_of_parameters_that_exist(on: FaultPlant) -> None:
     names = {name for change in refused_values(on) for name in change}
     assert names <= set(on.table.rows)
@@ -148,7 +165,7 @@ def test_report_and_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert json.loads((tmp_path / 'summary.json').read_text())['results']['bias'][
         'time_to_recover_s'] is None
     assert write(tmp_path, {'good': good, 'skipped': skipped})
-    assert len(CASES) == 167
+    assert len(CASES) == 191
     assert main(['sensor', 'feed-warm', '--list']) == 0
     assert 'nan-short' in capsys.readouterr().out
     with pytest.raises(SystemExit):

@@ -29,6 +29,9 @@ from studies.shipped_models import (
     FEED,
     library_system,
     LIFTS,
+    LINE,
+    LINE_VALVE,
+    line_with_feed,
     reactor_with_feed,
     SADDLE,
     SEED,
@@ -120,6 +123,20 @@ def test_the_lift_with_the_feed_temperature_knows_its_effect():
         state_upper=327.0, hold_time=(0.5, 5.0), sample_period=SAMPLE_PERIOD)
     assert roll_out_error(model.joined, [
         random_steps(system, design, 15.0, 7001)]) <= PROMISED_KELVIN[4]
+
+
+def test_the_lift_of_the_heated_line_knows_its_feed_its_valve_and_its_line():
+    model = load(model_path(LINE))
+    assert model.dead_time.tolist() == [LINE_VALVE.dead_time]
+    assert model.provenance.metrics['rw'] <= PROMISED_FIT[4]
+    design = RandomStepDesign(
+        input_lower=[10.0, 284.0], input_upper=[90.0, 302.0], state_lower=[0.15, 308.0],
+        state_upper=[0.5, 338.0], hold_time=(60.0, 240.0), sample_period=30.0)
+    run = random_steps(line_with_feed(), design, 3600.0, 7001)
+    # of the lift, and of the straight pieces of its characteristic
+    u = np.column_stack([LINE_VALVE.position(run.u[:, :1]), run.u[:, 1]])
+    predicted = model.joined.predict(run.x[0], u, design.sample_period)
+    np.testing.assert_allclose(predicted, run.x, rtol=0.0, atol=0.04)
 
 
 def test_the_linear_model_is_the_linearisation_and_predicts_far_worse(episodes):
