@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 import re
 import sys
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 
 from koopman_ros.demo.reactor import constant
+from koopman_ros.model import load
 from koopman_ros.nodes import trainer
 from koopman_ros.records import summary
 from koopman_ros.testing import Harness
@@ -23,26 +23,31 @@ STATUS = 'trainer: training'
 QUICK = {'model_class': 'identity lift', 'lifted_dimension': 2, 'restarts': 1}
 
 
-def train_instead(patch: pytest.MonkeyPatch, summary: dict[str, Any]) -> None:
-    """Have processes that train answer with a summary; the class of their task is the reason."""
-    patch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
-        sys.executable, '-c', 'import json; task = json.loads(input()); print(json.dumps('
-        f'{{"summary": {{**json.loads({json.dumps(summary)!r}), '
-        '"reasons": [task["model_class"]]}}))'))
-
-
-def test_a_terminal_shows_a_bar_and_the_accepted_model(
-        monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    train_instead(monkeypatch, {
-        'accepted': True, 'model_class': 'linear', 'model_file': 'new.safetensors',
-        'units': {'temperature': 'K'}, 'heldout_error': {'temperature': 0.1},
-        'heldout_error_of_current_model': {'temperature': 2.0}})
-    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True)
-    assert run_here(trainer, task='train', bags='[run]') == 0
-    said = capfd.readouterr().err
-    assert re.search(r'\|#{30}\| +100 %', said)
-    assert ('the new model (linear) is accepted: its error on held-out data is 0.1 K, that of the '
-            'current model 2 K; written to new.safetensors') in said
+def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Path) -> None:
+    """Six minutes of a reactor whose jacket has fouled."""
+    bag = write_bag(tmp_path / 'run.mcap', driven(reactor(0.8), 6.0))
+    # a terminal of its own, whose output goes to the log
+    program = ('import pty, os, sys; '
+               'sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))')
+    process = ros.start('trainer', {
+        **QUICK, 'task': 'train', 'bags': [bag], 'model_output': tmp_path / 'new.safetensors'},
+        command=(sys.executable, '-c', program, sys.executable, '-m', 'koopman_ros.nodes.trainer'))
+    assert ros.wait_for_end(process) == 0, process.output()
+    printed = process.output()
+    shares = [int(share) for share in re.findall(r'\|[#-]{30}\| +(\d+) %', printed)]
+    assert shares == sorted(shares)
+    assert len(shares) > 3
+    assert shares[-1] == 100
+    assert 'estimating: drift of degree' in printed
+    assert re.search(r'the new model \(.+\) is accepted: its error on held-out data is 0\.\d+ '
+                     r'K, that of the current model \d\.\d+ K; written to '
+                     rf'{tmp_path}/new\.safetensors',
+                     printed)
+    assert {'new.free_run.png', 'new.json', 'new.md', 'new.png', 'new.safetensors'} == {
+        path.name for path in tmp_path.glob('new.*') if 'alternative' not in path.name}
+    assert load(tmp_path / 'new.safetensors').n_z == 2
+    # no bag is recorded meanwhile
+    assert not list(tmp_path.glob('koopman_ros_*'))
 
 
 @pytest.mark.parametrize('name', ['best', 'neural drift'])
@@ -56,7 +61,10 @@ def test_class_is_passed_on_and_each_that_was_learned_is_shown(
         'free lift': {'chosen': False, 'refusal': 'it has lost a state', 'seconds': 2.0}}
     end = {'accepted': False, 'model_class': 'linear', 'model_file': '',
            'units': {'temperature': 'K'}, 'classes': learned}
-    train_instead(monkeypatch, end)
+    monkeypatch.setattr('koopman_ros.execution.training.TrainingJob.command', lambda *_: (
+        sys.executable, '-c', 'import json; task = json.loads(input()); print(json.dumps('
+        f'{{"summary": {{**json.loads({json.dumps(end)!r}), "reasons": [task["model_class"]]}}}}))'
+    ))
     assert run_here(trainer, task='train', bags='[run]', model_class=name) == 2
     said = capfd.readouterr().err
     assert re.search(rf'\[WARN\].*the new model \(.+\) is rejected: {name}\n', said)
