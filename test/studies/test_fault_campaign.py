@@ -22,7 +22,6 @@ from studies.faults.interceptor import value
 from studies.faults.judge import judge
 from studies.faults.late import reloaded
 from studies.faults.plants import FaultPlant, HEATED_LINE, QUADRUPLE_TANK, REACTOR, TWO_TANKS
-from studies.faults.processes import second_controller
 from studies.faults.report import write
 from support.recorded_runs import Recorded, STEADY
 
