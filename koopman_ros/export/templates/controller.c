@@ -7,7 +7,6 @@
 
 #include <math.h>
 #include <stddef.h>
-#include <string.h>
 
 @TABLES@
 
@@ -268,24 +267,28 @@ static mat secants(int rows, const double *O, mat x, mat x_ref, mat w, mat *H) {
     return M;
 }
 
-/* The drift f (NX, 1) and its derivative J (NX, NX), of the model or of its linearisation */
+/* The drift f (NX, 1) and, where J is not NULL, its derivative J (NX, NX), of the model or of its
+ * linearisation */
 static mat drift(int linear, mat x, mat *J) {
-    mat N, AN, slope, bend, pre = of(NX, NX, PRE_FEEDBACK), bent = zeros(NX, NX);
-    *J = of(NX, NX, SLOPE);
-    if (linear) return mul(*J, x);
-    if (READ_OUT) return lift(NX, MODEL_READOUT, x, J);
+    mat N = of(NX, NX, SLOPE), AN, slope, bend, pre = of(NX, NX, PRE_FEEDBACK), f = mul(N, x);
+    mat bent = zeros(NX, NX);
+    if (READ_OUT && !linear) f = lift(NX, MODEL_READOUT, x, &N);
+    if ((READ_OUT || linear) && J) *J = N;
+    if (READ_OUT || linear) return f;
     /* f = N'^+ A N, and the derivative of N''N' f = N''A N by each state */
     mat rate = lift(NZ, RATE, x, &AN);
     lift(NZ, LIFT, x, &N);
-    mat onto = inverse(N), f = mul(onto, rate), rest = plus(rate, -1.0, mul(N, f));
-    EACH(k, N_PHI) {
+    mat onto = inverse(N), rest;
+    f = mul(onto, rate);
+    rest = plus(rate, -1.0, mul(N, f));
+    EACH(k, J ? N_PHI : 0) {
         double share = 0.0;
         feature(k, x, &slope, &bend);
         EACH(i, NZ) share += LIFT[i * N_PSI + NX + k] * rest.a[i];
         bent = plus(bent, share, bend);
         of_feature(k, LIFT, scaled(-1.0, transposed(mul(bend, f))), &AN);
     }
-    *J = plus(mul(onto, plus(AN, 1.0, mul(transposed(onto), bent))), -1.0, pre);
+    if (J) *J = plus(mul(onto, plus(AN, 1.0, mul(transposed(onto), bent))), -1.0, pre);
     return plus(f, -1.0, mul(pre, x));
 }
 
@@ -302,13 +305,15 @@ static mat input_matrix(int linear, mat x, mat u, mat *J) {
     return B;
 }
 
-/* f(x) + B(x) u + w, and its derivative J (NX, NX + NU) by x and u */
+/* f(x) + B(x) u + w and, where J is not NULL, its derivative J (NX, NX + NU) by x and u */
 static mat rate_under(int linear, mat x, mat u, mat w, mat *J) {
     mat slope, by_input, B = input_matrix(linear, x, u, &by_input);
-    mat f = drift(linear, x, &slope);
-    *J = zeros(NX, NXU);
-    put(J, 0, 0, plus(slope, 1.0, by_input));
-    put(J, 0, NX, B);
+    mat f = drift(linear, x, J ? &slope : NULL);
+    if (J) {
+        *J = zeros(NX, NXU);
+        put(J, 0, 0, plus(slope, 1.0, by_input));
+        put(J, 0, NX, B);
+    }
     return plus(plus(f, 1.0, mul(B, u)), 1.0, w);
 }
 
@@ -379,8 +384,8 @@ static int doubled(mat D, mat G, mat *H) {
     return 0;
 }
 
-/* D, G and P of the discrete equation that `doubled` solves, of a plant F over an interval with the
- * weights W, or of one in continuous time. */
+/* D, G and P of the equation that `doubled` solves, of a plant F over an interval with the weights
+ * W, or of one in continuous time. */
 static void reduced(mat F, mat W, int held, mat *D, mat *G, mat *P) {
     int n = F.n - NU;
     mat A = block(F, 0, 0, n, n), B = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
@@ -609,8 +614,8 @@ static int predicted(int linear, koopman_estimate *e, const double *input, doubl
         mat sum = zeros(NX, WIDTH);
         EACH(stage, STAGES) {
             mat at = plus(all, AHEAD[stage] * h, rate), x = block(at, 0, 0, NX, 1);
-            x = rate_under(linear, x, deviation(OF_U, input), of(NX, 1, e->w), &J);
-            rate = mul(block(J, 0, 0, NX, NX), at);
+            x = rate_under(linear, x, deviation(OF_U, input), of(NX, 1, e->w), KALMAN ? &J : NULL);
+            if (KALMAN) rate = mul(block(J, 0, 0, NX, NX), at);
             put(&rate, 0, 0, x);
             EACH(i, KALMAN ? NX : 0) rate.a[i * WIDTH + 1 + NX + i] += 1.0;
             sum = plus(sum, PARTS[stage], rate);
@@ -651,8 +656,8 @@ static void correct(koopman_estimate *e, mat x, double seconds) {
 /* Start from a measured state: with the disturbance as known, or where u is not NULL the one under
  * which u and the measured disturbances, of the rate `feed`, hold the plant. */
 static void restart(int linear, koopman_estimate *e, mat x, const mat *u, mat feed) {
-    mat w = e->known ? of(NX, 1, e->w) : zeros(NX, 1), J;
-    if (u) w = as_disturbance(scaled(-1.0, rate_under(linear, x, *u, zeros(NX, 1), &J)));
+    mat w = e->known ? of(NX, 1, e->w) : zeros(NX, 1);
+    if (u) w = as_disturbance(scaled(-1.0, rate_under(linear, x, *u, zeros(NX, 1), NULL)));
     if (u && ND > 0) w = as_disturbance(plus(w, -1.0, feed));
     store(x, e->x);
     store(w, e->w);
@@ -673,9 +678,9 @@ static int model_level(const koopman_supervisor *s) {
 
 /* Transfer an estimate from the model of a level to that of another; the plant's rate stays. */
 static void transfer(koopman_estimate *e, int before, int now) {
-    mat J, x = of(NX, 1, e->x), w = of(NX, 1, e->w);
+    mat x = of(NX, 1, e->x), w = of(NX, 1, e->w);
     if (LINEAR[before] == LINEAR[now] || !e->known) return;
-    w = plus(plus(w, 1.0, drift(LINEAR[before], x, &J)), -1.0, drift(LINEAR[now], x, &J));
+    w = plus(plus(w, 1.0, drift(LINEAR[before], x, NULL)), -1.0, drift(LINEAR[now], x, NULL));
     store(as_disturbance(w), e->w);
 }
 
@@ -707,9 +712,11 @@ static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double 
 static void enqueue(koopman_state *s, int64_t time, const double *u) {
     while (s->queued > 0 && s->applied_at[s->queued - 1] >= time) s->queued--;
     if (s->queued == QUEUE) {
-        memmove(s->applied_at, s->applied_at + 1, sizeof s->applied_at - sizeof *s->applied_at);
-        memmove(s->applied, s->applied + 1, sizeof s->applied - sizeof *s->applied);
         s->queued--;
+        EACH(k, s->queued) {
+            s->applied_at[k] = s->applied_at[k + 1];
+            store(of(NU, 1, s->applied[k + 1]), s->applied[k]);
+        }
     }
     s->applied_at[s->queued] = time;
     store(of(NU, 1, u), s->applied[s->queued++]);
