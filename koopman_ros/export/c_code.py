@@ -46,8 +46,9 @@ CODES = tuple(StatusCode[name] for name in (
 _WITHOUT_TABLE = re.compile(
     r'MODEL_(PROVENANCE|TIME_UNIT|PRE_FEEDBACK|DEAD_TIME)|OBSERVABLES_(V|IDENTITY|EXPONENTS)'
     r'|(STATES|INPUTS|DISTURBANCES)_(NAMES|UNITS|LOWER|UPPER)|DISTURBANCES_TIMEOUT|SENSOR_DEADBAND'
-    r'|ESTIMATOR|(MEASUREMENT|DISTURBANCE|ANALYSIS)_NOISE|INITIAL_ERROR|UNCERTAIN_NOISE_FACTOR'
-    r'|FALLBACK_ORDER|(LEARNED|LINEAR)_MODEL_MARGIN|SAFE_VALUE|PLUGINS')
+    r'|TUNING_((STATE|INPUT)_WEIGHT|DEAD_TIME|CONTROLLED|OBSERVER_BANDWIDTH|MAX_DISTURBANCE'
+    r'|(MEASUREMENT|DISTURBANCE|ANALYSIS)_NOISE|INITIAL_ERROR|UNCERTAIN_NOISE_FACTOR|ESTIMATOR'
+    r'|FALLBACK_ORDER|(LEARNED|LINEAR)_MODEL_MARGIN|SAFE_VALUE|PLUGINS)')
 
 
 class ExportError(ValueError):
@@ -129,12 +130,13 @@ def _fields(controller: Controller, code: str) -> dict[str, Any]:
     found: dict[str, Any] = dict.fromkeys(re.findall(_OPTIONAL, code), np.zeros(0))
     found['TRAINING_STATES_FILL_DISTANCE'] = 0.0
     for remedy, values in (('train a model without it', _walk(model, 'MODEL_')),
-                           ('set it to 0 or false', _walk(controller.tuning, ''))):
+                           ('set it to 0 or false', _walk(controller.tuning, 'TUNING_'))):
         for name, value in values:
             if re.search(rf'\b{name}\b', code):
                 found[name] = np.zeros(0) if value is None else value
             elif not _WITHOUT_TABLE.fullmatch(name) and value is not None and np.any(value):
-                raise ExportError(f'{name.lower()} cannot be exported: {remedy}')
+                raise ExportError(f'{name.lower().removeprefix("tuning_")} cannot be exported: '
+                                  f'{remedy}')
     return found | {count: len(found[name]) for count, name in _COUNTED.items()}
 
 

@@ -417,9 +417,9 @@ static int gain_of(mat F, mat W, int held, mat P, mat *K) {
     mat rest = plus(plus(Q, 1.0, square), -1.0, feedback);
     rest = plus(plus(rest, 1.0, PA), 1.0, transposed(PA));
     double terms = size(Q) + 2.0 * size(PA) + size(square) + size(feedback);
-    if (!(size(rest) / terms <= MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
-    return contracts(scaled(1.0 / MAX_GAIN / MAX_GAIN, mul(*K, transposed(*K)))) ? KOOPMAN_OK
-        : KOOPMAN_GAIN_TOO_LARGE;
+    if (!(size(rest) / terms <= TUNING_MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
+    right = scaled(1.0 / TUNING_MAX_GAIN, *K);
+    return contracts(mul(right, transposed(right))) ? KOOPMAN_OK : KOOPMAN_GAIN_TOO_LARGE;
 }
 
 /* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
@@ -846,8 +846,8 @@ static void disturbed(koopman_state *s, const double *d) {
 static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
     EACH(i, finite(of(NU, 1, applied)) ? NU : 0)
-        last[i] = within(s->command[i], applied[i] - TRACKING_TOLERANCE[i],
-                         applied[i] + TRACKING_TOLERANCE[i]);
+        last[i] = within(s->command[i], applied[i] - TUNING_TRACKING_TOLERANCE[i],
+                         applied[i] + TUNING_TRACKING_TOLERANCE[i]);
 }
 
 /* Check a measurement and take it into account: the state that it stands for, in its units, and
@@ -896,7 +896,7 @@ static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, 
     koopman_supervisor next = {to.level, -1, to.status, to.cause, NEVER, NEVER};
     if (to.level == KOOPMAN_HOLD) {
         next.bad_since = s->bad_since == NEVER ? now : s->bad_since;
-        int too_long = (double)(now - next.bad_since) / SECOND > HOLD_TIMEOUT;
+        int too_long = (double)(now - next.bad_since) / SECOND > TUNING_HOLD_TIMEOUT;
         if (too_long) next.status = KOOPMAN_HELD_TOO_LONG;
         if (too_long || (s->level == KOOPMAN_SAFE && s->bad_since != NEVER)) {
             next.level = KOOPMAN_SAFE;
@@ -905,7 +905,7 @@ static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, 
     }
     if (to.passing && from < next.level) next.resumes = from;
     else if (to.passing && next.level == KOOPMAN_HOLD && from > KOOPMAN_HOLD) next.level = from;
-    else if (next.level < from && (double)(now - better) / SECOND < RECOVERY_TIME)
+    else if (next.level < from && (double)(now - better) / SECOND < TUNING_RECOVERY_TIME)
         next = (koopman_supervisor){from, -1, s->status == KOOPMAN_OK ? KOOPMAN_OK
                                     : KOOPMAN_RECOVERING, s->cause, s->bad_since, better};
     return next;
@@ -966,7 +966,7 @@ static void recover(koopman_state *s, int fault, double outside) {
     if (was) {
         double change = outside - s->farthest, still = 0.03 * (1.0 + s->farthest);
         if (!(change > still || (change < -still && !s->led))) {
-            s->led = s->led || since(s, s->resting_since) >= 3.0 * RECOVERY_TIME;
+            s->led = s->led || since(s, s->resting_since) >= 3.0 * TUNING_RECOVERY_TIME;
             s->nearest = smaller(s->nearest, outside);
             return;
         }
@@ -978,7 +978,7 @@ static void recover(koopman_state *s, int fault, double outside) {
 
 /* Let the offset of a bumpless transfer fade with d (1 + t/T) exp(-t/T). */
 static void fade(koopman_state *s, double seconds) {
-    double share = seconds / BUMPLESS_TRANSFER_TIME, offset = 0.0, feed = 0.0;
+    double share = seconds / TUNING_BUMPLESS_TRANSFER_TIME, offset = 0.0, feed = 0.0;
     EACH(i, NU) {
         s->offset[i] = exp(-share) * (s->offset[i] + share * s->feed[i]);
         s->feed[i] *= exp(-share);
@@ -1018,7 +1018,7 @@ static mat automatic(koopman_state *s, int fault, double outside, double elapsed
     transfer(&s->estimate, from, model_level(&s->supervisor));
     if (targeted && !CONTROLS_ALL) store(target, s->target);
     if (level < LAWS) {
-        if (s->law != level && s->commanded && BUMPLESS_TRANSFER_TIME > 0.0) {
+        if (s->law != level && s->commanded && TUNING_BUMPLESS_TRANSFER_TIME > 0.0) {
             EACH(i, NU) s->offset[i] = s->feed[i] = s->command[i] - u.a[i];
             s->transferring = 1;
         } else if (s->transferring) {
@@ -1049,12 +1049,13 @@ static void command(koopman_state *s, int fault, double outside, double elapsed,
 static void advance(koopman_state *s, mat state, double seconds) {
     EACH(i, NC) {
         int k = CONTROLLED[i];
-        double *active = s->setpoint + i, *ramped = s->ramped + i, share;
-        double reach = isinf(SETPOINT_RAMP[i]) ? INFINITY : SETPOINT_RAMP[i] * seconds;
+        double *active = s->setpoint + i, *ramped = s->ramped + i;
+        double filter = TUNING_SETPOINT_FILTER_TIME;
+        double share = filter > 0.0 ? -expm1(-seconds / filter) : 1.0;
+        double ramp = TUNING_SETPOINT_RAMP[i], reach = isinf(ramp) ? INFINITY : ramp * seconds;
         if (!s->active) *active = *ramped = within(state.a[k], STATES_LOWER[k], STATES_UPPER[k]);
         if (isnan(s->requested[i])) s->requested[i] = *active;
         *ramped = within(s->requested[i], *ramped - reach, *ramped + reach);
-        share = SETPOINT_FILTER_TIME > 0.0 ? -expm1(-seconds / SETPOINT_FILTER_TIME) : 1.0;
         *active += share * (*ramped - *active);
     }
     s->active = 1;
