@@ -86,7 +86,7 @@ static double size(mat A) {
     return sqrt(sum);
 }
 
-static int finite(mat A) {
+static int all_finite(mat A) {
     EACH(k, A.m * A.n) if (!isfinite(A.a[k])) return 0;
     return 1;
 }
@@ -164,7 +164,7 @@ static double apart(const double *a, const double *b) {
 static double distance(mat state) {
     mat x = deviation(OF_X, state.a);
     double out = 0.0, nearest = INFINITY;
-    if (!finite(x)) return INFINITY;
+    if (!all_finite(x)) return INFINITY;
     EACH(i, NX)
         out = larger(out, larger(CORNERS[i] - x.a[i], x.a[i] - CORNERS[NX + i]) / HALF_WIDTH[i]);
     EACH(k, N_TRAINING) nearest = smaller(nearest, apart(TRAINING_STATES_STATES + k * NX, x.a));
@@ -379,7 +379,7 @@ static int doubled(mat D, mat G, mat *H) {
         *H = symmetric(plus(plus(*H, 1.0, HY), 1.0, mul(transposed(D), HY)));
         G = symmetric(plus(plus(G, 1.0, AV), 1.0, mul(AV, transposed(D))));
         D = plus(plus(D, 1.0, Y), 1.0, mul(D, Y));          /* A (I + Y) - I */
-        if (size(plus(one, 1.0, D)) < 1e-10) return finite(*H);
+        if (size(plus(one, 1.0, D)) < 1e-10) return all_finite(*H);
     }
     return 0;
 }
@@ -427,7 +427,7 @@ static int gain_of(mat F, mat W, int held, mat P, mat *K) {
 static int riccati(mat A, mat B, double h, mat *K) {
     int n = A.n, N = n + NU, held = h > 0.0;
     mat F = zeros(N, N), W = F, D, G, P;
-    if (!finite(A) || !finite(B)) return KOOPMAN_NOT_STABILISABLE;
+    if (!all_finite(A) || !all_finite(B)) return KOOPMAN_NOT_STABILISABLE;
     put(&F, 0, 0, A);
     put(&F, 0, n, B);
     EACH(i, NX) W.a[i * N + i] = STATE_WEIGHT[i];
@@ -442,7 +442,7 @@ static int decays(mat slope, mat B, mat K, double h) {
     mat F = zeros(NXU, NXU), W = F;
     put(&F, 0, 0, h > 0.0 ? slope : plus(slope, -1.0, mul(B, K)));
     if (h > 0.0) put(&F, 0, NX, B);
-    if (!finite(F) || !finite(K)) return 0;
+    if (!all_finite(F) || !all_finite(K)) return 0;
     over_interval(h > 0.0 ? h : 1.0, &F, &W);
     return contracts(plus(plus(diagonal(NX, 1.0), 1.0, block(F, 0, 0, NX, NX)), -1.0,
                           mul(block(F, 0, NX, NX, NU), K)));
@@ -497,7 +497,7 @@ static int law(int linear, const koopman_estimate *estimate, mat target, double 
     if (status != KOOPMAN_OK) return status;
     if (!decays(slope, push, mul(K, M), h)) return KOOPMAN_PREDICTED_UNSTABLE;
     *u = physical(OF_U, plus(u_ref, -1.0, mul(K, e)));
-    if (!finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
+    if (!all_finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
     *u = limited(*u, NULL, 0.0);
     return KOOPMAN_OK;
 }
@@ -518,7 +518,7 @@ static int equilibrium(int linear, mat w, const double *reach, mat anchor, mat *
             away.a[k] *= reach[k] > 0.0;
             free += reach[k] > 0.0;
         }
-        if (!finite(J) || !finite(rate)) return 0;
+        if (!all_finite(J) || !all_finite(rate)) return 0;
         mat step = mul(inverse(by_reach), plus(mul(J, away), -1.0, rate));
         EACH(k, NXU) {
             step.a[k] = reach[k] * step.a[k] - away.a[k];
@@ -599,7 +599,8 @@ static mat bounded(mat w) {
 static mat as_disturbance(mat rate) { return bounded(mul(of(NX, NX, ONTO_DISTURBANCES), rate)); }
 
 static int usable(const koopman_estimate *e) {
-    return finite(of(NX, 1, e->x)) && finite(of(NX, 1, e->w)) && finite(of(NP, NP, e->P));
+    return all_finite(of(NX, 1, e->x)) && all_finite(of(NX, 1, e->w))
+        && all_finite(of(NP, NP, e->P));
 }
 
 /* Predict an estimate under an input, in its units, for some seconds; returns 0 where it is lost.
@@ -771,7 +772,7 @@ static mat position(const koopman_estimate *e, const double *y) {
     double reach[NXU];
     if (DETERMINED) return mul(onto, rest);
     state = plus(state, 1.0, mul(onto, plus(rest, -1.0, mul(C, state))));
-    if (e->known || !RESTS || !finite(state)) return state;
+    if (e->known || !RESTS || !all_finite(state)) return state;
     EACH(k, NXU) reach[k] = k >= NX || !MEASURED[k];
     found = zeros(NXU, 1);
     put(&found, 0, 0, deviation(OF_X, state.a));
@@ -845,7 +846,7 @@ static void disturbed(koopman_state *s, const double *d) {
 /* Take into account that the last command was not followed, where applied inputs are measured. */
 static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
-    EACH(i, finite(of(NU, 1, applied)) ? NU : 0)
+    EACH(i, all_finite(of(NU, 1, applied)) ? NU : 0)
         last[i] = within(s->command[i], applied[i] - TUNING_TRACKING_TOLERANCE[i],
                          applied[i] + TUNING_TRACKING_TOLERANCE[i]);
 }
@@ -1080,7 +1081,7 @@ void koopman_init(koopman_state *s, const double *applied) {
     s->supervisor = (koopman_supervisor){-1, -1, KOOPMAN_NO_MEASUREMENT, KOOPMAN_NO_MEASUREMENT,
                                          NEVER, NEVER};
     EACH(i, NC) s->requested[i] = NAN;
-    if (!applied || !finite(of(NU, 1, applied))) return;
+    if (!applied || !all_finite(of(NU, 1, applied))) return;
     store(limited(of(NU, 1, applied), NULL, 0.0), s->command);
     s->commanded = 1;
     enqueue(s, NEVER, applied);
@@ -1113,7 +1114,7 @@ void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_output
             predict(s, elapsed, &s->estimate);
         }
         command(s, fault, outside, elapsed, interval, counted);
-        if (!finite(of(NU, 1, s->command)) || (s->estimate.known && !usable(&s->estimate))) {
+        if (!all_finite(of(NU, 1, s->command)) || (s->estimate.known && !usable(&s->estimate))) {
             *s = before;
             if (received) s->measured_at = s->now;
             s->law = -1;
