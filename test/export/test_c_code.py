@@ -82,8 +82,8 @@ def test_the_program_writes_an_example_that_repeats_its_test_vectors(
     assert main(['two_tanks', '--parameters', str(tmp_path / 'loop.yaml'), '--sample_period',
                  '0.5', '--output', str(tmp_path)]) == 0
     # also with the extensions of a compiler's own standard
-    subprocess.run(['gcc', *FLAGS[1:], tmp_path / 'controller.c', tmp_path / 'example.c', '-lm', '-o',
-                    tmp_path / 'example'], check=True)
+    subprocess.run(['gcc', *FLAGS[1:], tmp_path / 'controller.c', tmp_path / 'example.c', '-lm',
+                    '-o', tmp_path / 'example'], check=True)
     table = (tmp_path / 'test_vectors.csv').read_text()
     answers = subprocess.run([tmp_path / 'example'], input=table, check=True,
                              capture_output=True, text=True).stdout.splitlines()
