@@ -26,7 +26,9 @@ import numpy as np
 from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.signals import Outputs
+from koopman_ros.core.status import StatusCode
 from koopman_ros.export import compiled_example
+from koopman_ros.export.c_code import CODES
 from koopman_ros.export.command_line import loop
 from koopman_ros.export.vectors import vectors
 from koopman_ros.model import (
@@ -45,13 +47,16 @@ FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wconversion', '-Werror', '-O1')
 SANITIZERS = ('-fsanitize=address,undefined', '-fno-sanitize-recover')
 #: largest relative difference of a command that is not due to rounding
 TOLERANCE = 1e-9
+# Which test refuses a Riccati equation without a solution is a matter of rounding.
+_ALIKE = dict.fromkeys((str(CODES.index(code) + 1) for code in (
+    StatusCode.NOT_STABILISABLE, StatusCode.RICCATI_INACCURATE, StatusCode.GAIN_TOO_LARGE)), '-')
 # The floor below which an error of a command counts as one of it, in half-ranges of the input.
 _FLOOR = 1e-3
 # Seconds between samples of the bundled models, where not 1 s, and the plants of those that are
 # not named like one.
 _INTERVALS = {'pendulum': 0.02, 'two_state_example': 0.1, 'two_tanks': 0.5}
-_PLANTS = {'reactor_feed': 'reactor', 'reactor_linear': 'reactor', 'reactor_nz3': 'reactor',
-           'reactor_nz4': 'reactor', 'two_state_saddle': 'two_state'}
+_PLANTS = {**dict.fromkeys(('reactor_feed', 'reactor_linear', 'reactor_nz3', 'reactor_nz4'),
+                           'reactor'), 'two_state_saddle': 'two_state'}
 
 
 @dataclass(frozen=True)
@@ -113,8 +118,10 @@ def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answer
                      for rows in (wanted, found))
     error = np.abs(got - expected) / np.maximum(
         np.abs(expected), _FLOOR * controller.model.inputs.scale)
-    pairs = enumerate(zip(wanted, found, strict=True))
-    return float(np.max(error)), tuple(k for k, (one, other) in pairs if one[n:] != other[n:])
+    codes = ([[_ALIKE.get(code, code) for code in row[n:]] for row in rows]
+             for rows in (wanted, found))
+    pairs = enumerate(zip(*codes, strict=True))
+    return float(np.max(error)), tuple(k for k, (one, other) in pairs if one != other)
 
 
 def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
@@ -183,7 +190,7 @@ def random_loop(seed: int) -> Controller:
             np.full(len(C), -1e9), np.full(len(C), 1e9), some(np.full(len(C), np.inf), half[
                 :len(C)]), some(np.full(len(C), np.inf), 0.1 * half[:len(C)]),
             stuck_sensor_timeout=3.0),
-        disturbances=DisturbanceLimits(*np.full((2, d), [[-1e9], [1e9]]), some(
+        disturbances=DisturbanceLimits(np.full(d, -1e9), np.full(d, 1e9), some(
             np.full(d, np.inf), np.full(d, 0.5)), np.full(d, 60.0)),
         setpoint_ramp=some(np.full(len(controlled), np.inf), 0.05 * np.ones(len(controlled))),
         setpoint_filter_time=some(0.0, 5.0),
@@ -226,7 +233,7 @@ def _model(rng: np.random.Generator) -> LiftedModel:
     inputs = replace(inputs, lower=inputs.center - 2.0 * inputs.scale,
                      upper=inputs.center + 2.0 * inputs.scale)
     some = rng.uniform(-1.0, 1.0, (30, n))
-    return LiftedModel(
+    found = LiftedModel(
         lift, 3.0 * A, 3.0 * B, states, inputs, 'min', Provenance('random'),
         training_states=TrainingStates(some, 0.3) if rng.random() < 0.5 else None,
         readout=None if readout is None else 3.0 * readout,
@@ -235,10 +242,11 @@ def _model(rng: np.random.Generator) -> LiftedModel:
         pre_feedback=0.2 * rng.normal(size=(m, n)) if rng.random() < 0.3 else None,
         verified_loops=VerifiedLoops(some, rng.uniform(-1.0, 1.0, (30, n)), rng.random(30) < 0.3)
         if rng.random() < 0.3 else None,
-        dead_time=rng.choice([0.0, 1.0], m),
-        **{} if rng.random() < 0.7 else {
-            'disturbances': Coordinates(('d',), ('K',), np.ones(1), np.full(1, 2.0), -np.ones(1),
-                                        np.full(1, 3.0)), 'E': 0.3 * rng.normal(size=(n, 1))})
+        dead_time=rng.choice([0.0, 1.0], m))
+    if rng.random() < 0.7:
+        return found
+    return replace(found, E=0.3 * rng.normal(size=(n, 1)), disturbances=Coordinates(
+        ('d',), ('K',), np.ones(1), np.full(1, 2.0), -np.ones(1), np.full(1, 3.0)))
 
 
 if __name__ == '__main__':

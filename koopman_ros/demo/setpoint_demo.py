@@ -197,9 +197,9 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
                 panel.plot(code.seconds, shown(np.array(code.commands)[:, j], unit), 'o',
                            color='tab:orange', fillstyle='none', markevery=len(code.seconds) // 50,
                            label='exported C code')
-                panel.text(0.99, 0.06, f'C code at most {code.largest()[signal]:.1e} [{unit}] from '
-                           'the learned controller', transform=panel.transAxes, ha='right',
-                           fontsize=8)
+                panel.text(
+                    0.99, 0.06, f'C code at most {code.largest()[signal]:.1e} [{unit}] off',
+                    transform=panel.transAxes, ha='right', fontsize=8)
             for name, course in courses.items():
                 values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=high),
                                  low, high)

@@ -29,6 +29,10 @@ from koopman_ros.model import NetworkObservables, PolynomialObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
 
 _LAWS = ('sdre', 'linear')
+# Parts that a model may lack, and their tables that the templates count.
+_OPTIONAL = r'\b(?:OBSERVABLES|INPUT_TERMS|TRAINING_STATES|VERIFIED_LOOPS)_[A-Z_]+'
+_COUNTED = {'N_TERMS': 'INPUT_TERMS_COEFFICIENTS', 'N_TRAINING': 'TRAINING_STATES_STATES',
+            'N_LOOPS': 'VERIFIED_LOOPS_LOST'}
 # The quadrature of the templates is exact up to this degree of a polynomial.
 _MAX_DEGREE = 10
 #: reasons that the C code gives, numbered from 1
@@ -39,13 +43,12 @@ CODES = tuple(StatusCode[name] for name in (
     'CALCULATION_FAILED', 'NOT_PREDICTED', 'NO_STEADY_STATE'))
 # Fields of model and tuning that the templates do not name: their effect is in other tables, or
 # they have none in C. Any other one that is set is refused.
-_WITHOUT_TABLE = frozenset("""
-    MODEL_PROVENANCE MODEL_TIME_UNIT MODEL_PRE_FEEDBACK MODEL_DEAD_TIME OBSERVABLES_V
-    OBSERVABLES_IDENTITY OBSERVABLES_EXPONENTS STATES_NAMES STATES_UNITS INPUTS_NAMES INPUTS_UNITS
-    INPUTS_LOWER INPUTS_UPPER DISTURBANCES_NAMES DISTURBANCES_UNITS DISTURBANCES_TIMEOUT ESTIMATOR
-    MEASUREMENT_NOISE DISTURBANCE_NOISE INITIAL_ERROR UNCERTAIN_NOISE_FACTOR ANALYSIS_NOISE
-    FALLBACK_ORDER LEARNED_MODEL_MARGIN LINEAR_MODEL_MARGIN SAFE_VALUE SENSOR_DEADBAND PLUGINS
-    """.split())
+_WITHOUT_TABLE = re.compile(
+    r'MODEL_(PROVENANCE|TIME_UNIT|PRE_FEEDBACK|DEAD_TIME)|OBSERVABLES_(V|IDENTITY|EXPONENTS)'
+    r'|(STATES|INPUTS|DISTURBANCES)_(NAMES|UNITS|LOWER|UPPER)|DISTURBANCES_TIMEOUT|SENSOR_DEADBAND'
+    r'|TUNING_((STATE|INPUT)_WEIGHT|DEAD_TIME|CONTROLLED|OBSERVER_BANDWIDTH|MAX_DISTURBANCE'
+    r'|(MEASUREMENT|DISTURBANCE|ANALYSIS)_NOISE|INITIAL_ERROR|UNCERTAIN_NOISE_FACTOR|ESTIMATOR'
+    r'|FALLBACK_ORDER|(LEARNED|LINEAR)_MODEL_MARGIN|SAFE_VALUE|PLUGINS)')
 
 
 class ExportError(ValueError):
@@ -127,15 +130,17 @@ def _fields(controller: Controller, code: str) -> dict[str, Any]:
     if degree > _MAX_DEGREE:
         raise ExportError(f'a polynomial of degree {degree} cannot be exported: train a model of '
                           f'at most {_MAX_DEGREE}')
-    found = {}
+    found: dict[str, Any] = dict.fromkeys(re.findall(_OPTIONAL, code), np.zeros(0))
+    found['TRAINING_STATES_FILL_DISTANCE'] = 0.0
     for remedy, values in (('train a model without it', _walk(model, 'MODEL_')),
-                           ('set it to 0 or false', _walk(controller.tuning, ''))):
+                           ('set it to 0 or false', _walk(controller.tuning, 'TUNING_'))):
         for name, value in values:
             if re.search(rf'\b{name}\b', code):
                 found[name] = np.zeros(0) if value is None else value
-            elif name not in _WITHOUT_TABLE and value is not None and np.any(value):
-                raise ExportError(f'{name.lower()} cannot be exported: {remedy}')
-    return found
+            elif not _WITHOUT_TABLE.fullmatch(name) and value is not None and np.any(value):
+                raise ExportError(f'{name.lower().removeprefix("tuning_")} cannot be exported: '
+                                  f'{remedy}')
+    return found | {count: len(found[name]) for count, name in _COUNTED.items()}
 
 
 def _walk(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -152,34 +157,25 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
     """Return the constants of the C code that are no fields by name."""
     model, tuning, best, outputs = (
         controller.model, controller.tuning, controller.best, controller.measured)
-    n, m, n_y, estimator, lift = model.n_x, model.n_u, len(outputs.C), best.estimator, (
-        model.observables)
-    kalman, network = isinstance(estimator, ExtendedKalmanFilter), isinstance(
-        lift, NetworkObservables)
+    n, m, n_y = model.n_x, model.n_u, len(outputs.C)
+    estimator: Any = best.estimator
+    lift: Any = model.observables
+    kalman = isinstance(estimator, ExtendedKalmanFilter)
+    network = isinstance(lift, NetworkObservables)
     if network:
         psi = np.vstack((np.zeros((model.n_z - len(lift.V), len(lift.W))), lift.V))
         psi = np.hstack((np.eye(model.n_z, n) * model.identity, psi))
     else:
         psi = np.eye(model.n_z)
-    terms, trained, loops = model.input_terms, model.training_states, model.verified_loops
+    linear, unit, none = model.linearised, model.seconds_per_time_unit, np.zeros(0)
     order = (model.n_z if closed(model) else n) + m
-    linear, unit = model.linearised, model.seconds_per_time_unit
     fastest = np.max(np.abs(np.linalg.eigvals(linear.A))) if kalman else linear.fastest_rate
     dead = [round(seconds * 1e9) for seconds in tuning.dead_times(model).tolist()]
-    none = np.zeros(0)
-    optional = dict.fromkeys((
-        *(f'VERIFIED_LOOPS_{name}' for name in ('STARTS', 'SETPOINTS', 'LOST') if loops is None),
-        *(f'OBSERVABLES_{name}' for name in 'WB' if not network),
-        *['TRAINING_STATES_STATES'] * (trained is None),
-        *['INPUT_TERMS_COEFFICIENTS'] * (terms is None)), none)
-    return optional | {
+    return {
         'NX': n, 'NU': m, 'NY': n_y, 'NC': len(controller.controlled), 'NZ': model.n_z,
         'ND': len(model.disturbances), 'NP': 2 * n if kalman else 1, 'NXU': n + m,
         'WIDTH': 1 + 2 * n if kalman else 1, 'N_PSI': psi.shape[1], 'N_PHI': psi.shape[1] - n,
-        'N_TERMS': 0 if terms is None else len(terms.coefficients),
-        'N_TRAINING': 0 if trained is None else len(trained.states),
-        'N_LOOPS': 0 if loops is None else len(loops.lost), 'LAWS': len(controller.levels),
-        'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
+        'LAWS': len(controller.levels), 'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
         'MOST': max(max(order, n + m, n_y, 2 * n * kalman) ** 2, n * max(
             model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
         'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
@@ -203,11 +199,10 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
            {**dict.fromkeys(('H_OUTPUT', 'NOISE', 'INTENSITY', 'FIRST_COVARIANCE'), none),
             'ONTO_DISTURBANCES': np.eye(n), 'FARTHEST': 10.0 * model.states.half_widths}),
         'HALF_WIDTH': model.states.half_widths, 'CORNERS': model.states.corners,
-        'TRAINING_STATES_FILL_DISTANCE': 0.0 if trained is None else trained.fill_distance,
         'LOWER_V': model.inputs.to_deviation(tuning.limits.lower),
         'UPPER_V': model.inputs.to_deviation(tuning.limits.upper),
         'SAFE': controller.safe_input, 'NOMINAL': controller.nominal_input,
-        'DEAD_TIME': np.array(dead, dtype=np.int64), 'LONGEST_DEAD_TIME': max(dead),
+        'DEAD_TIME': dead, 'LONGEST_DEAD_TIME': max(dead),
         'SHORTEST_DEAD_TIME': min(dead), 'MARGIN': controller.order.margins,
         'CONTROLLED': [model.states.names.index(name) for name in best.controlled],
         'LINEAR': [int(level.law.extrapolates) for level in controller.levels.values()],
@@ -218,8 +213,8 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'POWERS': none if network else lift.exponents[n:], 'LIFT': psi, 'RATE': model.A @ psi,
         'INPUT_INVERSE': estimator.as_input(np.eye(n)), 'SLOPE': linear.A,
         'PRE_FEEDBACK': model.pre_feedback_slope, 'NODES': NODES, 'SHARES': WEIGHTS,
-        'TERM_POWERS': none if terms is None else PolynomialObservables.total_degree(
-            n, terms.degree).exponents}
+        'TERM_POWERS': PolynomialObservables.total_degree(
+            n, max(1, model.input_matrix_degree)).exponents}
 
 
 def _table(name: str, value: Any) -> str:
@@ -227,9 +222,8 @@ def _table(name: str, value: Any) -> str:
     if np.ndim(value) == 0:
         return f'#define {name} {_number(value)}'
     flat = np.ravel(value)
-    kind = 'int64_t' if name == 'DEAD_TIME' else 'double' if flat.dtype.kind == 'f' else 'int'
-    if name.endswith('POWERS') or name.endswith('LOST'):
-        kind = 'int'
+    kind = 'int64_t' if name == 'DEAD_TIME' else 'int' if flat.dtype.kind != 'f' or re.search(
+        'POWERS|LOST', name) else 'double'
     entries = ', '.join(map(_number, flat)) or '0'
     return f'static const {kind} {name}[] = {{{entries}}};'
 

@@ -9,7 +9,8 @@ import subprocess
 import tempfile
 
 COMPILER, EMULATOR = 'arm-none-eabi-gcc', 'qemu-system-arm'
-_FLAGS = ('-std=c99', '-O2', '-mcpu=cortex-m4', '-mthumb', '-mfpu=fpv4-sp-d16', '-mfloat-abi=hard')
+_FLAGS = ('-std=c99', '-O2', '-fno-inline', '-mcpu=cortex-m4', '-mthumb', '-mfpu=fpv4-sp-d16',
+          '-mfloat-abi=hard')
 
 
 @dataclass(frozen=True)

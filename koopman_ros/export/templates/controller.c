@@ -7,7 +7,6 @@
 
 #include <math.h>
 #include <stddef.h>
-#include <string.h>
 
 @TABLES@
 
@@ -87,7 +86,7 @@ static double size(mat A) {
     return sqrt(sum);
 }
 
-static int finite(mat A) {
+static int all_finite(mat A) {
     EACH(k, A.m * A.n) if (!isfinite(A.a[k])) return 0;
     return 1;
 }
@@ -165,7 +164,7 @@ static double apart(const double *a, const double *b) {
 static double distance(mat state) {
     mat x = deviation(OF_X, state.a);
     double out = 0.0, nearest = INFINITY;
-    if (!finite(x)) return INFINITY;
+    if (!all_finite(x)) return INFINITY;
     EACH(i, NX)
         out = larger(out, larger(CORNERS[i] - x.a[i], x.a[i] - CORNERS[NX + i]) / HALF_WIDTH[i]);
     EACH(k, N_TRAINING) nearest = smaller(nearest, apart(TRAINING_STATES_STATES + k * NX, x.a));
@@ -268,24 +267,28 @@ static mat secants(int rows, const double *O, mat x, mat x_ref, mat w, mat *H) {
     return M;
 }
 
-/* The drift f (NX, 1) and its derivative J (NX, NX), of the model or of its linearisation */
+/* The drift f (NX, 1) and, where J is not NULL, its derivative J (NX, NX), of the model or of its
+ * linearisation */
 static mat drift(int linear, mat x, mat *J) {
-    mat N, AN, slope, bend, pre = of(NX, NX, PRE_FEEDBACK), bent = zeros(NX, NX);
-    *J = of(NX, NX, SLOPE);
-    if (linear) return mul(*J, x);
-    if (READ_OUT) return lift(NX, MODEL_READOUT, x, J);
+    mat N = of(NX, NX, SLOPE), AN, slope, bend, pre = of(NX, NX, PRE_FEEDBACK), f = mul(N, x);
+    mat bent = zeros(NX, NX);
+    if (READ_OUT && !linear) f = lift(NX, MODEL_READOUT, x, &N);
+    if ((READ_OUT || linear) && J) *J = N;
+    if (READ_OUT || linear) return f;
     /* f = N'^+ A N, and the derivative of N''N' f = N''A N by each state */
     mat rate = lift(NZ, RATE, x, &AN);
     lift(NZ, LIFT, x, &N);
-    mat onto = inverse(N), f = mul(onto, rate), rest = plus(rate, -1.0, mul(N, f));
-    EACH(k, N_PHI) {
+    mat onto = inverse(N), rest;
+    f = mul(onto, rate);
+    rest = plus(rate, -1.0, mul(N, f));
+    EACH(k, J ? N_PHI : 0) {
         double share = 0.0;
         feature(k, x, &slope, &bend);
         EACH(i, NZ) share += LIFT[i * N_PSI + NX + k] * rest.a[i];
         bent = plus(bent, share, bend);
         of_feature(k, LIFT, scaled(-1.0, transposed(mul(bend, f))), &AN);
     }
-    *J = plus(mul(onto, plus(AN, 1.0, mul(transposed(onto), bent))), -1.0, pre);
+    if (J) *J = plus(mul(onto, plus(AN, 1.0, mul(transposed(onto), bent))), -1.0, pre);
     return plus(f, -1.0, mul(pre, x));
 }
 
@@ -302,13 +305,15 @@ static mat input_matrix(int linear, mat x, mat u, mat *J) {
     return B;
 }
 
-/* f(x) + B(x) u + w, and its derivative J (NX, NX + NU) by x and u */
+/* f(x) + B(x) u + w and, where J is not NULL, its derivative J (NX, NX + NU) by x and u */
 static mat rate_under(int linear, mat x, mat u, mat w, mat *J) {
     mat slope, by_input, B = input_matrix(linear, x, u, &by_input);
-    mat f = drift(linear, x, &slope);
-    *J = zeros(NX, NXU);
-    put(J, 0, 0, plus(slope, 1.0, by_input));
-    put(J, 0, NX, B);
+    mat f = drift(linear, x, J ? &slope : NULL);
+    if (J) {
+        *J = zeros(NX, NXU);
+        put(J, 0, 0, plus(slope, 1.0, by_input));
+        put(J, 0, NX, B);
+    }
     return plus(plus(f, 1.0, mul(B, u)), 1.0, w);
 }
 
@@ -374,13 +379,13 @@ static int doubled(mat D, mat G, mat *H) {
         *H = symmetric(plus(plus(*H, 1.0, HY), 1.0, mul(transposed(D), HY)));
         G = symmetric(plus(plus(G, 1.0, AV), 1.0, mul(AV, transposed(D))));
         D = plus(plus(D, 1.0, Y), 1.0, mul(D, Y));          /* A (I + Y) - I */
-        if (size(plus(one, 1.0, D)) < 1e-10) return finite(*H);
+        if (size(plus(one, 1.0, D)) < 1e-10) return all_finite(*H);
     }
     return 0;
 }
 
-/* D, G and P of the discrete equation that `doubled` solves, of a plant F over an interval with the
- * weights W, or of one in continuous time. */
+/* D, G and P of the equation that `doubled` solves, of a plant F over an interval with the weights
+ * W, or of one in continuous time. */
 static void reduced(mat F, mat W, int held, mat *D, mat *G, mat *P) {
     int n = F.n - NU;
     mat A = block(F, 0, 0, n, n), B = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
@@ -412,9 +417,9 @@ static int gain_of(mat F, mat W, int held, mat P, mat *K) {
     mat rest = plus(plus(Q, 1.0, square), -1.0, feedback);
     rest = plus(plus(rest, 1.0, PA), 1.0, transposed(PA));
     double terms = size(Q) + 2.0 * size(PA) + size(square) + size(feedback);
-    if (!(size(rest) / terms <= MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
-    return contracts(scaled(1.0 / MAX_GAIN / MAX_GAIN, mul(*K, transposed(*K)))) ? KOOPMAN_OK
-        : KOOPMAN_GAIN_TOO_LARGE;
+    if (!(size(rest) / terms <= TUNING_MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
+    right = scaled(1.0 / TUNING_MAX_GAIN, *K);
+    return contracts(mul(right, transposed(right))) ? KOOPMAN_OK : KOOPMAN_GAIN_TOO_LARGE;
 }
 
 /* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
@@ -422,7 +427,7 @@ static int gain_of(mat F, mat W, int held, mat P, mat *K) {
 static int riccati(mat A, mat B, double h, mat *K) {
     int n = A.n, N = n + NU, held = h > 0.0;
     mat F = zeros(N, N), W = F, D, G, P;
-    if (!finite(A) || !finite(B)) return KOOPMAN_NOT_STABILISABLE;
+    if (!all_finite(A) || !all_finite(B)) return KOOPMAN_NOT_STABILISABLE;
     put(&F, 0, 0, A);
     put(&F, 0, n, B);
     EACH(i, NX) W.a[i * N + i] = STATE_WEIGHT[i];
@@ -437,7 +442,7 @@ static int decays(mat slope, mat B, mat K, double h) {
     mat F = zeros(NXU, NXU), W = F;
     put(&F, 0, 0, h > 0.0 ? slope : plus(slope, -1.0, mul(B, K)));
     if (h > 0.0) put(&F, 0, NX, B);
-    if (!finite(F) || !finite(K)) return 0;
+    if (!all_finite(F) || !all_finite(K)) return 0;
     over_interval(h > 0.0 ? h : 1.0, &F, &W);
     return contracts(plus(plus(diagonal(NX, 1.0), 1.0, block(F, 0, 0, NX, NX)), -1.0,
                           mul(block(F, 0, NX, NX, NU), K)));
@@ -492,7 +497,7 @@ static int law(int linear, const koopman_estimate *estimate, mat target, double 
     if (status != KOOPMAN_OK) return status;
     if (!decays(slope, push, mul(K, M), h)) return KOOPMAN_PREDICTED_UNSTABLE;
     *u = physical(OF_U, plus(u_ref, -1.0, mul(K, e)));
-    if (!finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
+    if (!all_finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
     *u = limited(*u, NULL, 0.0);
     return KOOPMAN_OK;
 }
@@ -513,7 +518,7 @@ static int equilibrium(int linear, mat w, const double *reach, mat anchor, mat *
             away.a[k] *= reach[k] > 0.0;
             free += reach[k] > 0.0;
         }
-        if (!finite(J) || !finite(rate)) return 0;
+        if (!all_finite(J) || !all_finite(rate)) return 0;
         mat step = mul(inverse(by_reach), plus(mul(J, away), -1.0, rate));
         EACH(k, NXU) {
             step.a[k] = reach[k] * step.a[k] - away.a[k];
@@ -594,7 +599,8 @@ static mat bounded(mat w) {
 static mat as_disturbance(mat rate) { return bounded(mul(of(NX, NX, ONTO_DISTURBANCES), rate)); }
 
 static int usable(const koopman_estimate *e) {
-    return finite(of(NX, 1, e->x)) && finite(of(NX, 1, e->w)) && finite(of(NP, NP, e->P));
+    return all_finite(of(NX, 1, e->x)) && all_finite(of(NX, 1, e->w))
+        && all_finite(of(NP, NP, e->P));
 }
 
 /* Predict an estimate under an input, in its units, for some seconds; returns 0 where it is lost.
@@ -609,8 +615,8 @@ static int predicted(int linear, koopman_estimate *e, const double *input, doubl
         mat sum = zeros(NX, WIDTH);
         EACH(stage, STAGES) {
             mat at = plus(all, AHEAD[stage] * h, rate), x = block(at, 0, 0, NX, 1);
-            x = rate_under(linear, x, deviation(OF_U, input), of(NX, 1, e->w), &J);
-            rate = mul(block(J, 0, 0, NX, NX), at);
+            x = rate_under(linear, x, deviation(OF_U, input), of(NX, 1, e->w), KALMAN ? &J : NULL);
+            if (KALMAN) rate = mul(block(J, 0, 0, NX, NX), at);
             put(&rate, 0, 0, x);
             EACH(i, KALMAN ? NX : 0) rate.a[i * WIDTH + 1 + NX + i] += 1.0;
             sum = plus(sum, PARTS[stage], rate);
@@ -651,8 +657,8 @@ static void correct(koopman_estimate *e, mat x, double seconds) {
 /* Start from a measured state: with the disturbance as known, or where u is not NULL the one under
  * which u and the measured disturbances, of the rate `feed`, hold the plant. */
 static void restart(int linear, koopman_estimate *e, mat x, const mat *u, mat feed) {
-    mat w = e->known ? of(NX, 1, e->w) : zeros(NX, 1), J;
-    if (u) w = as_disturbance(scaled(-1.0, rate_under(linear, x, *u, zeros(NX, 1), &J)));
+    mat w = e->known ? of(NX, 1, e->w) : zeros(NX, 1);
+    if (u) w = as_disturbance(scaled(-1.0, rate_under(linear, x, *u, zeros(NX, 1), NULL)));
     if (u && ND > 0) w = as_disturbance(plus(w, -1.0, feed));
     store(x, e->x);
     store(w, e->w);
@@ -673,9 +679,9 @@ static int model_level(const koopman_supervisor *s) {
 
 /* Transfer an estimate from the model of a level to that of another; the plant's rate stays. */
 static void transfer(koopman_estimate *e, int before, int now) {
-    mat J, x = of(NX, 1, e->x), w = of(NX, 1, e->w);
+    mat x = of(NX, 1, e->x), w = of(NX, 1, e->w);
     if (LINEAR[before] == LINEAR[now] || !e->known) return;
-    w = plus(plus(w, 1.0, drift(LINEAR[before], x, &J)), -1.0, drift(LINEAR[now], x, &J));
+    w = plus(plus(w, 1.0, drift(LINEAR[before], x, NULL)), -1.0, drift(LINEAR[now], x, NULL));
     store(as_disturbance(w), e->w);
 }
 
@@ -707,9 +713,11 @@ static int64_t piece(const koopman_state *s, int64_t begin, int64_t end, double 
 static void enqueue(koopman_state *s, int64_t time, const double *u) {
     while (s->queued > 0 && s->applied_at[s->queued - 1] >= time) s->queued--;
     if (s->queued == QUEUE) {
-        memmove(s->applied_at, s->applied_at + 1, sizeof s->applied_at - sizeof *s->applied_at);
-        memmove(s->applied, s->applied + 1, sizeof s->applied - sizeof *s->applied);
         s->queued--;
+        EACH(k, s->queued) {
+            s->applied_at[k] = s->applied_at[k + 1];
+            store(of(NU, 1, s->applied[k + 1]), s->applied[k]);
+        }
     }
     s->applied_at[s->queued] = time;
     store(of(NU, 1, u), s->applied[s->queued++]);
@@ -764,7 +772,7 @@ static mat position(const koopman_estimate *e, const double *y) {
     double reach[NXU];
     if (DETERMINED) return mul(onto, rest);
     state = plus(state, 1.0, mul(onto, plus(rest, -1.0, mul(C, state))));
-    if (e->known || !RESTS || !finite(state)) return state;
+    if (e->known || !RESTS || !all_finite(state)) return state;
     EACH(k, NXU) reach[k] = k >= NX || !MEASURED[k];
     found = zeros(NXU, 1);
     put(&found, 0, 0, deviation(OF_X, state.a));
@@ -844,9 +852,9 @@ static void disturbed(koopman_state *s, const double *d) {
 /* Take into account that the last command was not followed, where applied inputs are measured. */
 static void follow(koopman_state *s, const double *applied) {
     double *last = s->applied[s->queued - 1];
-    EACH(i, finite(of(NU, 1, applied)) ? NU : 0)
-        last[i] = within(s->command[i], applied[i] - TRACKING_TOLERANCE[i],
-                         applied[i] + TRACKING_TOLERANCE[i]);
+    EACH(i, all_finite(of(NU, 1, applied)) ? NU : 0)
+        last[i] = within(s->command[i], applied[i] - TUNING_TRACKING_TOLERANCE[i],
+                         applied[i] + TUNING_TRACKING_TOLERANCE[i]);
 }
 
 /* Check a measurement and take it into account: the state that it stands for, in its units, and
@@ -895,7 +903,7 @@ static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, 
     koopman_supervisor next = {to.level, -1, to.status, to.cause, NEVER, NEVER};
     if (to.level == KOOPMAN_HOLD) {
         next.bad_since = s->bad_since == NEVER ? now : s->bad_since;
-        int too_long = (double)(now - next.bad_since) / SECOND > HOLD_TIMEOUT;
+        int too_long = (double)(now - next.bad_since) / SECOND > TUNING_HOLD_TIMEOUT;
         if (too_long) next.status = KOOPMAN_HELD_TOO_LONG;
         if (too_long || (s->level == KOOPMAN_SAFE && s->bad_since != NEVER)) {
             next.level = KOOPMAN_SAFE;
@@ -904,7 +912,7 @@ static koopman_supervisor supervised(const koopman_supervisor *s, request_t to, 
     }
     if (to.passing && from < next.level) next.resumes = from;
     else if (to.passing && next.level == KOOPMAN_HOLD && from > KOOPMAN_HOLD) next.level = from;
-    else if (next.level < from && (double)(now - better) / SECOND < RECOVERY_TIME)
+    else if (next.level < from && (double)(now - better) / SECOND < TUNING_RECOVERY_TIME)
         next = (koopman_supervisor){from, -1, s->status == KOOPMAN_OK ? KOOPMAN_OK
                                     : KOOPMAN_RECOVERING, s->cause, s->bad_since, better};
     return next;
@@ -965,7 +973,7 @@ static void recover(koopman_state *s, int fault, double outside) {
     if (was) {
         double change = outside - s->farthest, still = 0.03 * (1.0 + s->farthest);
         if (!(change > still || (change < -still && !s->led))) {
-            s->led = s->led || since(s, s->resting_since) >= 3.0 * RECOVERY_TIME;
+            s->led = s->led || since(s, s->resting_since) >= 3.0 * TUNING_RECOVERY_TIME;
             s->nearest = smaller(s->nearest, outside);
             return;
         }
@@ -977,7 +985,7 @@ static void recover(koopman_state *s, int fault, double outside) {
 
 /* Let the offset of a bumpless transfer fade with d (1 + t/T) exp(-t/T). */
 static void fade(koopman_state *s, double seconds) {
-    double share = seconds / BUMPLESS_TRANSFER_TIME, offset = 0.0, feed = 0.0;
+    double share = seconds / TUNING_BUMPLESS_TRANSFER_TIME, offset = 0.0, feed = 0.0;
     EACH(i, NU) {
         s->offset[i] = exp(-share) * (s->offset[i] + share * s->feed[i]);
         s->feed[i] *= exp(-share);
@@ -1017,7 +1025,7 @@ static mat automatic(koopman_state *s, int fault, double outside, double elapsed
     transfer(&s->estimate, from, model_level(&s->supervisor));
     if (targeted && !CONTROLS_ALL) store(target, s->target);
     if (level < LAWS) {
-        if (s->law != level && s->commanded && BUMPLESS_TRANSFER_TIME > 0.0) {
+        if (s->law != level && s->commanded && TUNING_BUMPLESS_TRANSFER_TIME > 0.0) {
             EACH(i, NU) s->offset[i] = s->feed[i] = s->command[i] - u.a[i];
             s->transferring = 1;
         } else if (s->transferring) {
@@ -1048,12 +1056,13 @@ static void command(koopman_state *s, int fault, double outside, double elapsed,
 static void advance(koopman_state *s, mat state, double seconds) {
     EACH(i, NC) {
         int k = CONTROLLED[i];
-        double *active = s->setpoint + i, *ramped = s->ramped + i, share;
-        double reach = isinf(SETPOINT_RAMP[i]) ? INFINITY : SETPOINT_RAMP[i] * seconds;
+        double *active = s->setpoint + i, *ramped = s->ramped + i;
+        double filter = TUNING_SETPOINT_FILTER_TIME;
+        double share = filter > 0.0 ? -expm1(-seconds / filter) : 1.0;
+        double ramp = TUNING_SETPOINT_RAMP[i], reach = isinf(ramp) ? INFINITY : ramp * seconds;
         if (!s->active) *active = *ramped = within(state.a[k], STATES_LOWER[k], STATES_UPPER[k]);
         if (isnan(s->requested[i])) s->requested[i] = *active;
         *ramped = within(s->requested[i], *ramped - reach, *ramped + reach);
-        share = SETPOINT_FILTER_TIME > 0.0 ? -expm1(-seconds / SETPOINT_FILTER_TIME) : 1.0;
         *active += share * (*ramped - *active);
     }
     s->active = 1;
@@ -1078,7 +1087,7 @@ void koopman_init(koopman_state *s, const double *applied) {
     s->supervisor = (koopman_supervisor){-1, -1, KOOPMAN_NO_MEASUREMENT, KOOPMAN_NO_MEASUREMENT,
                                          NEVER, NEVER};
     EACH(i, NC) s->requested[i] = NAN;
-    if (!applied || !finite(of(NU, 1, applied))) return;
+    if (!applied || !all_finite(of(NU, 1, applied))) return;
     store(limited(of(NU, 1, applied), NULL, 0.0), s->command);
     s->commanded = 1;
     enqueue(s, NEVER, applied);
@@ -1111,7 +1120,7 @@ void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_output
             predict(s, elapsed, &s->estimate);
         }
         command(s, fault, outside, elapsed, interval, counted);
-        if (!finite(of(NU, 1, s->command)) || (s->estimate.known && !usable(&s->estimate))) {
+        if (!all_finite(of(NU, 1, s->command)) || (s->estimate.known && !usable(&s->estimate))) {
             *s = before;
             if (received) s->measured_at = s->now;
             s->law = -1;
