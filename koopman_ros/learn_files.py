@@ -9,7 +9,7 @@ an error.
 """
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import sys
 from typing import Any
 
@@ -78,6 +78,8 @@ def command_parser() -> argparse.ArgumentParser:
         help='time between rows, in place of a column, in s')
     add('--linear', nargs='+', default=(), metavar='INPUT',
         help='inputs that are linear from row to row; others are held')
+    add('--lag', nargs='+', default=(), metavar='INPUT=S', help='time constants with which inputs '
+        'follow their commands, in s; -1: found from a record of all states')
     add('--test', nargs='+', default=(), metavar='FILE', help='record of the same signals to test '
         'the model on; it takes no part in the training')
     options = parser.add_argument_group('training, by the parameters of the trainer node')
@@ -120,6 +122,14 @@ def _table(present: LiftedModel | None, states: tuple[str, ...], inputs: tuple[s
         'disturbances_measured': disturbances})
 
 
+def _lags(texts: Sequence[str]) -> dict[str, float]:
+    try:
+        return {name: float(seconds) for name, seconds in (one.split('=') for one in texts)}
+    except ValueError:
+        raise ValueError(f'--lag {" ".join(texts)} must be inputs with a time constant in s each, '
+                         'as in pump=5') from None
+
+
 def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record, n_u: int,
              test: Record | None) -> int:
     # not before it is clear that there is something to learn: torch takes seconds
@@ -149,7 +159,7 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
                      for name, unit in signals.states.items()),
         inputs=tuple(RecordedInput(name, unit, place(name, name, unit))
                      for name, unit in acting.items()),
-        **settings.training(signals))
+        **{**settings.training(signals), 'lag': _lags(options['lag'])})
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
 
     def on_progress(share: float, text: str) -> bool:

@@ -122,6 +122,8 @@ def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
 
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['--states', 'height'], "no column 'height', it has 'time [s]'"),
+    (['--lag', 'heater'], '--lag heater must be inputs with a time constant'),
+    (['--lag', 'heater=5'], 'lag names heater'),
     (['--restarts', '0'], 'restarts = 0 must be in [1, 100]'),
     (['--unmeasured_states', '1', '--input_matrix_degree', '1'], 'input_matrix_degree is 1'),
     (['--model', 'none.safetensors'], 'none.safetensors'),

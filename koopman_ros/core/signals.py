@@ -64,7 +64,7 @@ class Outputs:
         return self.determine(())
 
     def determine(self, known: Collection[int]) -> bool:
-        """Whether they leave nothing open beside some states that are known without them."""
+        """Whether they determine all states but some that follow from the inputs alone."""
         rest = [i for i, column in enumerate(self.C.T) if i not in known or column.any()]
         return len(rest) == len(self.C) == np.linalg.matrix_rank(self.C)
 

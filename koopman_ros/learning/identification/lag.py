@@ -49,9 +49,9 @@ def lagged(episode: Episode, lag: Array, longest: float = 0.0) -> Episode | None
     """
     Return the episode with each input as it acts behind its lag (n_u,).
 
-    It begins when what was applied before the first input has faded; None where nothing is left.
+    Its first samples, which depend on earlier inputs, are left out; None where nothing is left.
 
-    :param longest: a lag for which it has faded, too.
+    :param longest: a lag for which they are left out, too.
     """
     first = np.searchsorted(episode.time, episode.input_time[0] + _FADED * max(
         longest, np.max(lag, initial=0.0)))
