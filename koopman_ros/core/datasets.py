@@ -48,7 +48,7 @@ class PlantDescription:
     disturbance_names: tuple[str, ...] = ()
     #: static characteristics of inputs by name, none of an input that acts linearly; B is the gain
     #: of their effects
-    characteristics: Mapping[str, Characteristic] = field(default_factory=dict)
+    characteristics: Mapping[str, Characteristic] = field(default_factory=dict, repr=False)
 
     __repr__ = short_repr
 
