@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a control step takes while commands are on their way that have not acted yet."""
+"""Time of a control step with commands under way that have not acted yet."""
 
 from dataclasses import replace
 from time import thread_time_ns

@@ -129,7 +129,9 @@ def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
     for path in sorted((config_directory() / 'models').glob('*.safetensors')):
         name = path.stem
         parameters = config_directory() / 'plants' / f'{_PLANTS.get(name, name)}.yaml'
-        yield name, loop(name, 'sdre', parameters)[1], _INTERVALS.get(name, 1.0)
+        controller = loop(name, 'sdre', parameters)[1]
+        if not controller.model.inputs.characteristics:
+            yield name, controller, _INTERVALS.get(name, 1.0)
 
 
 def random_loops(first: int = 0) -> Iterator[tuple[int, Controller]]:

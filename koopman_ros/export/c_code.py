@@ -154,7 +154,7 @@ def _walk(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _tables(controller: Controller, interval: float) -> dict[str, Any]:
-    """Return the constants of the C code that are no fields by name."""
+    """Return the constants of the C code, by name, that are not fields of model or tuning."""
     model, tuning, best, outputs = (
         controller.model, controller.tuning, controller.best, controller.measured)
     n, m, n_y = model.n_x, model.n_u, len(outputs.C)

@@ -46,7 +46,7 @@ def modes_in_a_step(loop: FaultHarness) -> None:
 def bad_quality(loop: FaultHarness, seconds: float) -> None:
     """Report the temperature as bad for a plant time."""
     publisher = loop.ros.node.create_publisher(UInt8, QUALITY, topics.LOOP_QOS)
-    loop.wait(publisher.get_subscription_count, 'nobody subscribes to the quality')
+    loop.wait(publisher.get_subscription_count, 'the quality has no subscription')
     with loop.fault():
         publisher.publish(UInt8(data=_BAD))
         loop.run_for(seconds)
