@@ -61,6 +61,7 @@ def loop(model: str, law: str, parameters: Path | None = None
     :raises ValueError: for a model or parameters that the node refuses.
     """
     given = {'system': ''} if parameters is None else file_parameters(parameters, 'controller')
+    given.pop('disturbances_measured', None)  # the model has them; it is for the other nodes
     loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))
     table = table_of(loaded.model, given)
     if unknown := sorted(set(given) - set(table.rows)):
