@@ -37,6 +37,7 @@ class NetworkDrift(Drift):
     pace: float  #: r, a rate of the plant in 1/time unit, by which W2 has none
     ridge: float  #: weight of the network's squared parameters in the cost of output error
     learn_input_matrix: bool  #: whether B is refined
+    hold_units: bool = False  #: whether W1 and b1 are not
 
     __repr__ = short_repr
 
@@ -75,8 +76,8 @@ class NetworkDrift(Drift):
 
     @property
     def _refined(self) -> Iterator[str]:
-        return (name for name in ('A', 'c', 'W1', 'b1', 'W2', 'B')
-                if name != 'B' or self.learn_input_matrix)
+        held = ('W1', 'b1') * self.hold_units + ('B',) * (not self.learn_input_matrix)
+        return (name for name in ('A', 'c', 'W1', 'b1', 'W2', 'B') if name not in held)
 
     @property
     def theta(self) -> Array:
@@ -143,11 +144,12 @@ class NetworkDrift(Drift):
 
         add_rows(xi)
         add_rows(np.ones((len(xi), 1)))
-        dS[..., place:place + n_h * n_x] += (
-            slopes[..., None] * xi[:, None, None, :]).reshape(len(xi), n_x, n_h * n_x)
-        place += n_h * n_x
-        dS[..., place:place + n_h] += slopes
-        place += n_h
+        if not self.hold_units:
+            dS[..., place:place + n_h * n_x] += (
+                slopes[..., None] * xi[:, None, None, :]).reshape(len(xi), n_x, n_h * n_x)
+            place += n_h * n_x
+            dS[..., place:place + n_h] += slopes
+            place += n_h
         add_rows(self.pace * units)
         if self.learn_input_matrix:
             add_rows(v)
