@@ -100,7 +100,10 @@ def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[Netwo
     begin = NetworkDrift.beside(shared.start.drift, *item, ridge=_RIDGE,
                                 learn_input_matrix=shared.learn_input_matrix)
     # as long as W2 is small, the ridge alone would decide about the units
-    first = shared.fitted(replace(begin, hold_units=True), shared.starts, monitor, _ROUGH)
-    found = shared.fitted(replace(first.model, hold_units=False), first.starts, monitor,
-                          _TOLERANCE)
+    first = shared.fitted(replace(begin, held=('W1', 'b1')), shared.starts, monitor, _ROUGH)
+    found = shared.fitted(replace(first.model, held=()), first.starts, monitor, _TOLERANCE)
+    if not shared.allowed(found.model):
+        # the units can do what A does, within the data
+        found = shared.fitted(found.model.stabilised(-shared.linear.model.drift.growth_rate),
+                              found.starts, monitor, _TOLERANCE)
     return found if shared.allowed(found.model) else None

@@ -40,6 +40,7 @@ from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
     identify,
+    MOST_COEFFICIENTS,
     Stopped,
     usual_degrees,
     Watch,
@@ -84,7 +85,8 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
 
     An estimate of measured states by :func:`identify` is kept if its simulations of the whole
     record err by little more than noise. Otherwise B(x) of degree 1 is tried, which is taken where
-    free runs of the segments held out err less, and those of all by more than two standard errors.
+    free runs of the segments held out err less, and those of all by more than two standard errors,
+    unless it has too many coefficients.
     If the simulations then err by more than noise and than 1 % of the motion, the estimate
     competes with those of :func:`identify_unmeasured`.
 
@@ -95,11 +97,14 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
             plant, episodes, methods=methods, seed=seed, backend=backend,
             watch=lambda done, total, text: watch(before * total + done, 5 * total, text))
 
+    end = time.process_time() + BUDGET
     measured = estimate(plant, 0)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes, 0.0):
         return measured
-    if plant.B is None and not plant.disturbance_names:
+    n_x, n_u = len(plant.state_names), len(plant.input_names)
+    if plant.B is None and not plant.disturbance_names and (
+            n_x * (1 + n_x) * (1 + n_u) <= MOST_COEFFICIENTS):
         varying = estimate(replace(plant, input_matrix_degree=1), 1)
         (own, held_out), (other, others) = map(_free_run_errors, (varying, measured))
         better, words = compared(own, other)
@@ -111,7 +116,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
         return measured
     return identify_unmeasured(
         plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,
-        backend=backend,
+        backend=backend, budget=max(0.0, end - time.process_time()),
         watch=lambda done, total, text: watch(2 * total + 3 * done, 5 * total, text))
 
 
