@@ -26,7 +26,7 @@ from koopman_ros.learning.identification.structure_candidates import (
 )
 
 UNITS = (3, 8)  # hidden units of the networks that are tried
-STARTS = 4  # of each network, of which the best is taken
+STARTS = 2  # of each network, of which the best is taken
 # Relative decrease of the cost that ends a fit; the first one while the units are held.
 _ROUGH, _TOLERANCE = 1e-3, 1e-5
 _RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
