@@ -101,7 +101,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                      for one in found.constants), (2, 3))
     yield ('Errors on the selection segments, of the predicted next measurement:'
            if found.constants else 'Errors of simulations, at samples left out of the fit:'
-           if found.hidden or found.steps else 'Errors on the selection segments:')
+           if len(found.free_run) else 'Errors on the selection segments:')
     yield table(('degree', 'method', *errors),
                 (('' if score.degree is None else score.degree, score.method,
                   *(f'{error:.5g}' for error in score.rmse),

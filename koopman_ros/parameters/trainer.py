@@ -167,7 +167,8 @@ class TrainerParameters:
         'per second, for each input and measured disturbance; a single 0: learn it.')
     input_matrix_degree: int = parameter(
         0, 'Degree of a learned B(x) as a polynomial in the states; 0: constant B, the only one '
-        'with measured disturbances.', '', 0, 5)
+        'with measured disturbances; with unmeasured_states -1 also degree 1 if the record shows '
+        'it.', '', 0, 5)
     identification_methods: tuple[str, ...] = parameter(
         ('weak_form', 'total_variation'), 'Methods that estimate the drift if all states are '
                                           'measured, compared on held-out segments: weak_form, '

@@ -4,6 +4,7 @@
 """The causes that errors of a drift point to: plants with one each, which the drift lacks."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,3 +49,6 @@ def test_the_likeliest_cause_is_that_of_the_plant(plant: Plant, first: str) -> N
     causes = likely_causes(found, 0)
     assert [name for _, name in causes][:1] == [first] * bool(first), causes
     assert not first or causes[0][0] > 0.6
+    # nothing is advised that the search has tried
+    tried = likely_causes(replace(found, searched=(first,)), 0)
+    assert first.endswith('.dead_time') or first not in [name for _, name in tried]

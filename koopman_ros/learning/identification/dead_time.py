@@ -177,7 +177,11 @@ class LinearModels:
 
     def best(self, highest: tuple[int, ...], watch: Callable[[], object],
              start: tuple[int, ...] | None = None) -> tuple[int, ...]:
-        """Return the dead times with the least error, one input after the other, then all."""
+        """
+        Return the dead times with the least error, one input after the other, then all.
+
+        :param watch: True ends the search.
+        """
         delays, n_u = start or (0,) * len(highest), len(highest)
         # a common lag and a common dead time are much alike
         sets = [{j} for j in range(n_u)] + [set(range(n_u))] * (n_u > 1)
@@ -187,7 +191,8 @@ class LinearModels:
                 costs = []
                 for shift in range(-min(delays[j] for j in moved),
                                    1 + min(highest[j] - delays[j] for j in moved)):
-                    watch()
+                    if watch():
+                        return delays
                     tried = tuple(d + shift * (j in moved) for j, d in enumerate(delays))
                     model = self.model(tried)
                     costs.append((np.inf if model is None else float(np.sum(

@@ -36,7 +36,7 @@ from koopman_ros.model import Box
 DEGREES = (1, 2, 3, 4, 5, 6)
 # Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
 # minutes for more, and an hour does not determine them.
-_MOST_COEFFICIENTS = 150
+MOST_COEFFICIENTS = 150
 OUTPUT_ERROR = 'output error'
 INNOVATIONS_FORM = 'innovations form'
 
@@ -250,7 +250,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
 def usual_degrees(n_x: int) -> tuple[int, ...]:
     """Return the degrees of a drift with few enough coefficients for a number of states."""
     return tuple(degree for degree in DEGREES if degree == 1
-                 or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
+                 or n_x * math.comb(n_x + degree, degree) <= MOST_COEFFICIENTS)
 
 
 @dataclass(frozen=True)

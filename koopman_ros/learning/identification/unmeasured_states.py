@@ -40,6 +40,7 @@ from koopman_ros.learning.identification.episode_offsets import (
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
+    MOST_COEFFICIENTS,
     Stopped,
     usual_degrees,
     Watch,
@@ -52,9 +53,8 @@ from koopman_ros.learning.identification.innovations_form import (
 )
 from koopman_ros.learning.identification.network_candidates import (
     add_networks,
+    network_starts,
     Shared,
-    STARTS,
-    UNITS,
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import innovations_form
@@ -86,9 +86,10 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
 
     An estimate of measured states by :func:`identify_with_characteristics` is kept if its
     simulations of the whole record err by little more than noise. Otherwise B(x) of degree 1 is
-    tried, which is taken where free runs of the segments held out err less by more than two
-    standard errors. If the simulations then err by more than noise and than 1 % of the motion, the
-    estimate competes with those of :func:`identify_unmeasured`.
+    tried, unless it has too many coefficients, and taken where free runs of the segments held out
+    err less, and those of all by more than two standard errors. If the simulations then err by
+    more than noise and than 1 % of the motion, the estimate competes with those of
+    :func:`identify_unmeasured`.
 
     :param given: inputs whose characteristic the plant has already.
     :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
@@ -98,14 +99,19 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
             plant, episodes, given=given, methods=methods, seed=seed, backend=backend,
             watch=lambda done, total, text: watch(before * total + done, 5 * total, text))
 
+    end = time.process_time() + BUDGET
     measured = estimate(plant, given, 0)
     plant = replace(plant, characteristics=measured.drift.box.inputs.characteristics)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes, 0.0):
         return measured
-    if plant.B is None and not plant.disturbance_names:
+    n_x, n_u = len(plant.state_names), len(plant.input_names)
+    if plant.B is None and not plant.disturbance_names and (
+            n_x * (1 + n_x) * (1 + n_u) <= MOST_COEFFICIENTS):
         varying = estimate(replace(plant, input_matrix_degree=1), plant.input_names, 1)
-        better, words = compared(_held_out_errors(varying), _held_out_errors(measured))
+        (own, held_out), (other, others) = map(_free_run_errors, (varying, measured))
+        better, words = compared(own, other)
+        better &= bool(np.mean(held_out ** 2) < np.mean(others ** 2))
         steps = measured.drift.form, f'{varying.drift.form}: {words}'
         measured = replace(varying if better else measured, linear=measured.linear, steps=steps,
                            searched=('input_matrix_degree',))
@@ -113,7 +119,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
         return measured
     return identify_unmeasured(
         plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,
-        backend=backend,
+        backend=backend, budget=max(0.0, end - time.process_time()),
         watch=lambda done, total, text: watch(2 * total + 3 * done, 5 * total, text))
 
 
@@ -129,13 +135,14 @@ def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Epi
         _EXPLAINED * found.noise ** 2, slight ** 2 * spread)))
 
 
-def _held_out_errors(found: Identified) -> Array:
-    """Return the errors (N, n_x) of free runs of the segments held out, in deviations."""
-    drift, scale = found.drift, found.drift.box.states.scale
-    data = Segments.of(found.held_out, longest_step(found.held_out))
-    errors = data.errors(drift.rate, fitted_starts(drift.rate, data, scale)[0]) / scale
+def _free_run_errors(found: Identified) -> tuple[Array, Array]:
+    """Return the errors (N, n_x) of free runs of all segments, and of those held out, scaled."""
+    rate, scale = found.drift.rate, found.drift.box.states.scale
+    data = Segments.of([*found.fitted, *found.held_out], longest_step(found.fitted))
+    errors = data.errors(rate, fitted_starts(rate, data, scale)[0]).swapaxes(0, 1) / scale
     # one segment after the other
-    return np.asarray(np.swapaxes(errors, 0, 1)[data.sampled.T])
+    sampled, first = data.sampled.T, len(found.fitted)
+    return errors[sampled], errors[first:][sampled[first:]]
 
 
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
@@ -176,8 +183,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
     least = 1 if measured is None else 0
-    networks = {f'network of {units} units, start {start + 1}': (units, STARTS * seed + start)
-                for units in UNITS for start in range(STARTS)}
+    networks = network_starts(seed)
     total = hidden + 1 - least + highest_degree + len(networks) + 5
     end, choice = time.process_time() + budget, Choice(() if measured is None else measured.steps)
     begun = itertools.count()
@@ -244,12 +250,13 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             last = search.filtered(raised(last), monitor)
             choice.gains(None if last is None else search.simulated(last, count, monitor))
     if not choice.explained(explained):
-        # in coordinates of a filter, whose hidden states have the range of those in the record
-        base = None if begin is None else search.simulated(begin, count, monitor)
-        linear = base or linear
-        data, starts = search.record.simulated(linear.start, search.samples)
-        shared = Shared(linear, (data, starts if base is None else base.starts),
-                        search.learn_B, (end - time.process_time()) / len(networks))
+        # hidden states of a filter stay near those of the plant, in the range of the network's
+        # units; those that a linear model needs to simulate a nonlinear plant go far
+        start = begin or linear.start
+        shared = Shared(
+            linear, start, *search.record.simulated(start, search.samples),
+            float(np.mean(search.deviation ** 2)), search.learn_B,
+            (end - time.process_time()) / len(networks))
         add_networks(choice, shared, networks,
                       lambda text: stage(f'{text} with {not_measured(count)}'),
                       backend or Serial())

@@ -53,6 +53,12 @@ def test_dead_times_are_found_within_a_sample(dead_times, time_constants):
     np.testing.assert_array_equal(found.values, PERIOD * np.array(found.samples))
 
 
+@pytest.mark.parametrize('seed', [6, 7])
+def test_two_lags_are_told_from_a_dead_time_by_a_model_without_zeros(seed):
+    # with zeros it is a sample off either way
+    assert find_dead_times([record(seed, (12,), (16.0, 36.0))]).samples == (12,)
+
+
 def test_a_known_dead_time_is_not_looked_for():
     episode = record(1, (8, 5), (20.0,)).delayed(np.array([8 * PERIOD, 0.0]))
     assert episode is not None

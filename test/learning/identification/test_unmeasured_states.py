@@ -81,6 +81,18 @@ def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate
     found = identify_structure(PLANT, [record(rate, samples=500)])
     assert found.hidden == hidden
     assert bool(found.steps) == bool(hidden)
+    # with a state more the plant is explained no better
+    assert ('unmeasured_states' in found.searched) == bool(hidden)
+
+
+def test_an_input_may_act_by_a_product_with_the_state():
+    found = identify_structure(PLANT, [record(
+        lambda x, u: np.array([-x[0] + (1.0 + 0.5 * x[0]) * u, -x[1]]), samples=500)])
+    assert found.hidden == 0
+    assert found.drift.input_matrix_at(np.array([[0.5], [-0.5]])).ravel() == pytest.approx(
+        [1.25, 0.75], rel=0.05)
+    assert 'B of degree 1' in found.steps[-1]
+    assert found.searched == ('input_matrix_degree',)
 
 
 def test_the_best_so_far_is_taken_when_the_time_is_over():
@@ -153,7 +165,7 @@ def duffing(x, u):
 def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
         monkeypatch, rate, degree, kind, samples):
     # one of all networks
-    monkeypatch.setattr(network_candidates, 'UNITS', (8,))
+    monkeypatch.setattr(network_candidates, 'UNITS', (3,))
     monkeypatch.setattr(network_candidates, 'STARTS', 1)
     found = identify_unmeasured(PLANT, [record(rate, samples=samples, size=0.8)], 1,
                                 highest_degree=degree, dead_times=False, seed=2)
