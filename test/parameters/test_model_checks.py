@@ -54,7 +54,7 @@ def renamed(state: str, coolant: str) -> LiftedModel:
      'set-point 51.80 degC is outside the trained range 31.85 degC to 51.65 degC'),
     # an input without effect
     (replace(SHIPPED, A=-SHIPPED.A, B=np.zeros((1, 1))),
-     'tried at temperature 51.8 degC with the set-point temperature 51.8 degC the control law of '
+     'at temperature 51.8 degC with the set-point temperature 51.8 degC the control law of '
      'the model fails (no feedback gain: the Hamiltonian has no stable subspace of full size'),
     # a gain beyond its bound
     (replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),

@@ -52,7 +52,7 @@ def test_an_input_without_commands_is_taken_from_its_measurements(
     assert "no topic '/jacket_setpoint': jacket is taken from its measurements" in account.notes[0]
     # the same by names alone
     assert np.array_equal(records.read(path, 'warm [K]', 'jacket [K]').episodes[0].u, episode.u)
-    with pytest.raises(ValueError, match='warm has no unit, and bags have none'):
+    with pytest.raises(ValueError, match='warm has no unit, and a bag stores none'):
         records.read(path, 'warm', 'jacket [K]')
 
 

@@ -156,7 +156,7 @@ def test_a_method_of_ones_own_has_its_own_parameters(noisy):
 @pytest.mark.usefixtures('own_module')
 @pytest.mark.parametrize(('name', 'parameters', 'words'), [
     ('own_methods:Unfinished', {}, 'lacks estimate'),
-    ('own_methods:function', {}, 'no subclass of'),
+    ('own_methods:function', {}, 'not a subclass of'),
     ('own_methods:Own', {'Own': {'window': 3}}, 'window must be at least 5'),
     ('own_methods:Own', {'Own': {'size': 3}}, 'size'),
     ('own_methods:Absent', {}, 'Absent'), ('weak', {}, 'choose one of weak_form, total_variation'),
