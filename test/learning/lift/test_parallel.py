@@ -11,7 +11,11 @@ import torch
 
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import train
-from koopman_ros.learning.identification import identify, identify_unmeasured
+from koopman_ros.learning.identification import (
+    identify,
+    identify_unmeasured,
+    network_candidates,
+)
 from koopman_ros.learning.record import read_record
 from koopman_ros.model import Coordinates, linearised_model, Provenance
 from support.known_plants import CUBIC, methods, PAIR
@@ -67,7 +71,7 @@ def estimated(backend):
 
 
 def estimated_with_a_hidden_state(backend):
-    whole = PAIR.excited(200, 0.1, noise=0.01)
+    whole = PAIR.excited(160, 0.1, noise=0.01)
     plant = replace(PAIR.plant, state_names=('x1',), state_units=('1',),
                     nominal_state=np.zeros(1))
     return identify_unmeasured(plant, [replace(whole, x=whole.x[:, :1])], 1, highest_degree=1,
@@ -75,7 +79,8 @@ def estimated_with_a_hidden_state(backend):
 
 
 @pytest.mark.parametrize('estimate', [estimated, estimated_with_a_hidden_state])
-def test_drifts_are_estimated_side_by_side(places, estimate):
+def test_drifts_are_estimated_side_by_side(places, estimate, monkeypatch):
+    monkeypatch.setattr(network_candidates, 'UNITS', (2,))
     here, there = (estimate(places[kind]) for kind in ('', 'joblib:2'))
     rng, box = np.random.default_rng(0), here.drift.box
     xi, v = (rng.uniform(-1.0, 1.0, (9, len(own))) for own in (box.states, box.inputs))
