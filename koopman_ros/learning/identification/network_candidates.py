@@ -10,12 +10,9 @@ import contextlib
 from dataclasses import dataclass, replace
 import time
 
-import numpy as np
-
 from koopman_ros.core.datasets import Array
 from koopman_ros.execution import Backend, Tell
 from koopman_ros.learning.identification.drift import DriftModel, Segments
-from koopman_ros.learning.identification.innovations_form import Predictor
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import Refined
 from koopman_ros.learning.identification.structure_candidates import (
@@ -26,9 +23,7 @@ from koopman_ros.learning.identification.structure_candidates import (
 )
 
 UNITS = (3, 8)  # hidden units of the networks that are tried
-STARTS = 2  # of each network, of which the best is taken
-# Relative decrease of the cost that ends a fit; the first one while the units are held.
-_ROUGH, _TOLERANCE = 1e-3, 1e-5
+STARTS = 4  # of each network, of which the best is taken
 _RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
 
 
@@ -42,11 +37,8 @@ def network_starts(seed: int) -> dict[str, tuple[int, int]]:
 class Shared:
     """The common data of all networks."""
 
-    linear: StructureCandidate  #: the linear model that they compete with
-    start: Predictor[DriftModel]  #: beside which they begin
-    data: Segments  #: pieces that are simulated
-    starts: Array  #: (M, n_x) of them, in deviations
-    noise: float  #: mean squared innovation of the filter, in deviations
+    linear: StructureCandidate  #: beside which they are
+    data: tuple[Segments, Array]  #: pieces that are simulated, and where they start
     learn_input_matrix: bool
     budget: float  #: of each, in s of processor time
 
@@ -54,19 +46,10 @@ class Shared:
         """Return whether a network diverges far from the data only where the plant does."""
         return network.bounded or self.linear.model.drift.growth_rate >= 0.0
 
-    def fitted(self, network: NetworkDrift, starts: Array, monitor: Callable[..., bool],
-               tolerance: float) -> Refined[NetworkDrift]:
-        """Return a network whose simulations err least."""
-        # starts are within the range of the record: units that are saturated far from it would
-        # not bring them back
-        prior = self.noise / np.sum(self.data.sampled)
-        return simulated(network, self.start.gain, self.data, starts, monitor, tolerance=tolerance,
-                         penalty=np.append(network.penalty, np.full(starts.size, prior)))
-
     def candidate(self, network: Refined[NetworkDrift]) -> StructureCandidate | None:
         """Return the candidate of a network."""
         linear = self.linear
-        found = candidate_of(network, self.start, self.data, linear.record, linear.hidden)
+        found = candidate_of(network, linear.start, self.data[0], linear.record, linear.hidden)
         return found and replace(found, offsets=linear.offsets)
 
 
@@ -97,13 +80,10 @@ def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[Netwo
         return time.process_time() > end
 
     monitor()
-    begin = NetworkDrift.beside(shared.start.drift, *item, ridge=_RIDGE,
-                                learn_input_matrix=shared.learn_input_matrix)
-    # as long as W2 is small, the ridge alone would decide about the units
-    first = shared.fitted(replace(begin, held=('W1', 'b1')), shared.starts, monitor, _ROUGH)
-    found = shared.fitted(replace(first.model, held=()), first.starts, monitor, _TOLERANCE)
-    if not shared.allowed(found.model):
-        # the units can do what A does, within the data
-        found = shared.fitted(found.model.stabilised(-shared.linear.model.drift.growth_rate),
-                              found.starts, monitor, _TOLERANCE)
+    (units, seed), drift = item, shared.linear.model.drift
+    assert isinstance(drift, DriftModel)
+    found = simulated(
+        NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
+                            learn_input_matrix=shared.learn_input_matrix),
+        shared.linear.gain, *shared.data, monitor)
     return found if shared.allowed(found.model) else None

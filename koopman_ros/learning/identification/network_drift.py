@@ -37,7 +37,6 @@ class NetworkDrift(Drift):
     pace: float  #: r, a rate of the plant in 1/time unit, by which W2 has none
     ridge: float  #: weight of the network's squared parameters in the cost of output error
     learn_input_matrix: bool  #: whether B is refined
-    held: tuple[str, ...] = ()  #: names of arrays that are not
 
     __repr__ = short_repr
 
@@ -76,8 +75,8 @@ class NetworkDrift(Drift):
 
     @property
     def _refined(self) -> Iterator[str]:
-        held = (*self.held, *['B'] * (not self.learn_input_matrix))
-        return (name for name in ('A', 'c', 'W1', 'b1', 'W2', 'B') if name not in held)
+        return (name for name in ('A', 'c', 'W1', 'b1', 'W2', 'B')
+                if name != 'B' or self.learn_input_matrix)
 
     @property
     def theta(self) -> Array:
@@ -90,11 +89,6 @@ class NetworkDrift(Drift):
         return np.concatenate([
             np.full(getattr(self, name).size, self.ridge * _SHARES.get(name, 0.0))
             for name in self._refined])
-
-    def stabilised(self, rate: float) -> NetworkDrift:
-        """Return the same with modes of A that decay at least at a rate, and A held."""
-        excess = max(0.0, rate + float(np.max(np.linalg.eigvals(self.A).real)))
-        return replace(self, A=self.A - excess * np.eye(len(self.A)), held=('A',))
 
     def moved(self, states: Coordinates) -> NetworkDrift:
         """Return the same in deviations of other coordinates of the states."""
@@ -147,15 +141,13 @@ class NetworkDrift(Drift):
                 dS[:, i, place:place + width] += values
                 place += width
 
-        if 'A' not in self.held:
-            add_rows(xi)
+        add_rows(xi)
         add_rows(np.ones((len(xi), 1)))
-        if 'W1' not in self.held:
-            dS[..., place:place + n_h * n_x] += (
-                slopes[..., None] * xi[:, None, None, :]).reshape(len(xi), n_x, n_h * n_x)
-            place += n_h * n_x
-            dS[..., place:place + n_h] += slopes
-            place += n_h
+        dS[..., place:place + n_h * n_x] += (
+            slopes[..., None] * xi[:, None, None, :]).reshape(len(xi), n_x, n_h * n_x)
+        place += n_h * n_x
+        dS[..., place:place + n_h] += slopes
+        place += n_h
         add_rows(self.pace * units)
         if self.learn_input_matrix:
             add_rows(v)

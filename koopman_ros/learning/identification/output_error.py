@@ -176,8 +176,7 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
     :param smooth: whether the starts are refined in place of the gain. With both a predictor would
         be found that is not stable and fits its starts to the noise.
     :param tolerance: relative decrease of the cost that ends it.
-    :param penalty: weights of the squares of the model's parameters (p,), and of the starts where
-        it is longer, in the cost (ridge).
+    :param penalty: (p,) weights of the squares of the model's parameters in the cost (ridge).
     :param iterations: limit on steps tried.
     """
     problem = _Problem(model, segments, gain, starts, deviation, settling, smooth, penalty)

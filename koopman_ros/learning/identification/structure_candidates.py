@@ -117,11 +117,11 @@ class Choice:
 
 
 def simulated(model: _Model, gain: Array, data: Segments, starts: Array,
-              monitor: Callable[..., bool], *, tolerance: float = _TOLERANCE,
-              penalty: Array | None = None) -> Refined[_Model]:
+              monitor: Callable[..., bool]) -> Refined[_Model]:
     """Return a model whose simulations err least."""
+    penalty = model.penalty if isinstance(model, NetworkDrift) else None
     return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
-                            tolerance=tolerance, penalty=penalty, iterations=_ITERATIONS,
+                            tolerance=_TOLERANCE, penalty=penalty, iterations=_ITERATIONS,
                             monitor=monitor)
 
 

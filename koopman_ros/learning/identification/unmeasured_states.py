@@ -250,13 +250,12 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             last = search.filtered(raised(last), monitor)
             choice.gains(None if last is None else search.simulated(last, count, monitor))
     if not choice.explained(explained):
-        # hidden states of a filter stay near those of the plant, in the range of the network's
-        # units; those that a linear model needs to simulate a nonlinear plant go far
-        start = begin or linear.start
-        shared = Shared(
-            linear, start, *search.record.simulated(start, search.samples),
-            float(np.mean(search.deviation ** 2)), search.learn_B,
-            (end - time.process_time()) / len(networks))
+        # in coordinates of a filter, whose hidden states have the range of those in the record
+        base = None if begin is None else search.simulated(begin, count, monitor)
+        linear = base or linear
+        data, starts = search.record.simulated(linear.start, search.samples)
+        shared = Shared(linear, (data, starts if base is None else base.starts),
+                        search.learn_B, (end - time.process_time()) / len(networks))
         add_networks(choice, shared, networks,
                       lambda text: stage(f'{text} with {not_measured(count)}'),
                       backend or Serial())
