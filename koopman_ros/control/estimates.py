@@ -179,10 +179,9 @@ class StateEstimation:
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
             # an estimate that strayed from the data is corrected; a plant that did is not known
-            margin = max(level.law.margin for level in self.levels.values())
-            far = outside > max(margin, 0.0) and (
+            far = outside > 0.0 and self._beyond(outside) and (
                 self.outputs.determine_state
-                or self.model.distance(self.position(None, y)) > margin)
+                or self._beyond(self.model.distance(self.position(None, y))))
             lost = far or self._lost(state, time_ns)
             fresh = predicted is None or verdict.moved or not elapsed > 0.0 or lost
             predicted = self._corrected(
@@ -207,6 +206,10 @@ class StateEstimation:
         return self._remembering(
             now, state, time_ns, elapsed, corrected_by, self._factor(quality)
         ), Observation(verdict, expected, x, outside)
+
+    def _beyond(self, outside: float) -> bool:
+        """Whether no law acts at a distance from the training data."""
+        return outside > max(level.law.margin for level in self.levels.values())
 
     def position(self, known: Estimate | None, y: Array) -> Array:
         """
@@ -253,11 +256,10 @@ class StateEstimation:
         """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
         estimator, model = self.level(state.supervisor).estimator, self.model
         if u is not None and model.lagged:
-            xi = xi.copy()
+            xi, applied = xi.copy(), model.inputs.to_physical(u)
             for j, i in model.lagged.items():
                 if not self.outputs.C[:, i].any():
-                    xi[i] = ((model.inputs.to_physical(u) - model.states.center[i])[j]
-                             / model.states.scale[i])
+                    xi[i] = (applied[j] - model.states.center[i]) / model.states.scale[i]
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:
             return started

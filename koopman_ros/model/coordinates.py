@@ -114,14 +114,13 @@ class Coordinates:
     def to_deviation(self, value: Array) -> Array:
         """Map physical values (..., n) to scaled deviations (..., n)."""
         if self.characteristics:
-            return (self._effects(value) - self._effects(self.center)) / self.scale
+            return (self._mapped(value, Characteristic.effect) - self._central) / self.scale
         return (value - self.center) / self.scale
 
     def to_physical(self, deviation: Array) -> Array:
         """Map scaled deviations (..., n) to physical values (..., n)."""
         if self.characteristics:
-            effects = self._effects(self.center) + deviation * self.scale
-            return self._mapped(effects, Characteristic.value)
+            return self._mapped(self._central + deviation * self.scale, Characteristic.value)
         return self.center + deviation * self.scale
 
     def slope(self, value: Array) -> Array:
@@ -139,8 +138,10 @@ class Coordinates:
             mapped[..., j] = by(one, value[..., j])
         return mapped
 
-    def _effects(self, value: Array) -> Array:
-        return self._mapped(value, Characteristic.effect)
+    @cached_property
+    def _central(self) -> Array:
+        """The effects (n,) of the center."""
+        return self._mapped(self.center, Characteristic.effect)
 
     def violation(self, value: Array) -> float:
         """

@@ -82,6 +82,7 @@ class Recorder:
         self._subscriptions: dict[str, Subscription] = {}
         self._empty_ns: dict[str, int] = {}  # when nothing waited in each
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
+        self._at_take = get_rmw_implementation_identifier() in _STAMPED_AT_TAKE
         self._begun = time.monotonic()
         self.simulated = bool(node.get_parameter('use_sim_time').value)
         # 0 before the first /clock
@@ -174,7 +175,6 @@ class Recorder:
 
     def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
         waiting: list[_Taken] = []
-        at_take = get_rmw_implementation_identifier() in _STAMPED_AT_TAKE
         with (handle := subscription.handle):
             # no more than can wait, lest a fast publisher keeps us here
             while len(waiting) < _QUEUE_DEPTH:
@@ -184,7 +184,7 @@ class Recorder:
                     self._empty_ns[topic] = now_ns
                     break
                 data, info = taken
-                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic], at_take)
+                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic], self._at_take)
                 waiting.append(_Taken(
                     topic, data, received_ns, info['source_timestamp'] or received_ns))
         return waiting
