@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import differences
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state
@@ -126,8 +127,7 @@ class FirstOrder:
         """
         system, actuator, u = process.system, process.actuator, process.u
         A, seconds = system.slope(process.x, actuator.effect(u)), system.seconds_per_time_unit
-        du = 1e-4 * np.maximum(np.abs(u), 1.0)
-        slope = (actuator.effect(u + du) - actuator.effect(u - du)) / (2.0 * du)
+        slope = np.diag(differences(actuator.effect, u, np.maximum(np.abs(u), 1.0)))
         b = (system.input_matrix(process.x) * slope)[:, 0]
         i, final = system.state_names.index(state), np.linalg.solve(A, -b)
         step = _SLOWEST / float(np.min(-np.linalg.eigvals(A).real)) / _POINTS

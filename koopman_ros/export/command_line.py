@@ -18,7 +18,7 @@ from koopman_ros import __version__
 from koopman_ros.control import Controller
 from koopman_ros.export.c_code import c_code, ExportError, signals, template
 from koopman_ros.export.vectors import columns, vectors
-from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.parameters.controller import built, OF_THE_MODEL, table_of
 from koopman_ros.parameters.model_checks import load_suitable, LoadedModel
 from koopman_ros.parameters.signal_topics import file_parameters
 
@@ -61,9 +61,9 @@ def loop(model: str, law: str, parameters: Path | None = None
     :raises ValueError: for a model or parameters that the node refuses.
     """
     given = {'system': ''} if parameters is None else file_parameters(parameters, 'controller')
-    given.pop('disturbances_measured', None)  # the model has them; it is for the other nodes
     loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))
     table = table_of(loaded.model, given)
+    given = {name: value for name, value in given.items() if name not in OF_THE_MODEL}
     if unknown := sorted(set(given) - set(table.rows)):
         raise ExportError(f'{parameters}: {unknown[0]} is not a parameter of this loop: correct '
                           'or remove it')

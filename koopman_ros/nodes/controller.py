@@ -23,7 +23,12 @@ from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation import MeasurementBuffer
 from koopman_ros.event_log import records
-from koopman_ros.parameters.controller import built, ControllerParameters, table_of
+from koopman_ros.parameters.controller import (
+    built,
+    ControllerParameters,
+    OF_THE_MODEL,
+    table_of,
+)
 from koopman_ros.parameters.model_checks import (
     load_suitable,
     LoadedModel,
@@ -83,8 +88,7 @@ class ControllerNode(ManagedNode):
                 f'{", ".join(bundled_plants())}')
         loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))
         self._table = table = table_of(loaded.model, given)
-        # in the file of a whole loop; the controller has those of its model
-        self._settings = self.declare_table(table, ('disturbances_measured',))
+        self._settings = self.declare_table(table, OF_THE_MODEL)
         self._signals = signals_of(
             loaded.model, self._settings.tuning.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded

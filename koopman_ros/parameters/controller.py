@@ -42,6 +42,9 @@ from koopman_ros.parameters.signal_topics import (
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.tuning import Tuning
 
+#: parameters in the file of a whole loop that a controller does not need: its model has them
+OF_THE_MODEL = ('disturbances_measured',)
+
 
 @dataclass(frozen=True)
 class ControllerParameters:
