@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array, frozen, real, short_repr
 from koopman_ros.core.characteristic import Characteristic
-from koopman_ros.core.units import check_time_unit, named_units
+from koopman_ros.core.units import check_time_unit, checked_signals
 
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
-           'split_by_episode', 'within']
+           'sample_interval', 'split_by_episode', 'within']
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class PlantDescription:
     def __post_init__(self) -> None:
         check_time_unit(self.time_unit)
         for kind in ('state', 'input'):
-            names, units = named_units(
+            names, units = checked_signals(
                 kind, getattr(self, f'{kind}_names'), getattr(self, f'{kind}_units'))
             nominal = real(getattr(self, f'nominal_{kind}'), f'nominal_{kind}').copy()
             if nominal.shape != (len(names),):
@@ -213,6 +213,11 @@ class Episode:
         last = np.searchsorted(self.input_time, time[-1], side='left') + any(self.linear)
         keep = slice(first, max(first + 1, last))
         return Episode(time, self.x[start:stop], self.input_time[keep], self.u[keep], self.linear)
+
+
+def sample_interval(episodes: Sequence[Episode]) -> float:
+    """Return the median time between the samples of episodes, in their time unit."""
+    return float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
 
 
 def cut(episodes: Sequence[Episode], samples: int) -> list[Episode]:

@@ -104,7 +104,7 @@ def check_unit(unit: str) -> None:
                          'dimensionless') from error
 
 
-def named_units(kind: str, names: Sequence[str], units: Sequence[str]
+def checked_signals(kind: str, names: Sequence[str], units: Sequence[str]
                 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """
     Return names and units of states or inputs.

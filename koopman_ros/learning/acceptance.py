@@ -11,6 +11,7 @@ import numpy as np
 
 from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.datasets import sample_interval
 from koopman_ros.core.units import (
     Display,
     display_unit,
@@ -104,8 +105,7 @@ class HeldOut:
         :param rate: that to take instead.
         """
         # as it was measured, as far as that matters
-        period = float(np.median(np.concatenate(
-            [np.diff(part.time) for part in self._found.held_out])))
+        period = sample_interval(self._found.held_out)
         model = replace(model, dead_time=self._seconds * self._found.dead_time)
         found = evaluate_closed_loops(
             model, rate or self._found.drift.rate, loops=loops, seed=seed, watch=watch,

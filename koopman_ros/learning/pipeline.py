@@ -16,7 +16,7 @@ import shutil
 import numpy as np
 
 from koopman_ros.core.arrays import Array, short_repr
-from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.datasets import Episode, PlantDescription, sample_interval
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.plots import finite
 from koopman_ros.core.progress import progress_line
@@ -101,7 +101,7 @@ class Retrained:
     reduction: Reduction | None = None  #: the part of a long record that is used
     #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
     free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
-    #: likewise by model: of the drift that it was learned from, of the best linear model
+    #: the same of the estimated drift and of the best linear model, by model and record
     compared_runs: Mapping[str, Mapping[str, FreeRun]] = field(default_factory=dict)
 
     __repr__ = short_repr
@@ -403,8 +403,7 @@ def _given_lag(task: TrainingTask, plant: PlantDescription, episodes: Sequence[E
             name in task.disturbances and task.lag[name])):
         raise ValueError(f'lag names {wrong}: choose from the manipulated inputs '
                          f'{", ".join(name for name in names if name not in task.disturbances)}')
-    shortest = 0.5 * SECONDS_PER_TIME_UNIT[plant.time_unit] * float(np.median(np.concatenate(
-        [np.diff(one.time) for one in episodes])))
+    shortest = 0.5 * SECONDS_PER_TIME_UNIT[plant.time_unit] * sample_interval(episodes)
     for name, value in task.lag.items():
         if not (value in (-1.0, 0.0) or shortest <= value <= LONGEST_DEAD_TIME):
             raise ValueError(f'lag of {name} is {value:g} s, must be {shortest:.3g} s (half of a '

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.solvers import differences
-from koopman_ros.core.units import check_time_unit, named_units, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import check_time_unit, checked_signals, SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
 
@@ -78,7 +78,7 @@ class ControlAffineSystem:
     def __post_init__(self) -> None:
         check_time_unit(self.time_unit)
         for kind in ('state', 'input'):
-            for what, given in zip(('names', 'units'), named_units(
+            for what, given in zip(('names', 'units'), checked_signals(
                     kind, getattr(self, f'{kind}_names'), getattr(self, f'{kind}_units')),
                     strict=True):
                 object.__setattr__(self, f'{kind}_{what}', given)

@@ -16,6 +16,7 @@ from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.identification_methods import WeakFormParameters
+from koopman_ros.learning.identification.chance import block_gains, clearly_positive
 from koopman_ros.learning.identification.drift import (
     Drift,
     DriftModel,
@@ -34,8 +35,6 @@ from koopman_ros.learning.identification.weak_form import weak_form
 from koopman_ros.model import Coordinates
 
 _POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions beside states
-# A larger model must err less by so many standard errors of the difference.
-_SIGMAS = 2.0
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
 _FEW_STEPS, _MOST_STEPS = 10, 40  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
@@ -153,10 +152,8 @@ def _better(found: Identified, functions: _Functions, drift: DriftModel) -> Drif
     without = _refined(drift, Segments.of(episodes, step)).left_out(SETTLING)
 
     def gains(one: Refined[PolynomialCoefficients]) -> bool:
-        gain = np.array([np.mean(block) for block in np.array_split(
-            (without ** 2 - one.left_out(SETTLING) ** 2) / np.mean(without ** 2, axis=0),
-            max(2, len(without) // SETTLING))])
-        return bool(np.mean(gain) > _SIGMAS * np.std(gain) / np.sqrt(len(gain)))
+        return clearly_positive(block_gains(
+            one.left_out(SETTLING), without, max(2, len(without) // SETTLING)))
 
     # without a need for them nothing is left to gain after a few steps
     if not gains(_refined(start, segments, _FEW_STEPS)):

@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
+from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription, sample_interval
 from koopman_ros.learning.identification.drift import Drift, DriftModel, longest_step, Segments
 from koopman_ros.learning.identification.identify import Identified, Score, segments_of, split
 from koopman_ros.learning.identification.innovations_form import FilterRun, Predictor
@@ -60,7 +60,7 @@ class SplitRecord:
         self.step = longest_step(self.parts)  #: longest of a roll-out
         self._last: tuple[Predictor[Drift], FilterRun] | None = None
         #: usual time between samples
-        self.period = float(np.median(np.concatenate([np.diff(p.time) for p in self.parts])))
+        self.period = sample_interval(self.parts)
 
     def segments(self, parts: Sequence[int], samples: int | None = None) -> Segments:
         """Return some segments on grids, cut into pieces of a largest number of samples."""

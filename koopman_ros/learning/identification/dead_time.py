@@ -12,7 +12,8 @@ import numpy as np
 from scipy.linalg import block_diag, lstsq
 from scipy.signal import lfilter
 
-from koopman_ros.core.datasets import Array, Episode
+from koopman_ros.core.datasets import Array, Episode, sample_interval
+from koopman_ros.learning.identification.chance import block_gains, clearly_positive
 
 _ORDERS = (1, 2, 3)  # of the linear models
 LONGEST = 60  # samples of dead time that are tried, where the record is long enough
@@ -20,7 +21,6 @@ SHARE = 8  # of an episode, which the longest dead time may take
 _ROUNDS = 3  # over all inputs
 _ITERATIONS = 8  # of Steiglitz and McBride from nothing; from a neighbour's filter below
 _FEW = 3
-_SIGMAS = 2.0  # standard errors of a clear difference
 _WHITE = 0.3  # correlation of an error with the next one
 _BLOCKS = 30  # in which errors are compared
 _STABLE = 0.9999  # largest magnitude of a pole
@@ -60,7 +60,7 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     :param known: (n_u,) inputs whose dead time the episodes have already; none by default.
     :param watch: called now and then; it may raise to end the search.
     """
-    period = float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
+    period = sample_interval(episodes)
     n_y, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
     longest = min(LONGEST, max(len(episode) for episode in episodes) // SHARE)
     data = [Sampled.of(episode, period, longest) for episode in episodes
@@ -84,7 +84,8 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     plain = min((one for one in tried if one.delays == none), key=lambda one: one.criterion,
                 default=best)
     # errors that are not white hide whether a dead time is one, or what the models lack
-    if not (_white(best.errors) or _clearly_less(best.errors, plain.errors)):
+    if not (_white(best.errors) or clearly_positive(
+            block_gains(best.errors, plain.errors, _BLOCKS))):
         best = plain
     return DeadTimes(best.delays, period, best.order, best.rmse, plain.rmse)
 
@@ -125,14 +126,6 @@ def _median(searches: Sequence[LinearModels], tried: Sequence[_LinearModel]) -> 
 def _white(errors: Array) -> bool:
     return bool(np.all(np.sum(errors[1:] * errors[:-1], axis=0) < _WHITE * np.sum(
         errors ** 2, axis=0)))
-
-
-def _clearly_less(errors: Array, others: Array) -> bool:
-    """Return whether squared errors (N, n_y) are less than others by more than chance."""
-    scale = np.mean(others ** 2, axis=0) + 1e-300
-    gain = np.array([np.mean(block) for block in np.array_split(
-        (others ** 2 - errors ** 2) / scale, _BLOCKS)])
-    return bool(np.mean(gain) > _SIGMAS * np.std(gain) / np.sqrt(len(gain)))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import short_repr
-from koopman_ros.core.datasets import Array, Episode, PlantDescription
+from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials
@@ -257,7 +257,7 @@ class Segments:
 def longest_step(episodes: Sequence[Episode]) -> float:
     """Return a step over which a Runge-Kutta method follows motion that the episodes resolve."""
     # a motion is resolved where it takes several samples
-    return 2.0 * float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
+    return 2.0 * sample_interval(episodes)
 
 
 def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, Array]:

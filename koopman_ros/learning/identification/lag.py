@@ -14,6 +14,7 @@ from scipy.optimize import minimize_scalar
 
 from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
+from koopman_ros.learning.identification.chance import clearly_positive
 from koopman_ros.learning.identification.drift import (
     box_of,
     Drift,
@@ -41,8 +42,6 @@ _RATIO, _SHARE, _TOLERANCE = 2.0, 30.0, 0.05
 _DEGREE, _MOST_COEFFICIENTS, _WINDOW = 3, 60, 40
 # Samples of a segment that is simulated.
 _SAMPLES = 240
-# A lag must reduce the squared error by so many standard errors of the difference.
-_SIGMAS = 2.0
 
 
 def lagged(episode: Episode, lag: Array, longest: float = 0.0) -> Episode | None:
@@ -216,8 +215,8 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         for d in range(degree, 0, -1):
             start = drift or weak_form(parts, box, d, inputs.weights, _WINDOW, inputs.degree)
             refined = output_error(start, segments, learn_input_matrix=inputs.weights is None)
-            squares = fitted_starts(refined.rate, segments, box.states.scale)[1]
-            found = np.mean(squares / box.states.scale ** 2, axis=1)
+            found = np.mean(fitted_starts(refined.rate, segments, box.states.scale)[1]
+                            / box.states.scale ** 2, axis=1)
             if np.isfinite(found).all():
                 drift = refined
                 break
@@ -240,17 +239,11 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
             bounds=(-math.log(_RATIO), math.log(min(_RATIO, longest / best))), method='bounded',
             options={'xatol': _TOLERANCE}).x)
         errors = squares(j, found)
-        if not _clearly_less(errors, without):
+        if not clearly_positive(without - errors):
             continue
         assert drift is not None
         # a linear plant may exchange the lag for a time constant: the actuator is the faster one
         times = 1.0 / np.maximum(-np.linalg.eigvals(drift.slope(box.states.center)).real, 1e-9)
         lag[j] = next((other for other in sorted(times.tolist()) if step / 4.0 < other < found
-                       and not _clearly_less(errors, squares(j, other))), found)
+                       and not clearly_positive(squares(j, other) - errors)), found)
     return lag
-
-
-def _clearly_less(errors: Array, others: Array) -> bool:
-    """Whether mean squared errors (M,) are less than others, not by chance."""
-    less = others - errors
-    return bool(np.mean(less) > _SIGMAS * np.std(less) / math.sqrt(len(less)))

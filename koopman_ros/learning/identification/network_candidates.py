@@ -18,7 +18,7 @@ from koopman_ros.learning.identification.output_error import Refined
 from koopman_ros.learning.identification.structure_candidates import (
     candidate_of,
     Choice,
-    simulated,
+    fitted_by_simulation,
     StructureCandidate,
 )
 
@@ -82,7 +82,7 @@ def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[Netwo
     monitor()
     (units, seed), drift = item, shared.linear.model.drift
     assert isinstance(drift, DriftModel)
-    found = simulated(
+    found = fitted_by_simulation(
         NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
                             learn_input_matrix=shared.learn_input_matrix),
         shared.linear.gain, *shared.data, monitor)

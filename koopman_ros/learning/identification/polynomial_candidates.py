@@ -24,7 +24,7 @@ from koopman_ros.learning.identification.output_error import (
 from koopman_ros.learning.identification.realisation import realised
 from koopman_ros.learning.identification.structure_candidates import (
     candidate_of,
-    simulated,
+    fitted_by_simulation,
     StructureCandidate,
 )
 from koopman_ros.model import Box
@@ -88,8 +88,9 @@ class PolynomialSearch:
                 data, starts = self.record.simulated(start, samples)
             except ValueError:
                 return None
-            refined = simulated(PolynomialCoefficients(start.drift, self.learn_B), start.gain,
-                                data, starts, monitor)
+            refined = fitted_by_simulation(
+                PolynomialCoefficients(start.drift, self.learn_B), start.gain, data, starts,
+                monitor)
             if not np.isfinite(refined.cost):
                 return None
             if not self.samples:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from koopman_ros.core.datasets import Array
+from koopman_ros.learning.identification.chance import SIGMAS
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.identification.identify import NEARLY, OUTPUT_ERROR, Score
@@ -19,8 +20,6 @@ from koopman_ros.learning.identification.innovations_form import Predictor, SETT
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import innovations_form, Refinable, Refined
 
-# A larger model must err less by so many standard errors of the difference.
-_SIGMAS = 2.0
 _MOST = 2.0  # times the least squared error that a smaller model may have
 _ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
 _LOST = 10.0  # half-ranges from the measurement
@@ -103,7 +102,7 @@ class Choice:
         if not before:
             self.steps.append(one.text)
             return True
-        better, words = compared(one.errors, plainest(before).errors)
+        better, words = compared(one.errors, smallest_adequate(before).errors)
         self.steps.append(f'{one.text}; {words}')
         return better
 
@@ -116,8 +115,8 @@ class Choice:
         return (*self.steps, f'selected: {best.text}')
 
 
-def simulated(model: _Model, gain: Array, data: Segments, starts: Array,
-              monitor: Callable[..., bool]) -> Refined[_Model]:
+def fitted_by_simulation(model: _Model, gain: Array, data: Segments, starts: Array,
+                         monitor: Callable[..., bool]) -> Refined[_Model]:
     """Return a model whose simulations err least."""
     penalty = model.penalty if isinstance(model, NetworkDrift) else None
     return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
@@ -154,7 +153,7 @@ def equals(best: StructureCandidate, able: Sequence[StructureCandidate]
             and one.score.cost <= most]
 
 
-def plainest(candidates: Sequence[StructureCandidate]) -> StructureCandidate:
+def smallest_adequate(candidates: Sequence[StructureCandidate]) -> StructureCandidate:
     """Return the smallest whose squared errors are not clearly above the least."""
     squares = _blocks([one.errors for one in candidates])
     least = min(squares, key=np.mean)
@@ -162,7 +161,7 @@ def plainest(candidates: Sequence[StructureCandidate]) -> StructureCandidate:
     def worse(own: Array) -> bool:
         more, deviation = _excess(own, least)
         # of a model that errs wildly in a few blocks the scatter says nothing
-        return more > min(_SIGMAS * deviation, _MOST - 1.0)
+        return more > min(SIGMAS * deviation, _MOST - 1.0)
 
     able = [(len(one.model.theta), float(np.mean(own)), i) for i, (one, own) in enumerate(
         zip(candidates, squares, strict=True)) if not worse(own)]
@@ -172,7 +171,7 @@ def plainest(candidates: Sequence[StructureCandidate]) -> StructureCandidate:
 def compared(own: Array, other: Array) -> tuple[bool, str]:
     """Return whether errors (N, n_y) are less than others, not by chance, and how much."""
     more, deviation = _excess(*_blocks([own, other]))
-    return more < -_SIGMAS * deviation, (
+    return more < -SIGMAS * deviation, (
         f'mean square {100.0 * abs(more):.3g} % {"more" if more > 0.0 else "less"} than with the '
         f'best before (standard error {100.0 * deviation:.2g} %)')
 

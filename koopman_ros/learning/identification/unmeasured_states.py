@@ -64,7 +64,7 @@ from koopman_ros.learning.identification.structure_candidates import (
     compared,
     equals,
     not_measured,
-    plainest,
+    smallest_adequate,
     StructureCandidate,
 )
 from koopman_ros.model import Coordinates
@@ -263,7 +263,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     searched = ('input_matrix_degree', *['unmeasured_states'] * (linear.hidden < hidden))
     able = choice.candidates
     while True:
-        best = plainest(able)
+        best = smallest_adequate(able)
         if best is kept:
             # the estimate without unmeasured states, as it is
             assert measured is not None
