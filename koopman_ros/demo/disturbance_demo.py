@@ -9,19 +9,18 @@ that its model has learned. In the other it does not, and the disturbance observ
 that effect.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.plots import drawing, legend, write_figures
-from koopman_ros.core.units import conversion, NANOSECONDS, shown, unit_label
+from koopman_ros.core.units import shown, unit_label
 from koopman_ros.demo import reactor
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
-from koopman_ros.demo.loop import FIRST_STAMP_NS, running_loop, Scenario
-from koopman_ros.demo.results import DemoRun, read_run
-from koopman_ros.records import read_series
+from koopman_ros.demo.loop import running_loop, Scenario
+from koopman_ros.demo.results import DemoRun, read_run, read_signal
 
 MODEL, FEED = 'reactor_feed', 'feed_temperature'
 STEP = 5.0  # K
@@ -79,11 +78,8 @@ def run_disturbance(output: Path, speed: float) -> dict[str, object]:
 
 def _read(scenario: Scenario, bag: Path) -> _DisturbedRun:
     wiring = scenario.wiring
-    loop = read_run(wiring, bag)
-    place = wiring.measured_disturbances[FEED]
-    series = read_series(bag, replace(place, topic=f'/{place.topic}'))
-    return _DisturbedRun(loop, (series.stamp_ns - FIRST_STAMP_NS) / NANOSECONDS,
-                conversion(place.unit, 'K')(series.values))
+    return _DisturbedRun(read_run(wiring, bag), *read_signal(
+        bag, wiring.measured_disturbances[FEED], 'K'))
 
 
 def _draw(path: Path, runs: dict[str, _DisturbedRun]) -> None:

@@ -20,9 +20,7 @@ from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import draw_limits, drawing, legend, write_figures
 from koopman_ros.core.units import (
-    conversion,
     display_unit,
-    NANOSECONDS,
     shown,
     to_celsius,
     unit_label,
@@ -30,13 +28,12 @@ from koopman_ros.core.units import (
 from koopman_ros.demo.console import LiveTable
 from koopman_ros.demo.late_input import Course, FirstOrder, LateRun, pi_law, Piece
 from koopman_ros.demo.loop import FIRST_STAMP_NS, running_loop, Scenario
-from koopman_ros.demo.results import read_run
+from koopman_ros.demo.results import read_run, read_signal
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.signal_topics import CONTROLLER_INTERNALS, EVENT_LOG
 from koopman_ros.plants import Process, sensor_noise
-from koopman_ros.records import read_series
 
 PLANT = 'heated_line'
 TEMPERATURE, FEED, VALVE, CONCENTRATION = (
@@ -70,7 +67,8 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
         operator.set('plant', **{f'constants.{FEED}': to_celsius(COLD)})
         operator.run_until(_DURATION)
 
-    run, feed = read_run(wiring, bag), _series(bag, FEED, 'K', wiring.measured_disturbances[FEED])
+    run, feed = read_run(wiring, bag), read_signal(
+        bag, wiring.measured_disturbances[FEED], 'K')
     colder = feed[0][np.argmax(feed[1] < 0.5 * (feed[1][0] + COLD))]
     # the plant goes on until it is stopped
     commands = run.commanded[VALVE][run.command_seconds <= _DURATION]
@@ -80,21 +78,13 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
         f'{name.lower().replace(" ", "_")}': {
             'cost_by_optimum': course.cost / best.cost, **_figures(course, seconds, colder)}
         for name, course in courses.items()}
-    analysed = _series(bag, CONCENTRATION, 'mol/L',
-                       place(CONCENTRATION, CONCENTRATION, 'mol/L'))
-    estimated = _series(bag, CONCENTRATION, 'mol/L', replace(
+    analysed = read_signal(bag, place(CONCENTRATION, CONCENTRATION, 'mol/L'), 'mol/L')
+    estimated = read_signal(bag, replace(
         place(CONTROLLER_INTERNALS, CONCENTRATION, 'mol/L'),
-        field=f'position[estimated_{CONCENTRATION} [mol/L]]'))
+        field=f'position[estimated_{CONCENTRATION} [mol/L]]'), 'mol/L')
     _draw(output / 'closed_loop.png', seconds, courses, feed, analysed, estimated)
     write_figures(output / 'summary.json', result)
     return result
-
-
-def _series(bag: Path, name: str, unit: str, where: Any) -> tuple[Array, Array]:
-    """Return the seconds since the first measurement and the values of a signal."""
-    found = read_series(bag, replace(where, topic=f'/{where.topic}'))
-    return ((found.stamp_ns - FIRST_STAMP_NS) / NANOSECONDS,
-            conversion(where.unit, unit)(found.values))
 
 
 def _courses(commands: Array, colder: int) -> dict[str, Course]:

@@ -17,6 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import conversion, NANOSECONDS
+from koopman_ros.demo.loop import FIRST_STAMP_NS
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.records import read_series
 
@@ -57,6 +58,13 @@ class DemoRun:
         """Return the largest change from one command to the next between two times."""
         rows = (self.command_seconds >= start) & (self.command_seconds <= end)
         return float(np.max(np.abs(np.diff(self.commanded[signal][rows]))))
+
+
+def read_signal(bag: Path, place: MessageField, unit: str) -> tuple[Array, Array]:
+    """Return the seconds since the first measurement and the values of a signal, in a unit."""
+    found = read_series(bag, replace(place, topic=f'/{place.topic}'))
+    return ((found.stamp_ns - FIRST_STAMP_NS) / NANOSECONDS,
+            conversion(place.unit, unit)(found.values))
 
 
 def read_run(wiring: SignalTopics, *bags: Path) -> DemoRun:
