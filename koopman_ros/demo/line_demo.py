@@ -65,13 +65,13 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
             operator.request_setpoints({TEMPERATURE: kelvin}, at)
         operator.run_until(FEED_TIME)
         operator.set('plant', **{f'constants.{FEED}': to_celsius(COLD)})
-        operator.run_until(_DURATION)
+        operator.run_until(operator.seconds + _DURATION - FEED_TIME)
 
     run, feed = read_run(wiring, bag), read_signal(
         bag, wiring.measured_disturbances[FEED], 'K')
     colder = feed[0][np.argmax(feed[1] < 0.5 * (feed[1][0] + COLD))]
-    # the plant goes on until it is stopped
-    commands = run.commanded[VALVE][run.command_seconds <= _DURATION]
+    # a plant in lock-step goes on while it is given the constant, and until it is stopped
+    commands = run.commanded[VALVE][run.command_seconds <= colder + _DURATION - FEED_TIME]
     courses = _courses(commands, round(colder / scenario.sample_period))
     best, seconds = courses['optimum'], scenario.sample_period * np.arange(float(len(commands)))
     result: dict[str, object] = {'unit': 'K', 'feed_step': COLD - float(feed[1][0])} | {
