@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         for flag, options in arguments.items():
             command.add_argument(f'--{flag}' if 'default' in options else flag, **options)
-        command.add_argument('--timeout', type=float, default=10.0, metavar='S',
+        command.add_argument('--timeout', type=float, default=30.0, metavar='S',
                              help='longest wait (default: %(default)s s)')
 
     message_type = {'default': '', 'metavar': 'TYPE',
