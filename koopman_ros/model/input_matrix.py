@@ -50,7 +50,8 @@ class InputTerms:
             return u
         phi = PolynomialObservables.total_degree(x.shape[-1], degree).lift(x)
         products = phi[..., :, None] * u[..., None, :]
-        return np.concatenate([u, products.reshape(*u.shape[:-1], -1)], axis=-1)
+        width = phi.shape[-1] * u.shape[-1]  # -1 has no value where there are no rows
+        return np.concatenate([u, products.reshape(*u.shape[:-1], width)], axis=-1)
 
     @staticmethod
     def split(weights: Array, n_u: int) -> tuple[Array, InputTerms | None]:

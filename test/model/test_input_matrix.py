@@ -50,3 +50,11 @@ def test_weights_of_the_regressors_are_the_matrix_and_its_terms():
     np.testing.assert_allclose(InputTerms.regressors(x, u, 3) @ weights.T, expected,
                                rtol=0, atol=1e-13)
     assert InputTerms.split(weights[:, :3], 3)[1] is None
+
+
+def test_no_samples_have_regressors_of_the_usual_width():
+    # the last block of a record's steps may hold a single one, which has no successor
+    for degree in range(3):
+        empty = InputTerms.regressors(np.empty((0, 5, 2)), np.empty((0, 5, 3)), degree)
+        one = InputTerms.regressors(np.empty((1, 5, 2)), np.empty((1, 5, 3)), degree)
+        assert (len(empty), empty.shape[1:]) == (0, one.shape[1:])
