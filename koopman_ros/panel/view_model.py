@@ -17,15 +17,7 @@ from koopman_ros.core.status import level_words
 from koopman_ros.core.units import conversion, display_unit, printed
 from koopman_ros.panel.conditions import Conditions
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
-from koopman_ros.panel.snapshot import (
-    CONTROL,
-    CONTROLLER,
-    OK,
-    PLANT,
-    ROLES,
-    Snapshot,
-    TaskStatus,
-)
+from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, OK, PLANT, ROLES, Snapshot, TaskStatus
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.signal_topics import Signals
