@@ -131,7 +131,7 @@ def test_a_report_is_followed(base: Path) -> None:
     trained = {**TRAINED, 'model_file': f'{base}.safetensors'}
     for number, (model, accepted) in enumerate(((trained['model_file'], True), ('other', False))):
         Path(f'{base}.json').write_text(json.dumps({**FIGURES, 'model_file': model}))
-        os.utime(f'{base}.json', (number, number))
+        os.utime(f'{base}.json', (2e9 + number, 2e9 + number))
         watch.training(trained, '')
         assert watch.learning.report
         assert watch.learning.report.accepted is accepted
