@@ -70,10 +70,10 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	@touch $@
 
 demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C; EXPORT=1: with its exported C code; DISTURBANCE=1: a step of the feed temperature with and without its measurement -> out/demo-disturbance)
-	$(BIN)/python -m koopman_ros.demo$(if $(DISTURBANCE),.disturbance) $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel) $(if $(EXPORT),--export)
+	$(BIN)/python -m koopman_ros.demo $(if $(DISTURBANCE),disturbance) $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel) $(if $(EXPORT),--export)
 
 demo-retrain: $(VENV)/retrain.stamp  ## retrain the model of a plant that changes -> out/demo-retrain
-	$(BIN)/python -m koopman_ros.demo.retrain
+	$(BIN)/python -m koopman_ros.demo retrain
 
 demo-saddle: SEEDS = 5
 demo-saddle: $(VENV)/saddle.stamp  ## train on an unstable reactor under PI control, temperature measured only, and stabilise it; SEEDS=5, 15 min -> out/demo-saddle

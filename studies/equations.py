@@ -8,10 +8,10 @@ from typing import Any, TypeAlias
 
 import casadi
 
-from koopman_ros.plants.library.outflow import GRAVITY
 from koopman_ros.plants.library.pendulum import Pendulum
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from koopman_ros.plants.library.reactor import FedReactor, ReactorParameters, TwoStateReactor
+from koopman_ros.plants.library.tanks import GRAVITY
 
 # Rates of the state (n_x,) from state and input (n_u,), expressions all.
 Rates: TypeAlias = Callable[[Any, Any], Any]

@@ -57,7 +57,6 @@ def run_disturbance(output: Path, speed: float) -> dict[str, object]:
             {}, duration=0.0, speed=speed, disturbances=(f'{FEED} [K]',),
             controller={'model': MODEL, f'{FEED}.topic': topic})
         logs, bag = output / f'logs_{name}', output / f'{name}.mcap'
-        logs.mkdir(parents=True, exist_ok=True)
         bag.unlink(missing_ok=True)
         table = LiveTable(f'feed {STEP:g} K warmer after {_STEP_TIME:g} s, {name}',
                           scenario.wiring.signals, _STEP_TIME + _AFTER)

@@ -19,12 +19,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import draw_limits, drawing, legend, write_figures
-from koopman_ros.core.units import (
-    display_unit,
-    shown,
-    to_celsius,
-    unit_label,
-)
+from koopman_ros.core.units import display_unit, shown, to_celsius, unit_label
 from koopman_ros.demo.console import LiveTable
 from koopman_ros.demo.late_input import Course, FirstOrder, LateRun, pi_law, Piece
 from koopman_ros.demo.loop import FIRST_STAMP_NS, running_loop, Scenario
@@ -54,7 +49,6 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
                         PlantTable({'system': PLANT}).snapshot({}).sample_period, speed,
                         (f'{FEED} [K]',))
     wiring, logs, bag = scenario.wiring, output / 'logs', output / 'closed_loop.mcap'
-    logs.mkdir(parents=True, exist_ok=True)
     for old in (bag, output / 'closed_loop.png', output / 'summary.json'):
         old.unlink(missing_ok=True)
     table = LiveTable(f'heated line: temperature in two steps, feed colder after {FEED_TIME:g} s',

@@ -245,13 +245,14 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     The ROS domain is that of ROS_DOMAIN_ID, where it is set, or else one that no other run uses.
     To be called from the main thread: it takes over Ctrl-C, so that the processes end.
 
-    :param logs: folder for the output of the processes.
+    :param logs: folder for the output of the processes, which is created.
     :param trainer: parameters of the trainer, which records from its start.
     :param on_row: called at every command.
     :param panel: parameters of a panel, None for no panel.
     :raises HarnessError: when other nodes of the domain use the loop's topics or names, before
         anything is commanded; when a process ends early or the loop stops.
     """
+    logs.mkdir(parents=True, exist_ok=True)
     with (deferred_interrupt() as check_interrupt,
           Harness(logs, name='operator', timeout=_TIMEOUT, lasting=True,
                   domain=os.environ.get('ROS_DOMAIN_ID', ''), each_turn=check_interrupt)

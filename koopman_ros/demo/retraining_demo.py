@@ -25,12 +25,7 @@ from koopman_ros.demo.loop import Operator, running_loop
 from koopman_ros.demo.results import DemoRun, draw_phases, read_run
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.trainer import MANUAL
-from koopman_ros.plants import (
-    one_state_reactor,
-    random_steps,
-    RandomStepDesign,
-    ReactorParameters,
-)
+from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign, ReactorParameters
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left
@@ -59,8 +54,6 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     begin = time.monotonic()
     if output.exists():
         shutil.rmtree(output)
-    logs = output / 'logs'
-    logs.mkdir(parents=True)
     present = load(model_path(reactor.MODEL))
     setpoint = float(present.states.center[0]) + STEP
     scenario = reactor.scenario(reactor.MODEL, setpoint, step_time=_STEP_TIME, duration=0.0,
@@ -70,7 +63,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     table = LiveTable('retraining with the disturbance observer off',
                       scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
-    with running_loop(scenario, logs, trainer, table.show) as operator:
+    with running_loop(scenario, output / 'logs', trainer, table.show) as operator:
         phases = _operate(operator, bags[1], new_model)
     history = read_run(scenario.wiring, *bags)
     learned = load(new_model)

@@ -95,8 +95,6 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
         plant={f'{signal}.initial_offset': state.initial_offset
                for signal, state in plan.states.items()},
         controller={} if plan.observer else {'observer_bandwidth': 0.0})
-    logs = output / 'logs'
-    logs.mkdir(parents=True, exist_ok=True)
     bag, picture = output / 'closed_loop.mcap', output / 'closed_loop.png'
     for old in (bag, picture, output / 'summary.json'):
         old.unlink(missing_ok=True)
@@ -117,7 +115,7 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
         if code is not None:
             code.answer(row)
 
-    run_loop(scenario, bag, logs, on_row)
+    run_loop(scenario, bag, output / 'logs', on_row)
     differences = {} if code is None else {'exported_difference': code.close()}
     run = read_run(wiring, bag)
     first = round(plan.step_time / plant.sample_period)
@@ -215,10 +213,8 @@ def run_with_panel(plant: str, port: int, output: Path, speed: float) -> dict[st
     if preset_wiring(plant) is None:
         raise ValueError(f'no demo for the plant {plant!r}: choose one of '
                          f'{", ".join(bundled_plants())}')
-    logs = output / 'logs'
-    logs.mkdir(parents=True, exist_ok=True)
     scenario = Scenario({}, plant, duration=0.0, speed=min(speed or _PANEL_SPEED, _PANEL_SPEED))
-    with running_loop(scenario, logs, {'output': output / 'panel.mcap'},
+    with running_loop(scenario, output / 'logs', {'output': output / 'panel.mcap'},
                       panel={'port': port}) as operator:
         print(f'{scenario.speed:g} times real time; Ctrl-C ends it', flush=True)
         operator.run_until(math.inf)

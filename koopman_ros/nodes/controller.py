@@ -23,12 +23,7 @@ from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation import MeasurementBuffer
 from koopman_ros.event_log import records
-from koopman_ros.parameters.controller import (
-    built,
-    ControllerParameters,
-    OF_THE_MODEL,
-    table_of,
-)
+from koopman_ros.parameters.controller import built, ControllerParameters, OF_THE_MODEL, table_of
 from koopman_ros.parameters.model_checks import (
     load_suitable,
     LoadedModel,

@@ -123,14 +123,11 @@ def _shelved_row(page: PageLayout, first: Alarm) -> Callable[[Alarm], None]:
 
 
 def _act(page: PageLayout, what: str, key: str, seconds: float | None = None) -> None:
-    """Change an alarm for an operator, and publish the action."""
+    """Change an alarm for an operator, and publish the action if it was possible."""
     if not page.visitor.may_act():
         return
     alarms, who, now = page.source.view.alarms, page.visitor.name, time.time()
-    if what == 'acknowledge':
-        alarms.acknowledge(key, who, now)
-    elif what == 'shelve':
-        alarms.shelve(key, seconds or 0.0, who, now)
-    else:
-        alarms.unshelve(key, who, now)
-    page.source.ask(Action(who, what, key, seconds))
+    if (alarms.acknowledge(key, who, now) if what == 'acknowledge' else
+            alarms.unshelve(key, who, now) if seconds is None else
+            alarms.shelve(key, seconds, who, now)):
+        page.source.ask(Action(who, what, key, seconds))

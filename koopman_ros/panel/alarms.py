@@ -4,7 +4,8 @@
 """Alarms by ISA-18.2: delays, acknowledgement, shelving, and a journal of 24 hours."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
+import contextlib
 from dataclasses import dataclass
 from enum import Enum
 import math
@@ -12,8 +13,6 @@ import threading
 
 from koopman_ros.panel.files import sanitize_text
 
-SHORTEST_SHELVING = 60.0  # s
-LONGEST_SHELVING = 8 * 3600.0  # s
 MAX_TEXT = 500  # characters
 MAX_WHO = 64
 _FOUND_AGAIN = 10.0  # s after a restart until the conditions are reported again
@@ -164,41 +163,34 @@ class Alarms:
         with self._lock:
             self._advance(now)
 
-    def acknowledge(self, key: str, who: str, now: float) -> str:
-        """Acknowledge an alarm; return the reason if that is not possible."""
-        def act(record: _Record) -> str:
-            if record.state is AlarmState.ACKNOWLEDGED:
-                return f'already acknowledged by {record.acknowledged_by}'
+    def acknowledge(self, key: str, who: str, now: float) -> bool:
+        """Acknowledge an active alarm; return whether that was possible."""
+        with self._acting(key, now) as record:
+            if record is None or record.state is AlarmState.ACKNOWLEDGED:
+                return False
             back = record.state is AlarmState.RETURNED
             record.state = AlarmState.NORMAL if back else AlarmState.ACKNOWLEDGED
             record.acknowledged_by = '' if back else sanitize_text(who, MAX_WHO)
             self._note(now, record, 'acknowledged', who)
-            return ''
+        return True
 
-        return self._act(key, 'acknowledge', now, act)
-
-    def shelve(self, key: str, seconds: float, who: str, now: float) -> str:
-        """Hide an alarm for 1 min to 8 h; return the reason if that is not possible."""
-        if not SHORTEST_SHELVING <= seconds <= LONGEST_SHELVING:
-            return 'an alarm can be shelved for 1 min to 8 h'
-
-        def act(record: _Record) -> str:
+    def shelve(self, key: str, seconds: float, who: str, now: float) -> bool:
+        """Hide an active alarm for some seconds; return whether that was possible."""
+        with self._acting(key, now, shelved=True) as record:
+            if record is None:
+                return False
             record.shelved_until = now + seconds
             self._note(now, record, 'shelved', who)
-            return ''
+        return True
 
-        return self._act(key, 'shelve', now, act, shelved=True)
-
-    def unshelve(self, key: str, who: str, now: float) -> str:
-        """Show a shelved alarm again; return the reason if that is not possible."""
-        def act(record: _Record) -> str:
-            if record.shelved_until is None:
-                return 'the alarm is not shelved'
+    def unshelve(self, key: str, who: str, now: float) -> bool:
+        """Show a shelved alarm again; return whether that was possible."""
+        with self._acting(key, now, shelved=True) as record:
+            if record is None or record.shelved_until is None:
+                return False
             record.shelved_until = None
             self._note(now, record, 'unshelved', who)
-            return ''
-
-        return self._act(key, 'unshelve', now, act, shelved=True)
+        return True
 
     @property
     def standing(self) -> tuple[Alarm, ...]:
@@ -260,18 +252,18 @@ class Alarms:
         with self._lock:
             return tuple(entry for entry in reversed(self._journal) if entry.time >= since)
 
-    def _act(self, key: str, what: str, now: float, act: Callable[[_Record], str],
-             shelved: bool = False) -> str:
-        """Act on an active alarm, or also on a shelved one."""
+    @contextlib.contextmanager
+    def _acting(self, key: str, now: float, shelved: bool = False) -> Iterator[_Record | None]:
+        """Return an active alarm, or also a shelved one, to be changed; None for another."""
         with self._lock:
             self._advance(now)
             record = self._records.get(key)
             if record is None or (record.state is AlarmState.NORMAL
                                   and not (shelved and record.shelved_until is not None)):
-                return f'cannot {what} this alarm: it is no longer active'
-            refused = act(record)
-            self._tidy(record)
-            return refused
+                yield None
+            else:
+                yield record
+                self._tidy(record)
 
     def _advance(self, now: float) -> None:
         running = [self._records[key] for key in self._running]

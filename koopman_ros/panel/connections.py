@@ -11,9 +11,11 @@ import contextlib
 import logging
 import resource
 import socket
-import threading
-import time
 from typing import Any
+
+from limits import parse
+from limits.storage import MemoryStorage
+from limits.strategies import FixedWindowRateLimiter
 
 MAX_CONNECTIONS = 256
 BACKLOG = 64  # connections that are accepted at once
@@ -78,27 +80,16 @@ class Listener(socket.socket):
 
 
 class RateLimiter(logging.Filter):
-    """
-    Passes a number of records of a logger in a period, and drops the rest.
+    """Passes twenty records of some loggers a minute, and drops the rest."""
 
-    :param period: in s.
-    """
-
-    def __init__(self, most: int = 20, period: float = 60.0) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._most, self._period = most, period
-        self._begun, self._count = time.monotonic(), 0
-        self._lock = threading.Lock()
+        self._rate, self._limiter = parse('20/minute'), FixedWindowRateLimiter(MemoryStorage())
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a record is written; the last one mentions that others are dropped."""
-        with self._lock:
-            now = time.monotonic()
-            if now - self._begun >= self._period:
-                self._begun, self._count = now, 0
-            self._count += 1
-            if self._count == self._most:
-                record.msg, record.args = (
-                    f'{record.getMessage()} (further lines are dropped for up to '
-                    f'{self._period:g} s)'), ()
-            return self._count <= self._most
+        passes = self._limiter.hit(self._rate)
+        if passes and not self._limiter.test(self._rate):
+            record.msg, record.args = (
+                f'{record.getMessage()} (further lines are dropped for up to a minute)'), ()
+        return passes

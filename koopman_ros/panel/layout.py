@@ -9,6 +9,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from importlib.resources import files
 import re
 import time
 from typing import Any, Protocol, Self, TypeVar
@@ -19,7 +20,6 @@ from nicegui.element import Element
 from koopman_ros.panel.alarms import AlarmState
 from koopman_ros.panel.requests import Action, Answer
 from koopman_ros.panel.snapshot import Snapshot
-from koopman_ros.panel.style import CSS, WATCH
 from koopman_ros.panel.training_report import Learning
 from koopman_ros.panel.view_model import LoopViewModel
 
@@ -27,6 +27,7 @@ PERIOD = 0.25  # s between two updates of a page
 _TIMEOUT = 40.0  # s for an answer
 TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
          '/tuning': 'Tuning'}
+_CSS, _WATCH = ((files(__package__) / name).read_text() for name in ('style.css', 'watch.js'))
 _TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
 _ADDRESSES = ('href', 'src')
 _DEGREES = re.compile(r'\bdeg(?=[CF]\b)')
@@ -80,8 +81,8 @@ class PageLayout:
         self._shown: Snapshot | None = None
         self._updates: list[Callable[[Snapshot], None]] = []
         self._beat_at = 0.0
-        ui.add_css(CSS)
-        ui.add_head_html(WATCH)
+        ui.add_css(_CSS)
+        ui.add_head_html(f'<script>{_WATCH}</script>')
         ui.page_title(f'{TABS[path]} – {source.title}')
         ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
         self._head(path)

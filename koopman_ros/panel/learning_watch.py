@@ -9,12 +9,11 @@ from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 import tempfile
-import threading
 import time
 
 import yaml
 
-from koopman_ros.execution.job import ReplayJob
+from koopman_ros.execution.job import Job
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.training_report import (
     Learning,
@@ -27,15 +26,11 @@ from koopman_ros.panel.training_report import (
 from koopman_ros.parameters.signal_topics import EVENT_LOG, SignalTopics
 
 LAST = 3600.0  # s of the end of a bag that are compared
-_PERIOD = 1.0  # s between two looks at the files of a report
 
 
 class LearningWatch:
     """
     Keeps :class:`Learning` up to date.
-
-    A thread reads the files, for a disk may be slow or gone; all methods are called from the main
-    thread.
 
     :param resolve: full name of a topic.
     """
@@ -45,19 +40,23 @@ class LearningWatch:
         self.learning = Learning()
         self._system, self._wiring = system, wiring
         self._namespace, self._resolve = namespace, resolve
-        self._trained: tuple[str, Mapping[str, str]] = ('', {})
-        self._bag = ''
-        self._job: ReplayJob | None = None
+        self._model_file = self._bag = ''
+        self._job: Job | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._cancelled = False
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name='reports', daemon=True)
-        self._thread.start()
+        self._read: object = None  # the report that was read last
 
     def training(self, values: Mapping[str, str], output: str) -> None:
         """Take the figures of the trainer's status, and the file of its next model."""
         trained = values if 'accepted' in values else {}
-        self._trained = (trained.get('model_file') or output, trained)
+        self._model_file = trained.get('model_file', '')
+        if (base := report_base(self._model_file or output)) is None:
+            return
+        found = base, trained, report_time(base)
+        # a trainer that has not trained yet has no report
+        if found != self._read and (trained or found[2]):
+            self.learning.report = read_report(base, trained)
+        self._read = found
 
     def recording(self, bag: str) -> None:
         """Take the bag of the recording, empty for none."""
@@ -70,7 +69,7 @@ class LearningWatch:
         :param model: the active one, as the controller names it.
         """
         report = self.learning.report
-        new = self._trained[1].get('model_file') or (report.model_file if report else '')
+        new = self._model_file or (report.model_file if report else '')
         if self._job is not None:
             return Answer(False, 'a comparison is running')
         if not new:
@@ -91,8 +90,9 @@ class LearningWatch:
         remaps = [part for topic in topics for part in (
             '-r', f'{topic}:={self._resolve(topic)}')]
         try:
-            self._job = ReplayJob(['--ros-args', '--params-file', str(file), '-r',
-                                   f'__ns:={self._namespace}', *remaps])
+            self._job = Job('koopman_ros.nodes.replay', [
+                '--ros-args', '--params-file', str(file), '-r', f'__ns:={self._namespace}',
+                *remaps], interrupted=130)
         except OSError as error:
             self._folder.cleanup()
             return Answer(False, f'the replay cannot be started: {error}')
@@ -115,28 +115,13 @@ class LearningWatch:
         now = self.learning.comparison
         self.learning.comparison = ReplayComparison(
             'cancelled', model=now.model, since=now.since) if self._cancelled else read_comparison(
-                Path(self._folder.name), now.model, now.since, self._job.said)
+                Path(self._folder.name), now.model, now.since, '\n'.join(self._job.errors))
         self._job = None
         self._folder.cleanup()
 
     def complete(self) -> None:
-        """End the replay and the thread."""
-        self._ended.set()
+        """End the replay."""
         if self._job is not None and self._folder is not None:
             self._job.close()
             self._job = None
             self._folder.cleanup()
-        self._thread.join(_PERIOD)
-
-    def _watch(self) -> None:
-        last: object = None
-        while not self._ended.wait(_PERIOD):
-            name, trained = self._trained
-            base = report_base(name)
-            if base is None:
-                continue
-            written = report_time(base)
-            # a trainer that has not trained yet has no report
-            if last != (base, trained, written) and (trained or written):
-                self.learning.report = read_report(base, trained)
-            last = (base, trained, written)

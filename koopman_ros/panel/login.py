@@ -7,7 +7,9 @@ import asyncio
 from collections.abc import Mapping
 from functools import partial
 from html import escape
+from importlib.resources import files
 import math
+from string import Template
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -22,18 +24,7 @@ from koopman_ros.panel.sessions import Session, Sessions, Throttle
 _LONGEST_FORM = 8192  # bytes
 _FORM_TIMEOUT = 10.0  # s
 _ID = 'id'  # of the session, in its cookie
-_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>Log in</title>
-<link rel="icon" href="data:,">
-<style>body{{background:#d9d9d6;color:#1d1d1b;font:18px system-ui,sans-serif;margin:0}}
-form{{background:#e9e9e6;border:1px solid #a9a9a5;max-width:340px;margin:12vh auto 0;padding:20px}}
-label{{display:block;margin:12px 0 4px}}input,button{{font:inherit;width:100%;padding:10px;
-box-sizing:border-box}}button{{margin-top:18px}}p{{color:#a40000;font-weight:600}}
-</style></head><body><form method="post" action="/login{query}"><h1>{title}</h1>{message}
-<label for="name">Name</label><input id="name" name="name" autocomplete="username" autofocus
-required><label for="password">Password</label><input id="password" name="password"
-type="password" autocomplete="current-password" required><button>Log in</button></form>
-</body></html>"""
+_PAGE = Template((files(__package__) / 'login.html').read_text())
 
 
 class AccessControl:
@@ -74,7 +65,7 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
     """Serve the pages by which users log in and out."""
     def login_form(page: str, message: str = '', status: int = 200) -> HTMLResponse:
         shown = f'<p role="alert">{escape(message)}</p>' if message else ''
-        return HTMLResponse(_PAGE.format(
+        return HTMLResponse(_PAGE.substitute(
             title=escape(source.title), message=shown,
             query=f'?page={page}' if page in TABS else ''), status, {'cache-control': 'no-store'})
 

@@ -17,12 +17,7 @@ from koopman_ros.core.units import printed
 from koopman_ros.model import load
 from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
-from koopman_ros.panel.model_card import (
-    model_changes,
-    status_card,
-    training_card,
-    training_ranges,
-)
+from koopman_ros.panel.model_card import model_changes, status_card, training_card, training_ranges
 from koopman_ros.panel.report_cards import comparison_card, report_card
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import (

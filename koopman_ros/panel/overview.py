@@ -13,22 +13,8 @@ from nicegui import ui
 from nicegui.element import Element
 
 from koopman_ros.panel.alarm_page import alarm_rows
-from koopman_ros.panel.faceplates import (
-    Faceplate,
-    InputFaceplate,
-    number,
-    Range,
-    StateFaceplate,
-)
-from koopman_ros.panel.layout import (
-    AnswerLine,
-    attribute,
-    box,
-    label,
-    PageLayout,
-    place,
-    show_if,
-)
+from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, number, Range, StateFaceplate
+from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout, place, show_if
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot
 from koopman_ros.panel.trend_chart import TrendChart

@@ -31,7 +31,7 @@ EPOCH = 1e9  #: s; a later stamp is a wall time, an earlier one is a simulated t
 _GROUP = 1.0 / 15.0  # of the time shown; nearer events are one mark
 _LEAST = 0.1  # of the range of a signal, which an axis shows
 _HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
-# Pixels for the names of pens in charts from these widths on, of which the style sheet knows.
+# Pixels for the names of pens in charts from these widths on, as in style.css.
 _WIDTHS = {0: 320, 600: 560, 900: 860}
 _ROW = 20  # pixels of each further row of names
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),

@@ -17,15 +17,7 @@ from koopman_ros.core.status import level_words
 from koopman_ros.core.units import conversion, display_unit, printed
 from koopman_ros.panel.conditions import Conditions
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
-from koopman_ros.panel.snapshot import (
-    CONTROL,
-    CONTROLLER,
-    OK,
-    PLANT,
-    ROLES,
-    Snapshot,
-    TaskStatus,
-)
+from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, OK, PLANT, ROLES, Snapshot, TaskStatus
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.signal_topics import Signals
@@ -59,13 +51,11 @@ class LoopViewModel:
         self.conditions, self.trends = Conditions(nodes, now), Trends(span)
         self.alarms = self.conditions.alarms
         self._span = span
-        self._states = {name: SignalValues(name, unit, read[name])
-                        for name, unit in signals.states.items()}
-        self._inputs = {name: SignalValues(name, unit, read[name])
-                        for name, unit in signals.inputs.items()}
-        self._disturbances = {name: SignalValues(name, unit, read[name])
-                              for name, unit in signals.disturbances.items()}
-        self._all = {**self._states, **self._inputs, **self._disturbances}
+        self._all = {name: SignalValues(name, unit, read[name])
+                     for name, unit in signals.units.items()}
+        self._states, self._inputs, self._disturbances = (
+            {name: self._all[name] for name in of}
+            for of in (signals.states, signals.inputs, signals.disturbances))
         self._time = math.nan
         self._unplanned = 0
         self._mode = self._level = ''

@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
-from koopman_ros.core.declaration import (
-    nested,
-    of_other_states,
-    parameter,
-    per_signal,
-)
+from koopman_ros.core.declaration import nested, of_other_states, parameter, per_signal
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
 from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth

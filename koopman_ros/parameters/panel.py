@@ -12,7 +12,6 @@ from typing import Any
 from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
-    DEFAULT_SYSTEM,
     InputPlaces,
     MeasuredPlace,
     plant_defaults,
@@ -22,7 +21,7 @@ from koopman_ros.parameters.signal_topics import (
     system_of,
 )
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
-from koopman_ros.parameters.trainer import trainer_signals
+from koopman_ros.parameters.trainer import SignalParameters, trainer_signals
 
 
 def _shown_unit() -> Any:
@@ -51,27 +50,13 @@ class ShownDisturbance(MeasuredPlace):
     shown_unit: str = _shown_unit()
 
 
-@dataclass(frozen=True)
-class PanelParameters:
+@dataclass(frozen=True, eq=False)
+class PanelParameters(SignalParameters):
     """Parameters of the panel."""
 
-    system: str = parameter(
-        DEFAULT_SYSTEM, 'Bundled plant whose signals and topics are the defaults; any other '
-        'name: no defaults.', read_only=True)
     model: str = parameter(
         '', 'Model whose signals are shown if no other parameter names them: name of a bundled '
             'model, or path of a .safetensors file.', read_only=True)
-    states_measured: tuple[str, ...] = parameter(
-        ('',), 'Measured signals with their units, e.g. level [m]; an empty name: those of the '
-        'model.', read_only=True)
-    inputs_commanded: tuple[str, ...] = parameter(
-        ('',), 'Inputs with their units, e.g. pump [V]; an empty name: those of the model.',
-        read_only=True)
-    disturbances_measured: tuple[str, ...] = parameter(
-        ('',), 'Measured disturbances with their units, e.g. feed_temperature [K]; an empty name: '
-        'those of the model, or none.', read_only=True)
-    controlled: tuple[str, ...] = parameter(
-        ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
     controller: str = parameter(
         'controller', 'Name of the controller node.', read_only=True)
     trainer: str = parameter(

@@ -8,7 +8,7 @@ Rows of signals are named after the signal, ``temperature.weight``, and those of
 plug-in, ``pi.temperature.gain``. See :mod:`koopman_ros.core.declaration`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, Field, fields, replace
 from functools import partial, reduce
 import json
@@ -37,6 +37,7 @@ __all__ = ['UNBOUNDED', 'ConfigurationError', 'ParameterTable', 'Specification',
 
 T = TypeVar('T')
 _Path = tuple[Callable[[Any], Any], ...]
+_Make = Callable[[Mapping[str, Any]], Any]  # of values by name
 
 _TYPE_WORDS = {
     bool: ('a boolean', 'true'),
@@ -139,14 +140,10 @@ class ParameterTable(Generic[T]):
                  groups: Mapping[str, Sequence[Specification]] = MappingProxyType({}),
                  plugins: Mapping[str, type[Any]] = MappingProxyType({}),
                  defaults: Mapping[str, Any] = MappingProxyType({})) -> None:
-        self.kind = kind
-        self.ordered = ordered
-        self.cross_check = cross_check
-        self.build = build
-        self.signals = signals
-        self._groups = groups
-        self._plugins = plugins
-        declared = list(self._declared(kind, '', defaults))
+        self.ordered, self.cross_check, self.build = ordered, cross_check, build
+        self.signals, self._groups, self._plugins = signals, groups, plugins
+        self._defaults = defaults
+        declared, self._make = self._layout(kind)
         self._paths: dict[str, _Path] = {row.name: path for row, path in declared}
         # a file begins with what is not of a signal or a plug-in
         self.rows: dict[str, Specification] = {row.name: row for row, _ in sorted(
@@ -158,32 +155,42 @@ class ParameterTable(Generic[T]):
         prefix = name.partition('.')[0]
         return prefixes.index(prefix) if prefix in prefixes else len(prefixes)
 
-    def _declared(self, kind: type[Any], prefix: str, defaults: Mapping[str, Any],
-                  path: _Path = ()) -> Iterator[tuple[Specification, _Path]]:
-        """Yield the rows, each with the way to its value in a snapshot."""
+    def _layout(self, kind: type[Any], prefix: str = '', path: _Path = (), unit: str = ''
+                ) -> tuple[list[tuple[Specification, _Path]], _Make]:
+        """Return the rows, each with the path to its value, and the maker of an object of them."""
+        rows: list[tuple[Specification, _Path]] = []
+        makers: dict[str, _Make] = {}
         for item in fields(kind):
-            how = item.metadata
-            here: _Path = (*path, attrgetter(item.name))
+            how, name = item.metadata, item.name
+            here: _Path = (*path, attrgetter(name))
             if 'nested' in how:
-                yield from self._declared(how['nested'], prefix, defaults, here)
-            elif 'plugins' in how:
-                for name, own in self._plugins.items():
-                    yield from self._declared(own, f'{name}.', defaults, (*here, itemgetter(name)))
+                own, makers[name] = self._layout(how['nested'], prefix, here)
+            elif 'plugins' in how or 'per_signal' in how:
+                inner = [(key, found, '') for key, found in self._plugins.items()] if (
+                    'plugins' in how) else [(signal, how['per_signal'], its_unit)
+                                            for signal, its_unit in self._of(item).items()]
+                parts = {key: self._layout(found, f'{prefix}{key}.', (*here, itemgetter(key)), of)
+                         for key, found, of in inner}
+                own = [row for several, _ in parts.values() for row in several]
+                makers[name] = partial(_made, _frozen, {
+                    key: make for key, (_, make) in parts.items()})
             elif 'group' in how:
-                for row in self._groups[item.name]:
-                    yield (replace(row, name=f'{item.name}.{row.name}'),
-                           (*here, itemgetter(row.name)))
-            elif 'per_signal' in how:
-                for signal, unit in self._of(item).items():
-                    for field in fields(how['per_signal']):
-                        yield (_row(f'{prefix}{signal}.{field.name}', field, unit, defaults),
-                               (*here, itemgetter(signal), attrgetter(field.name)))
+                own = [(replace(row, name=f'{name}.{row.name}'), (*here, itemgetter(row.name)))
+                       for row in self._groups[name]]
+                makers[name] = partial(_made, _frozen, {
+                    row.name: itemgetter(f'{name}.{row.name}') for row in self._groups[name]})
             elif 'column' in how:
-                for i, (signal, unit) in enumerate(self._of(item).items()):
-                    yield (_row(f'{prefix}{signal}.{_name(item)}', item, unit, defaults),
-                           (*here, itemgetter(i), float, partial(_as_shown, item, unit=unit)))
+                column = {f'{prefix}{signal}.{how["column"].name or name}': its_unit
+                          for signal, its_unit in self._of(item).items()}
+                own = [(_row(one, item, of, self._defaults), (
+                    *here, itemgetter(i), float, partial(_as_shown, item, unit=of)))
+                    for i, (one, of) in enumerate(column.items())]
+                makers[name] = partial(_array, item, column)
             else:
-                yield _row(prefix + item.name, item, '', defaults), here
+                own = [(_row(prefix + name, item, unit, self._defaults), here)]
+                makers[name] = itemgetter(prefix + name)
+            rows += own
+        return rows, partial(_made, kind, makers)
 
     def _of(self, item: Field[Any]) -> Mapping[str, str]:
         """Return names and units of the signals of a field."""
@@ -193,35 +200,9 @@ class ParameterTable(Generic[T]):
 
     def snapshot(self, values: Mapping[str, Any]) -> T:
         """Return the snapshot of values by name; those that are not given are the defaults."""
-        made: T = self._made(self.kind, '', {
+        made: T = self._make({
             name: values.get(name, row.default) for name, row in self.rows.items()})
         return made
-
-    def _made(self, kind: type[Any], prefix: str, given: Mapping[str, Any]) -> Any:
-        parts: dict[str, Any] = {}
-        for item in fields(kind):
-            how, name = item.metadata, item.name
-            if 'nested' in how:
-                parts[name] = self._made(how['nested'], prefix, given)
-            elif 'plugins' in how:
-                parts[name] = MappingProxyType({
-                    plugin: self._made(own, f'{plugin}.', given)
-                    for plugin, own in self._plugins.items()})
-            elif 'group' in how:
-                parts[name] = MappingProxyType({
-                    row.name: given[f'{name}.{row.name}'] for row in self._groups[name]})
-            elif 'per_signal' in how:
-                inner = how['per_signal']
-                parts[name] = MappingProxyType({
-                    signal: inner(**{row.name: given[f'{prefix}{signal}.{row.name}']
-                                     for row in fields(inner)}) for signal in self._of(item)})
-            elif 'column' in how:
-                parts[name] = np.array([
-                    _in_code(item, given[f'{prefix}{signal}.{_name(item)}'], unit)
-                    for signal, unit in self._of(item).items()])
-            else:
-                parts[name] = given[prefix + name]
-        return kind(**parts)
 
     def values(self, snapshot: T) -> dict[str, Any]:
         """Return the values of a snapshot by name."""
@@ -309,10 +290,16 @@ def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) ->
         row.minimum, lowest(own))) if own == 'degC' and math.isfinite(row.minimum) else row
 
 
-def _name(item: Field[Any]) -> str:
-    """Return the name of a column's rows."""
-    name: str = item.metadata['column'].name
-    return name or item.name
+def _made(kind: Callable[..., Any], makers: Mapping[str, _Make], given: Mapping[str, Any]) -> Any:
+    return kind(**{name: make(given) for name, make in makers.items()})
+
+
+def _frozen(**parts: Any) -> Mapping[str, Any]:
+    return MappingProxyType(parts)
+
+
+def _array(item: Field[Any], column: Mapping[str, str], given: Mapping[str, Any]) -> Array:
+    return np.array([_in_code(item, given[name], unit) for name, unit in column.items()])
 
 
 def _in_code(item: Field[Any], shown: float, unit: str) -> float:

@@ -69,8 +69,8 @@ class TrainedInput(InputPlaces):
 
 
 @dataclass(frozen=True, eq=False)
-class TrainerParameters:
-    """Snapshot of the trainer's parameters, in the units that people read."""
+class SignalParameters:
+    """The signals of a plant, as parameters name them."""
 
     system: str = parameter(
         DEFAULT_SYSTEM, 'Bundled plant whose signals, topics and limits are the defaults; any '
@@ -87,6 +87,12 @@ class TrainerParameters:
         read_only=True)
     controlled: tuple[str, ...] = parameter(
         ('',), 'Measured signals with a set-point; an empty name: all.', read_only=True)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainerParameters(SignalParameters):
+    """Snapshot of the trainer's parameters, in the units that people read."""
+
     autostart: bool = parameter(
         True, 'Configure and activate at start-up; false: left to a lifecycle manager.',
         read_only=True)

@@ -3,7 +3,7 @@
 
 """Simulation of a plant whose input is held constant over each sample period."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 import math
 from typing import NamedTuple
@@ -110,15 +110,10 @@ def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
         if not _inside(start, limits):
             raise failed(IntegrationFailure.OUT_OF_BOUNDS, 0.0, start)
         # DOP853 would never return from a first step that begins with an infinite rate
-        first = rate(0.0, start)
-        if not np.all(np.isfinite(first)):
+        if not np.all(np.isfinite(rate(0.0, start))):
             raise failed(IntegrationFailure.NON_FINITE, 0.0, start)
         if duration == 0.0:
             return start.copy()
-        # most holds are short, so that one step does
-        end = _one_step(rate, start, first, duration, limits)
-        if end is not None and _inside(end, limits):
-            return end
         solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol,
                         first_step=duration)
         for _ in range(_MAX_STEPS_PER_HOLD):
@@ -131,31 +126,6 @@ def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
             if solver.status == 'finished':
                 return x
         raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, x)
-
-
-# What a stage of DOP853 takes of those before.
-_STAGES = [DOP853.A[stage, :stage] for stage in range(1, DOP853.n_stages)]
-# The errors of the results of orders 5 and 3, whose last column, of the rate at the end, is 0.
-_ERRORS = np.array((DOP853.E5, DOP853.E3))[:, :-1]
-
-
-def _one_step(rate: Callable[[float, Array], Array], start: Array, first: Array, duration: float,
-              limits: Limits) -> Array | None:
-    """
-    Return the end of one step of DOP853 over a whole hold, None where it is too inaccurate.
-
-    The bits are those of scipy, whose solver takes as long again to set up and to look around.
-    """
-    K = np.empty((DOP853.n_stages, len(start)))
-    K[0] = first
-    for stage, weights in enumerate(_STAGES, 1):
-        K[stage] = rate(0.0, start + K[:stage].T.dot(weights) * duration)
-    end: Array = start + duration * K.T.dot(DOP853.B)
-    scale = limits.atol + np.maximum(np.abs(start), np.abs(end)) * limits.rtol
-    fifth, third = np.sum((_ERRORS.dot(K) / scale) ** 2, axis=1)
-    # 0 / 0 where nothing moves
-    error = duration * fifth / np.sqrt((fifth + 0.01 * third) * len(start)) if fifth else 0.0
-    return end if error < 1.0 else None
 
 
 def _inside(x: Array, limits: Limits) -> bool:

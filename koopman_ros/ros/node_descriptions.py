@@ -29,12 +29,7 @@ from koopman_ros.parameters.signal_topics import (
     SignalTopics,
     system_of,
 )
-from koopman_ros.parameters.table import (
-    as_yaml,
-    ConfigurationError,
-    ParameterTable,
-    Specification,
-)
+from koopman_ros.parameters.table import as_yaml, ConfigurationError, ParameterTable, Specification
 from koopman_ros.ros import topics
 
 POLICY_FILE = 'sros2_policy.xml'

@@ -11,7 +11,6 @@ import signal
 import sys
 
 import rclpy
-from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
@@ -78,7 +77,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     return node.exit_code or 0
 
 
-def events_executor(context: Context | None = None) -> Executor:
+def events_executor() -> Executor:
     """
     Return an executor that is notified of each message, for nodes without clients.
 
@@ -88,8 +87,8 @@ def events_executor(context: Context | None = None) -> Executor:
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
-        return SingleThreadedExecutor(context=context)
-    return EventsExecutor(context=context)
+        return SingleThreadedExecutor()
+    return EventsExecutor()
 
 
 def run_task(name: str, prepare: Callable[[], Callable[[], int]],

@@ -17,7 +17,6 @@ from koopman_ros.ros.signals import SignalPublisher
 
 _PERIOD = 0.05  # s between two looks
 _REPEAT = 0.7  # s without an answer until a value is published again
-_TIMEOUT = 4.0  # s
 
 
 @dataclass
@@ -25,7 +24,6 @@ class _Value:
     outlet: SignalPublisher
     value: float
     due: float
-    deadline: float
     answered: bool = False
 
 
@@ -46,8 +44,7 @@ class RepeatedValues:
         """
         outlet = SignalPublisher({name: place}, {name: unit}, lambda topic, kind: (
             self._node.create_publisher(kind, topic, topics.LOOP_QOS)))
-        now = time.monotonic()
-        own = _Value(outlet, value, now, now + _TIMEOUT)
+        own = _Value(outlet, value, time.monotonic())
         self._values.append(own)
         self._timer.reset()
 
@@ -60,7 +57,7 @@ class RepeatedValues:
         now = time.monotonic()
         for own in list(self._values):
             (publisher,) = own.outlet.publishers
-            if own.answered or now > own.deadline:
+            if own.answered:
                 self._values.remove(own)
                 self._node.destroy_publisher(publisher)
                 continue

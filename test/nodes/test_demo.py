@@ -56,7 +56,7 @@ def test_demo_leaves_bag_picture_and_summary(
 def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_less(
         tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, '-m', 'koopman_ros.demo.disturbance', '--speed', '0', '--output',
+        [sys.executable, '-m', 'koopman_ros.demo', 'disturbance', '--speed', '0', '--output',
          tmp_path], capture_output=True, text=True, timeout=240, check=False)
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads((tmp_path / 'summary.json').read_text())
@@ -128,8 +128,9 @@ def test_demo_commands_nothing_in_a_domain_with_another_loop(
     assert "'mine'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('module', ['koopman_ros.demo', 'koopman_ros.demo.retrain'])
-def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path, module: str) -> None:
+@pytest.mark.parametrize('which', [[], ['retrain']])
+def test_demo_interrupted_while_it_loads_ends_without_a_word(
+        tmp_path: Path, which: list[str]) -> None:
     program = (
         'import os, runpy, signal, sys\n'
         'class Interrupted:\n'
@@ -137,8 +138,8 @@ def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path, mod
         '        if name == "matplotlib":\n'
         '            os.kill(os.getpid(), signal.SIGINT)\n'
         'sys.meta_path.insert(0, Interrupted())\n'
-        f'runpy.run_module({module!r}, run_name="__main__", alter_sys=True)\n')
-    done = subprocess.run([sys.executable, '-c', program, '--output', tmp_path],
+        'runpy.run_module("koopman_ros.demo", run_name="__main__", alter_sys=True)\n')
+    done = subprocess.run([sys.executable, '-c', program, *which, '--output', tmp_path],
                           capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 

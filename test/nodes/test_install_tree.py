@@ -81,6 +81,8 @@ def test_everything_is_installed(installation: Installation) -> None:
     assert {path.relative_to(share / 'config')
             for path in (share / 'config').rglob('*.*')} == shipped
     assert Path('models/reactor_nz4.safetensors') in shipped
+    for name in ('export/templates', 'panel/login.html', 'panel/style.css', 'panel/watch.js'):
+        assert (installation.package / name).exists()
     # the package alone, not what validates it
     beside = {path.name for path in installation.package.parent.iterdir()}
     assert 'koopman_ros' in beside

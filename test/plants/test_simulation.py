@@ -8,7 +8,6 @@ import pickle
 
 import numpy as np
 import pytest
-from scipy.integrate import DOP853
 
 from koopman_ros.plants import (
     advance,
@@ -70,21 +69,6 @@ def test_tolerance_is_kept(rtol):
     episode, exact = (simulate(system, system.nominal_state, inputs, 0.5,
                                limits=integration_limits(system, of)) for of in (rtol, 1e-13))
     np.testing.assert_allclose(episode.x, exact.x, rtol=10.0 * rtol)
-
-
-@pytest.mark.parametrize('minutes', [1.0 / 60.0, 3.0])
-def test_a_hold_is_that_of_the_solver_to_the_bit(minutes):
-    """In one step, and where it takes several."""
-    system, u = two_state_reactor(), np.array([285.0])
-    limits = integration_limits(system)
-    solver = DOP853(lambda _, x: system.derivative(x, u), 0.0, system.nominal_state, minutes,
-                    rtol=limits.rtol, atol=limits.atol, first_step=minutes)
-    steps = 0
-    while solver.status == 'running':
-        solver.step()
-        steps += 1
-    assert (steps > 1) is (minutes > 1.0)
-    assert advance(system, system.nominal_state, u, minutes).tobytes() == solver.y.tobytes()
 
 
 def test_advancing_hold_by_hold_is_simulating_to_the_bit():

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -16,7 +17,6 @@ from std_srvs.srv import Trigger
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import HostContext, wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.process import events_executor
 from koopman_ros.testing import Harness
 
 
@@ -144,7 +144,7 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
             speaker.publish(String())
     assert all(speaker.wait_for_all_acked() for speaker in speakers)
     asked = [client.call_async(Trigger.Request()) for _ in range(3)]
-    executor = events_executor(ros.node.context)
+    executor = EventsExecutor(context=ros.node.context)
     executor.add_node(node)
     # what has come is queued, and one of it handled
     ros.wait_until(lambda: executor.spin_once(timeout_sec=0.01) or heard)

@@ -4,22 +4,13 @@
 """The quadruple-tank process: four tanks, two pumps that each fill a lower and an upper one."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
 from koopman_ros.plants.constants import constant, Constants
-from koopman_ros.plants.library.outflow import (
-    level_with_outflow,
-    LOWEST_LEVEL,
-    outflow,
-    outflow_slope,
-)
+from koopman_ros.plants.library.tanks import Tanks
 from koopman_ros.plants.system import ControlAffineSystem
 
-# V
-_NOMINAL_PUMPS = np.array([3.0, 3.0])
 # flow into tanks 1 and 2 of what leaves each tank: 3 drains into 1, 4 into 2, 1 and 2 outside
 _INTO = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 1.0],
                   [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, -1.0]])
@@ -59,35 +50,7 @@ class QuadrupleTank(Constants):
             [self.split_1, 0.0], [0.0, self.split_2],
             [0.0, 1.0 - self.split_2], [1.0 - self.split_1, 0.0],
         ]) * [self.pump_gain_1, self.pump_gain_2]
-        through = np.linalg.solve(_INTO, -inflow @ _NOMINAL_PUMPS)
-        return ControlAffineSystem(
-            name='quadruple tank',
-            state_names=('level_1', 'level_2', 'level_3', 'level_4'),
-            state_units=('m',) * 4,
-            input_names=('pump_1', 'pump_2'),
-            input_units=('V', 'V'),
-            time_unit='s',
-            drift=self._drift,
-            drift_jacobian=self._drift_jacobian,
-            B=inflow / self._areas[:, None],
-            nominal_state=level_with_outflow(self._orifices, through),
-            nominal_input=_NOMINAL_PUMPS,
-            state_lower=np.full(4, LOWEST_LEVEL),
-        )
-
-    @cached_property
-    def _areas(self) -> Array:
-        return np.array([self.tank_area_1, self.tank_area_2, self.tank_area_3, self.tank_area_4])
-
-    @cached_property
-    def _orifices(self) -> Array:
-        return np.array([self.orifice_1, self.orifice_2, self.orifice_3, self.orifice_4])
-
-    def _drift(self, x: Array) -> Array:
-        rate: Array = outflow(self._orifices, x) @ _INTO.T / self._areas
-        return rate
-
-    def _drift_jacobian(self, x: Array) -> Array:
-        slope = outflow_slope(self._orifices, x)
-        jacobian: Array = _INTO * slope[..., None, :] / self._areas[:, None]
-        return jacobian
+        return Tanks(
+            np.array([self.tank_area_1, self.tank_area_2, self.tank_area_3, self.tank_area_4]),
+            np.array([self.orifice_1, self.orifice_2, self.orifice_3, self.orifice_4]),
+            _INTO, inflow).system('quadruple tank', np.array([3.0, 3.0]))

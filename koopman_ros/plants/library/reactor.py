@@ -81,6 +81,48 @@ class ReactorParameters(Constants):
         """The temperature rise by reaction, -Delta H_R/(rho C_p), in K per mol/L."""
         return -self.reaction_enthalpy / (self.density * self.heat_capacity)
 
+    def _rate(self, temperature: Array) -> Array:
+        """Evaluate the Arrhenius law k exp(-E_A/(R T)), in 1/min."""
+        return self.pre_exponential_factor * np.exp(-self.activation_temperature / temperature)
+
+    def _rate_slope(self, temperature: Array) -> Array:
+        steepness = self.activation_temperature / (temperature * temperature)
+        return self._rate(temperature) * steepness
+
+    def _heat_flow(self, temperature: Array) -> Array:
+        """Evaluate the heating by feed and a jacket at 0 K, in K/min; B u adds the coolant."""
+        feed = self.dilution_rate * (self.feed_temperature - temperature)
+        return feed - self.cooling_rate * temperature
+
+    def _one_state_drift(self, x: Array) -> Array:
+        reaction = self.concentration * self._rate(x)
+        return self._heat_flow(x) + self.heating_per_conversion * reaction
+
+    def _one_state_jacobian(self, x: Array) -> Array:
+        heating = self.heating_per_conversion * (self.concentration * self._rate_slope(x))
+        slope: Array = -self.dilution_rate - self.cooling_rate + heating
+        return slope[..., None]
+
+    def _two_state_drift(self, x: Array) -> Array:
+        concentration, temperature = x[..., 0], x[..., 1]
+        reaction = concentration * self._rate(temperature)
+        supply = self.dilution_rate * (self.feed_concentration - concentration)
+        heating = self.heating_per_conversion * reaction
+        return along_last(supply - reaction, self._heat_flow(temperature) + heating)
+
+    def _two_state_jacobian(self, x: Array) -> Array:
+        rate, steepening = self._rate(x[..., 1]), x[..., 0] * self._rate_slope(x[..., 1])
+        heating = self.heating_per_conversion
+        jacobian: Array = np.stack([
+            along_last(-self.dilution_rate - rate, -steepening),
+            along_last(heating * rate,
+                       -self.dilution_rate - self.cooling_rate + heating * steepening)], axis=-2)
+        return jacobian
+
+    def _with_steady_concentration(self, temperature: Array) -> Array:
+        supply = self.dilution_rate * self.feed_concentration
+        return along_last(supply / (self.dilution_rate + self._rate(temperature)), temperature)
+
 
 def one_state_reactor(parameters: ReactorParameters | None = None,
                       nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
@@ -96,9 +138,8 @@ def one_state_reactor(parameters: ReactorParameters | None = None,
     :raises EquilibriumError: when `nominal_state` is None and there is no stable steady state.
     """
     constants = parameters or ReactorParameters()
-    return _reactor('one-state reactor', constants, partial(_one_state_drift, constants),
-                    partial(_one_state_jacobian, constants), partial(np.expand_dims, axis=-1),
-                    nominal_state)
+    return _reactor('one-state reactor', constants, constants._one_state_drift,
+                    constants._one_state_jacobian, partial(np.expand_dims, axis=-1), nominal_state)
 
 
 def two_state_reactor(parameters: ReactorParameters | None = None,
@@ -110,10 +151,9 @@ def two_state_reactor(parameters: ReactorParameters | None = None,
     Parameters and errors are those of :func:`one_state_reactor`.
     """
     constants = parameters or ReactorParameters()
-    return _reactor('two-state reactor', constants, partial(_two_state_drift, constants),
-                    partial(_two_state_jacobian, constants),
-                    partial(_with_steady_concentration, constants), nominal_state,
-                    ('concentration',), ('mol/L',))
+    return _reactor('two-state reactor', constants, constants._two_state_drift,
+                    constants._two_state_jacobian, constants._with_steady_concentration,
+                    nominal_state, ('concentration',), ('mol/L',))
 
 
 def fed_reactor(parameters: ReactorParameters | None = None,
@@ -185,61 +225,6 @@ def _reactor(name: str, constants: ReactorParameters, drift: ArrayFunction,
         state_lower=np.array([*(0.0 for _ in others), lowest]),
         state_upper=np.array([*(np.inf for _ in others), highest]),
     )
-
-
-def _one_state_drift(constants: ReactorParameters, x: Array) -> Array:
-    reaction = constants.concentration * _rate_constant(constants, x)
-    return _heat_flow(constants, x) + constants.heating_per_conversion * reaction
-
-
-def _one_state_jacobian(constants: ReactorParameters, x: Array) -> Array:
-    steepening = constants.concentration * _rate_constant_slope(constants, x)
-    heating = constants.heating_per_conversion * steepening
-    slope: Array = -constants.dilution_rate - constants.cooling_rate + heating
-    return slope[..., None]
-
-
-def _two_state_drift(constants: ReactorParameters, x: Array) -> Array:
-    concentration, temperature = x[..., 0], x[..., 1]
-    reaction = concentration * _rate_constant(constants, temperature)
-    supply = constants.dilution_rate * (constants.feed_concentration - concentration)
-    heating = constants.heating_per_conversion * reaction
-    return along_last(supply - reaction, _heat_flow(constants, temperature) + heating)
-
-
-def _two_state_jacobian(constants: ReactorParameters, x: Array) -> Array:
-    rate = _rate_constant(constants, x[..., 1])
-    steepening = x[..., 0] * _rate_constant_slope(constants, x[..., 1])
-    jacobian = np.empty((*x.shape, 2))
-    jacobian[..., 0, 0] = -constants.dilution_rate - rate
-    jacobian[..., 0, 1] = -steepening
-    jacobian[..., 1, 0] = constants.heating_per_conversion * rate
-    heating = constants.heating_per_conversion * steepening
-    jacobian[..., 1, 1] = -constants.dilution_rate - constants.cooling_rate + heating
-    return jacobian
-
-
-def _rate_constant(constants: ReactorParameters, temperature: Array) -> Array:
-    """Evaluate the Arrhenius law k exp(-E_A/(R T)), in 1/min."""
-    return constants.pre_exponential_factor * np.exp(
-        -constants.activation_temperature / temperature)
-
-
-def _rate_constant_slope(constants: ReactorParameters, temperature: Array) -> Array:
-    steepness = constants.activation_temperature / (temperature * temperature)
-    return _rate_constant(constants, temperature) * steepness
-
-
-def _heat_flow(constants: ReactorParameters, temperature: Array) -> Array:
-    """Evaluate the heating by the feed and by a jacket at 0 K, in K/min; B u adds the coolant."""
-    feed = constants.dilution_rate * (constants.feed_temperature - temperature)
-    return feed - constants.cooling_rate * temperature
-
-
-def _with_steady_concentration(constants: ReactorParameters, temperature: Array) -> Array:
-    supply = constants.dilution_rate * constants.feed_concentration
-    consumption = constants.dilution_rate + _rate_constant(constants, temperature)
-    return along_last(supply / consumption, temperature)
 
 
 def _cold_stable_state(constants: ReactorParameters, drift: ArrayFunction,

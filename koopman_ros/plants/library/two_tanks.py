@@ -4,22 +4,12 @@
 """Two coupled tanks, one above the other, each filled by a pump of its own."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.core.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
-from koopman_ros.plants.library.outflow import (
-    level_with_outflow,
-    LOWEST_LEVEL,
-    outflow,
-    outflow_slope,
-)
+from koopman_ros.plants.library.tanks import Tanks
 from koopman_ros.plants.system import ControlAffineSystem
-
-# V
-_NOMINAL_PUMPS = np.array([6.0, 2.0])
 
 
 @dataclass(frozen=True)
@@ -43,34 +33,7 @@ class TwoTanks(Constants):
 
     def system(self) -> ControlAffineSystem:
         """Build it, nominal where 6 V and 2 V hold it; levels in m, pumps in V."""
-        flow = self.pump_gain * np.cumsum(_NOMINAL_PUMPS)
-        return ControlAffineSystem(
-            name='two tanks',
-            state_names=('level_1', 'level_2'),
-            state_units=('m', 'm'),
-            input_names=('pump_1', 'pump_2'),
-            input_units=('V', 'V'),
-            time_unit='s',
-            drift=self._drift,
-            drift_jacobian=self._drift_jacobian,
-            B=self.pump_gain / self.tank_area * np.eye(2),
-            nominal_state=level_with_outflow(self._orifices, flow),
-            nominal_input=_NOMINAL_PUMPS,
-            state_lower=np.full(2, LOWEST_LEVEL),
-        )
-
-    @cached_property
-    def _orifices(self) -> Array:
-        return np.array([self.orifice_1, self.orifice_2])
-
-    def _drift(self, x: Array) -> Array:
-        flow = outflow(self._orifices, x) / self.tank_area
-        return along_last(-flow[..., 0], flow[..., 0] - flow[..., 1])
-
-    def _drift_jacobian(self, x: Array) -> Array:
-        slope = outflow_slope(self._orifices, x) / self.tank_area
-        jacobian = np.zeros((*x.shape, 2))
-        jacobian[..., 0, 0] = -slope[..., 0]
-        jacobian[..., 1, 0] = slope[..., 0]
-        jacobian[..., 1, 1] = -slope[..., 1]
-        return jacobian
+        return Tanks(
+            np.full(2, self.tank_area), np.array([self.orifice_1, self.orifice_2]),
+            np.array([[-1.0, 0.0], [1.0, -1.0]]), self.pump_gain * np.eye(2),
+        ).system('two tanks', np.array([6.0, 2.0]))
