@@ -104,9 +104,9 @@ class FallbackLevel:
         model, inputs, n = self.model, self.model.inputs, self.model.n_x
         goal = self.controlled_states.to_deviation(setpoint)
         if self.law.model_free:
-            x, none = np.zeros(n), np.zeros(n)
+            x = np.zeros(n)
             x[self._indices] = goal
-            return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
+            return Target(x, np.zeros(model.n_u), np.zeros(n), 0.0)
         if self.controls_all:
             return steady_state_target(model, goal, w)
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(

@@ -159,5 +159,5 @@ def held_at(model: LiftedModel, x: Array, held: NDArray[np.bool_]) -> Array | No
 
 def _target(model: LiftedModel, y: Array, w: Array) -> Target:
     x, u = y[:model.n_x], y[model.n_x:]
-    drift, forcing = model.drift(x), model.forcing(x, u) + w
-    return Target(x, model.lift(x), drift, u, forcing, float(np.linalg.norm(drift + forcing)))
+    forcing = model.forcing(x, u) + w
+    return Target(x, u, forcing, float(np.linalg.norm(model.drift(x) + forcing)))

@@ -166,15 +166,11 @@ def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
     M[:N, :N] = -M[N:, N:].T
     size = _size(M) * interval
     M[:n, N:N + n], M[n:N, N + n:] = Q, R
-    weight = _size(M[:N, N:])
-    if not (math.isfinite(size) and weight > 0.0):
+    if not math.isfinite(_size(M)):
         raise np.linalg.LinAlgError('plant or weights are not finite')
-    # of the size of F, or of 1 where that is 0
-    weight *= interval / (size or interval)
-    M[:N, N:] /= weight
     total, doublings = _part(M, interval, size)
     D, W = total[N:, N:], total[:N, N:]
-    W = 0.5 * weight * (W + D.T.dot(W))
+    W = 0.5 * (W + D.T.dot(W))
     W = W + W.T
     for _ in range(doublings):
         DW = D.T.dot(W)

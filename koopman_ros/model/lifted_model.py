@@ -492,12 +492,7 @@ class LiftedModel:
         """Evaluate N(x) and J_N(x) at once."""
         return self.observables.lift_and_jacobian(self.states.array('state', x))
 
-    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
-                         ) -> tuple[Array, Array, Array, Array]:
-        """Evaluate N(x), J_N(x) and their secants; see :meth:`Observables.lift_and_secants`."""
-        return self.observables.lift_and_secants(x, x_ref, w)
-
-    def _onto_states(self, J: Array) -> Array:
+    def onto_states(self, J: Array) -> Array:
         """Return the pseudo-inverse of J_N(x): (..., n_z, n_x) -> (..., n_x, n_z)."""
         if self.identity and J.shape[-1] == 1:
             # one state: a tenth of the time of a singular value decomposition
@@ -505,22 +500,19 @@ class LiftedModel:
             return inverse
         return np.asarray(np.linalg.pinv(J), dtype=np.float64)
 
-    def onto_states(self, J: Array, rate: Array) -> Array:
-        """
-        Return the rate of the state, by J_N(x)^+, for a rate of z.
-
-        :param J: (n_z, n_x) at the state x.
-        :param rate: (n_z,) or (n_z, k).
-        """
-        return self._onto_states(J) @ rate
+    @cached_property
+    def _weights(self) -> Array | None:
+        """Weights (n_x, n_phi) of the features in the drift; None where it is not linear in them."""
+        state_alone = self.identity and self.observables.features.n_z == self.n_x
+        return self.A - self.pre_feedback_slope if self.readout is None and state_alone else (
+            self.readout)
 
     def drift(self, x: Array) -> Array:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
-        x = self.states.array('state', x)
-        if self.readout is not None:
-            return self.observables.features.lift(x) @ self.readout.T
+        if self._weights is not None:
+            return self.observables.features.lift(x) @ self._weights.T
         z, J = self.observables.lift_and_jacobian(x)
-        f = (self._onto_states(J) @ (z @ self.A.T)[..., None])[..., 0]
+        f = (self.onto_states(J) @ (z @ self.A.T)[..., None])[..., 0]
         return f if self.pre_feedback is None else f - self.pre_feedback_rate(x)
 
     @cached_property
@@ -536,11 +528,11 @@ class LiftedModel:
 
     def drift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate the drift and its Jacobian exactly: (..., n_x) -> same, (..., n_x, n_x)."""
-        if self.readout is not None:
+        if self._weights is not None:
             features, slope = self.observables.features.lift_and_jacobian(x)
-            return features @ self.readout.T, self.readout @ slope
+            return features @ self._weights.T, self._weights @ slope
         z, J, bend = self.observables.lift_and_derivatives(x)
-        inverse, rate = self._onto_states(J), (z @ self.A.T)[..., None]
+        inverse, rate = self.onto_states(J), (z @ self.A.T)[..., None]
         f = inverse @ rate
         # the derivative of J'J f = J'A z by each state, with J of full rank
         rest = (bend * (rate - J @ f)[..., None]).sum(axis=-3)
@@ -560,7 +552,7 @@ class LiftedModel:
             secants of its features, otherwise close, by Gauss-Legendre quadrature.
         """
         if self.readout is not None:
-            return self.readout @ self.observables.features.lift_and_secants(x, x_ref, x)[2]
+            return self.readout @ self.observables.features.secants(x, x_ref, x)[1]
         along = self.drift_jacobian(x_ref + NODES[:, None] * (x - x_ref))
         return np.tensordot(WEIGHTS, along, 1)
 

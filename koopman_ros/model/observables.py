@@ -47,10 +47,9 @@ class Observables(ABC):
         """Evaluate N(x), J_N(x) and the derivatives of J_N: the last (..., n_z, n_x, n_x)."""
 
     @abstractmethod
-    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
-                         ) -> tuple[Array, Array, Array, Array]:
+    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
         """
-        Evaluate N(x) and J_N(x), and the secants of N and of J_N w between two states, exactly.
+        Evaluate J_N(x), and the secants of N and of J_N w between two states, exactly.
 
         With e = x - x_ref the secants satisfy N(x) - N(x_ref) = M e and
         J_N(x) w - J_N(x_ref) w = H e; no digits cancel as e goes to 0.
@@ -58,7 +57,7 @@ class Observables(ABC):
         :param x: (n_x,) state.
         :param x_ref: (n_x,) reference.
         :param w: (n_x,) constant direction, e.g. B u_ref.
-        :return: (n_z,), (n_z, n_x), M (n_z, n_x) and H (n_z, n_x).
+        :return: J_N(x), M and H, (n_z, n_x) each.
         """
 
     @property
@@ -139,9 +138,8 @@ class NetworkObservables(Observables):
         return (self._lifted(x, h), self._jacobian(slope), np.concatenate(
             (states, bend.reshape(*bend.shape[:-1], n, n)), axis=-3))
 
-    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
-                         ) -> tuple[Array, Array, Array, Array]:
-        """Evaluate the lift and the secants, by divided differences of tanh and of its slope."""
+    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
+        """Evaluate the secants, by divided differences of tanh and of its slope."""
         a, a_ref = arguments = np.array((x, x_ref)) @ self.W.T + self.b
         h, h_ref = np.tanh(arguments)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
@@ -149,7 +147,7 @@ class NetworkObservables(Observables):
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
         J, M, H = self._bent(np.array((
             1.0 - h * h, secant, -(h + h_ref) * secant * (self.W @ w))))
-        return self._lifted(x, h), J + self._of_states, M + self._of_states, H
+        return J + self._of_states, M + self._of_states, H
 
     def _lifted(self, x: Array, h: Array) -> Array:
         free: Array = (h - self.value_at_zero) @ self.V.T
@@ -267,16 +265,15 @@ class PolynomialObservables(Observables):
         own, first, second = self._derivatives
         return own.at(x), first.at(x), second.at(x)
 
-    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
-                         ) -> tuple[Array, Array, Array, Array]:
-        """Evaluate the lift, and the secants as means along the segment, by exact quadrature."""
+    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
+        """Evaluate the secants as means along the segment, by exact quadrature."""
         shares, weights = self._quadrature
         points = x_ref + shares * (x - x_ref)
         _, first, second = self._derivatives
         M = np.tensordot(weights, first.at(points), 1)
         # the weights add up to 1 but for rounding
         M[:self.n_x] = np.eye(self.n_x)
-        return *self.lift_and_jacobian(x), M, np.tensordot(weights, second.at(points) @ w, 1)
+        return first.at(x), M, np.tensordot(weights, second.at(points) @ w, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,7 @@ def test_origin_states_among_the_coordinates_and_batches(lift):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
     for place in np.ndindex(2, 3):
         x = batch[place]
-        z, J, M, H = lift.lift_and_secants(x, -2.0 * x, np.ones(lift.n_x))
+        z, (J, M, H) = lift.lift(x), lift.secants(x, -2.0 * x, np.ones(lift.n_x))
         for one, many in zip((z, J, *lift.lift_and_derivatives(x)), (*first, *found),
                              strict=True):
             np.testing.assert_allclose(one, many[place], rtol=1e-13, atol=1e-13)
@@ -88,7 +88,7 @@ def test_derivatives_are_those_of_differences(lift):
     expected = derivative(lambda x: jacobian(lift, x).reshape(*x.shape[:-1], -1), x)
     np.testing.assert_allclose(bend, expected.reshape(bend.shape), rtol=1e-8, atol=1e-9)
     # secants between equal states are derivatives
-    M, H = map(np.array, zip(*(lift.lift_and_secants(y, y, w)[2:] for y in x), strict=True))
+    M, H = map(np.array, zip(*(lift.secants(y, y, w)[1:] for y in x), strict=True))
     np.testing.assert_allclose(M, J, rtol=1e-13, atol=1e-14)
     np.testing.assert_allclose(H, bend @ w, rtol=1e-12, atol=1e-13)
 
@@ -98,7 +98,7 @@ def test_secants_are_exact(lift):
     for reference, x, w in pairs(lift.n_x):
         # x - reference is not the separation drawn: x is rounded
         e = x - reference
-        z, J, M, H = lift.lift_and_secants(x, reference, w)
+        z, (J, M, H) = lift.lift(x), lift.secants(x, reference, w)
         z_ref, J_ref = lift.lift_and_jacobian(reference)
         np.testing.assert_allclose(M @ e, z - z_ref, rtol=1e-12, atol=1e-14 * size(z, z_ref))
         np.testing.assert_allclose(
@@ -109,7 +109,7 @@ def test_secants_are_exact(lift):
 def test_secants_of_a_network_are_means_along_the_segment(network):
     """At small separations only M and H themselves show whether digits cancelled."""
     for reference, x, w in pairs(network.n_x):
-        M, H = network.lift_and_secants(x, reference, w)[2:]
+        M, H = network.secants(x, reference, w)[1:]
         points = reference + 0.5 * (1.0 + NODES[:, None]) * (x - reference)
         _, J, bend = network.lift_and_derivatives(points)
         for found, along in ((M, J), (H, bend @ w)):
@@ -120,18 +120,19 @@ def test_secants_of_a_network_are_means_along_the_segment(network):
 @pytest.mark.parametrize('far', [40.0, 1e4])
 def test_a_network_saturates_without_a_warning(far):
     lift = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
-    z, J, M, H = lift.lift_and_secants(np.array([far]), np.array([-far]), np.ones(1))
-    np.testing.assert_allclose([z[0], J[0, 0], M[0, 0], H[0, 0]], [1.0, 0.0, 1.0 / far, 0.0],
+    x = np.array([far])
+    J, M, H = lift.secants(x, -x, np.ones(1))
+    np.testing.assert_allclose([lift.lift(x)[0], J[0, 0], M[0, 0], H[0, 0]], [1.0, 0.0, 1.0 / far, 0.0],
                                rtol=1e-14, atol=1e-30)
 
 
 @every_lift
 def test_neither_a_lift_nor_its_results_share_memory(lift):
     x, x_ref, w = states(lift.n_x, 3, seed=5)
-    before = lift.lift_and_secants(x.copy(), x_ref, w)
-    for array in (*lift.lift_and_jacobian(x.copy()), *lift.lift_and_secants(x.copy(), x_ref, w)):
+    before = lift.secants(x.copy(), x_ref, w)
+    for array in (*lift.lift_and_jacobian(x.copy()), *lift.secants(x.copy(), x_ref, w)):
         array[...] = 7.0
-    for a, b in zip(before, lift.lift_and_secants(x, x_ref, w), strict=True):
+    for a, b in zip(before, lift.secants(x, x_ref, w), strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(FrozenInstanceError):
         lift.identity = not lift.identity
@@ -199,7 +200,7 @@ def test_secants_of_monomials_against_fractions(lift):
     for separation, reference in product(SEPARATIONS, corners(n_x)):
         x = reference + separation * rng.normal(size=n_x)
         w = rng.normal(size=n_x)
-        M, H = lift.lift_and_secants(x, reference, w)[2:]
+        M, H = lift.secants(x, reference, w)[1:]
         e = [Fraction(a) - Fraction(b) for a, b in zip(x, reference, strict=True)]
         scale = float(max(map(abs, e)))
         for i, row in enumerate(lift.exponents):

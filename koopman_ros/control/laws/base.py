@@ -27,8 +27,6 @@ class Target:
     """A set-point with the input that holds it, in scaled deviations."""
 
     x: Array  #: (n_x,) reference state
-    z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
-    drift: Array  #: (n_x,) the model's drift there
     u: Array  #: (n_u,) input that balances drift and disturbance
     forcing: Array  #: (n_x,) B(x_ref) u_ref + w, added to the drift
     residual: float  #: size of the rate that no input balances; 0 where x can be held
@@ -52,11 +50,10 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
     :param x_ref: (n_x,) scaled deviation.
     :param w: (n_x,) disturbance of the state's rate, none by default.
     """
-    z, drift = model.lift(x_ref), model.drift(x_ref)
-    w = np.zeros(model.n_x) if w is None else w
+    w, drift = np.zeros(model.n_x) if w is None else w, model.drift(x_ref)
     u = -model.input_inverse(x_ref).dot(drift + w)
     forcing = model.forcing(x_ref, u) + w
-    return Target(x_ref, z, drift, u, forcing, math.hypot(*(drift + forcing).tolist()))
+    return Target(x_ref, u, forcing, math.hypot(*(drift + forcing).tolist()))
 
 
 @dataclass(frozen=True)
