@@ -50,7 +50,9 @@ class InputTerms:
             return u
         phi = PolynomialObservables.total_degree(x.shape[-1], degree).lift(x)
         products = phi[..., :, None] * u[..., None, :]
-        return np.concatenate([u, products.reshape(*u.shape[:-1], -1)], axis=-1)
+        # not -1, which numpy cannot tell of no rows
+        count = phi.shape[-1] * u.shape[-1]
+        return np.concatenate([u, products.reshape(*u.shape[:-1], count)], axis=-1)
 
     @staticmethod
     def split(weights: Array, n_u: int) -> tuple[Array, InputTerms | None]:

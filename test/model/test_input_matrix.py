@@ -50,3 +50,11 @@ def test_weights_of_the_regressors_are_the_matrix_and_its_terms():
     np.testing.assert_allclose(InputTerms.regressors(x, u, 3) @ weights.T, expected,
                                rtol=0, atol=1e-13)
     assert InputTerms.split(weights[:, :3], 3)[1] is None
+
+
+@pytest.mark.parametrize('degree', [0, 1, 3])
+def test_no_states_have_no_regressors(degree):
+    """As in a batch of closed loops that have all ended."""
+    none = InputTerms.regressors(np.empty((0, 2)), np.empty((0, 3)), degree)
+    assert none.shape == (0, InputTerms.regressors(np.ones((1, 2)), np.ones((1, 3)), degree).size)
+    assert TERMS.matrix(np.empty((0, 2))).shape == (0, 2, 3)
