@@ -185,7 +185,8 @@ def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
                  f'roll-out {_errors(one["heldout_error"], units)}',
                  f'law fails in {failed} of {loops} closed loops']
     line = 'chosen: ' * one['chosen'] + ', '.join([*parts, f'{one["seconds"]:.1f} s'])
-    return line + (f'; rejected: {one["refusal"]}' if one['refusal'] else '')
+    return '; '.join(filter(None, [line, one['limit'], one['refusal'] and (
+        f'rejected: {one["refusal"]}')]))
 
 
 def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:

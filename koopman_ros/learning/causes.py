@@ -25,7 +25,7 @@ def likely_causes(found: Identified, i: int) -> list[tuple[float, str]]:
 
     The errors of the drift in each segment are regressed on the response of a linear state with
     the drift's slope to the rate due to each cause that was not searched for: inputs that act
-    later, products of inputs and states, filtered inputs.
+    later, or change between samples, products of inputs and states, filtered inputs.
 
     :param i: number of the state.
     :return: the explained share of the mean square, cross-validated over the segments, and the
@@ -59,8 +59,11 @@ def _causes(found: Identified, episodes: Sequence[Episode]) -> dict[str, list[Ar
         v = box.inputs.to_deviation(episode.inputs_at(episode.time))
         late = np.array([box.inputs.to_deviation(episode.inputs_at(np.maximum(
             episode.time - count * period, episode.input_time[0]))) - v for count in _DELAYS])
+        early = np.vstack((v[1:], v[-1:])) - v
         for j, name in enumerate(box.inputs.names):
             causes.setdefault(f'{name}.dead_time', []).append(late[..., j].T)
+            if not any(episode.linear[j:j + 1]):
+                causes.setdefault(f'linear = {name}', []).append(early[:, [j]])
         if not (found.constants or found.hidden or found.drift.varying_input_matrix
                 or 'input_matrix_degree' in found.searched):
             causes.setdefault('input_matrix_degree', []).append(

@@ -46,6 +46,7 @@ _MAX_SAMPLES = 2000
 _CELLS = 20
 # Parts among which the samples are dealt out.
 _SHARES = 10
+BUDGET = 180.0  # s of processor time for the networks of all classes together
 
 
 def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> DriftSamples:
@@ -212,8 +213,8 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
         # which is that drift itself
         model_class, begin = LINEAR, None
     alone = model_class != BEST
-    return compare(known, samples,
-                   {**usual_recipes(len(noise)), IDENTITY_LIFT: IncrementalTraining(n_z)},
+    recipes = {**usual_recipes(len(noise)), IDENTITY_LIFT: IncrementalTraining(n_z)}
+    return compare(known, samples, recipes, budget=BUDGET / (1 if alone else len(recipes)),
                    choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
                    watch=watch, judge=Judge(judged, max(chance, ROUNDING)), device=device,
                    backend=backend, begin=begin)

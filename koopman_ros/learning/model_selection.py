@@ -20,6 +20,7 @@ from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_clo
 from koopman_ros.execution import Backend
 from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import IncrementalTraining
+from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.metrics import evaluate, LiftMetrics, ROUNDING
 from koopman_ros.learning.lift.multistart import MultistartProgress, Recipe, Watch
 from koopman_ros.learning.lift.neural_drift import NeuralDrift, with_readout, with_units_of
@@ -47,6 +48,7 @@ class ModelCandidate:
     #: scale; None where no record judges
     excess: float | None = None
     steps: int = 0  #: of minimisations, where it is a network
+    limit: str = ''  #: what ended its training before it converged, where that was its time
 
     @property
     def error(self) -> float:
@@ -112,7 +114,8 @@ class ClassComparison:
                 *['' if one.excess is None else f'{one.excess:.1e}'] * recorded, *errors,
                 *(('', '') if law is None else (f'{law.failed.sum()} of {law.loops}',
                                                 f'{law.median_ratio:.3f}')), f'{one.seconds:.1f}',
-                '; '.join(filter(None, ['chosen' * (one is self.chosen), one.refusal]))])
+                '; '.join(filter(None, [
+                    'chosen' * (one is self.chosen), one.limit, one.refusal]))])
         return table(head, rows, range(1, len(head) - 1))
 
 
@@ -131,7 +134,8 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
             seed: int = 0, starts: int = 2, watch: Watch | None = None,
             loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
-            backend: Backend | None = None, begin: LiftedModel | None = None) -> ClassComparison:
+            backend: Backend | None = None, begin: LiftedModel | None = None,
+            budget: float = math.inf) -> ClassComparison:
     """
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
@@ -150,6 +154,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     :param alone: whether it is the only one to be learned.
     :param judge: of the models, in place of validation episodes and `loops`.
     :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
+    :param budget: processor time in s of the networks of each class, see :func:`train`.
     :raises TrainingFailed: when no model of the requested class was learned, or none at all.
     :raises ValueError: for an unknown name; otherwise as :func:`train`, where the class was
         requested or the cause is in the samples.
@@ -176,15 +181,17 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     found: list[ModelCandidate] = []
     drift: LiftedModel | None = None
     for name in names:
-        since, steps = time.perf_counter(), 0
+        since, steps, limit = time.perf_counter(), 0, ''
         try:
             if name in recipes:
                 trained = train(
                     plant, samples, recipes[name], seed=seed, starts=starts,
                     loops=0, watch=_among(watch, name, counts),
                     device=device, backend=backend,
-                    begin=begin if name in continuing else None)
+                    begin=begin if name in continuing else None, budget=budget)
                 steps = trained.steps
+                if trained.status == MinimumStatus.OUT_OF_TIME.value:
+                    limit = trained.status
                 model = trained.model if drift is None else _with_units_of(
                     drift, trained.model, prepared)
                 if isinstance(recipes[name], NeuralDrift):
@@ -195,7 +202,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             model = replace(model, training_states=prepared.states)
             figures = evaluate(model, prepared.parts[2])
             one = judge.judged(ModelCandidate(name, model, prepared.rx(model), figures, None,
-                                              seconds, steps=steps))
+                                              seconds, steps=steps, limit=limit))
             found.append(replace(one, model=_noted(model, one)))
         except (ValueError, np.linalg.LinAlgError) as refusal:
             if name == choose:
@@ -263,9 +270,14 @@ def _noted(model: LiftedModel, one: ModelCandidate) -> LiftedModel:
 def _polynomial(prepared: PreparedSamples, degrees: Sequence[int]) -> LiftedModel:
     """Choose the degree; those with too many monomials to tell apart or to save fall out."""
     tried, refusal = [], 'no degree was given'
+    training = prepared.parts[0]
     for degree in degrees:
+        count = math.comb(training.x.shape[1] + degree, degree)
+        if count >= len(training):
+            refusal = f'{len(training)} samples do not determine {count} monomials'
+            continue
         try:
-            model = Edmd(degree).learn(prepared.plant, prepared.parts[0], prepared.box)
+            model = Edmd(degree).learn(prepared.plant, training, prepared.box)
             model_file.check(model)
             tried.append(ModelCandidate(POLYNOMIAL, model, prepared.rx(model), None, None, 0.0))
         except (ValueError, np.linalg.LinAlgError) as error:

@@ -135,7 +135,8 @@ class Retrained:
         def of_class(one: ModelCandidate) -> dict[str, object]:
             said: dict[str, object] = {
                 'chosen': self.learned is not None and one is self.learned.chosen,
-                'refusal': one.refusal, 'seconds': one.seconds, 'steps': one.steps}
+                'refusal': one.refusal, 'limit': one.limit, 'seconds': one.seconds,
+                'steps': one.steps}
             if one.figures and one.law_check:
                 assert one.figures.rollout_rmse is not None
                 said |= {

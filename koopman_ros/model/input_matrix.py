@@ -50,8 +50,9 @@ class InputTerms:
             return u
         phi = PolynomialObservables.total_degree(x.shape[-1], degree).lift(x)
         products = phi[..., :, None] * u[..., None, :]
-        width = phi.shape[-1] * u.shape[-1]  # -1 has no value where there are no rows
-        return np.concatenate([u, products.reshape(*u.shape[:-1], width)], axis=-1)
+        # not -1, which numpy cannot tell of no rows
+        count = phi.shape[-1] * u.shape[-1]
+        return np.concatenate([u, products.reshape(*u.shape[:-1], count)], axis=-1)
 
     @staticmethod
     def split(weights: Array, n_u: int) -> tuple[Array, InputTerms | None]:
@@ -81,7 +82,7 @@ class InputTerms:
 
     def averaged_jacobian(self, x: Array, x_ref: Array, u: Array) -> Array:
         """Average that Jacobian along the segment from x_ref to x, (n_x,) each, exactly."""
-        M = self._monomials.secants(x, x_ref, x)[1]
+        M = self._monomials.lift_and_secants(x, x_ref, x)[2]
         return np.einsum('kij,j,kl->il', self.coefficients, u, M)
 
 

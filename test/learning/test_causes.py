@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -52,3 +53,28 @@ def test_the_likeliest_cause_is_that_of_the_plant(plant: Plant, first: str) -> N
     # nothing is advised that the search has tried
     tried = likely_causes(replace(found, searched=(first,)), 0)
     assert first.endswith('.dead_time') or first not in [name for _, name in tried]
+
+
+def test_an_input_that_was_not_held_between_samples_is_named() -> None:
+    drift = DriftModel(BOX, 1, np.array([[0.0], [-1.0]]), np.array([[0.5]]))
+
+    def analogue(seed: int) -> Episode:
+        """Return dx/dt = -x + u, u linear from sample to sample, exactly but for noise."""
+        rng = np.random.default_rng(seed)
+        u = np.convolve(rng.standard_normal(COUNT + 2), np.full(3, 0.3), 'valid')
+        decay, x = np.exp(-PERIOD), [rng.uniform(-1.0, 1.0)]
+        gain = 1.0 - (1.0 - decay) / PERIOD
+        for before, after in pairwise(u):
+            x.append(decay * x[-1] + (1.0 - decay) * before + gain * (after - before))
+        time = PERIOD * np.arange(COUNT)
+        noise: Array = 2e-3 * rng.standard_normal(COUNT)
+        return Episode(time, (np.array(x) + noise)[:, None], time, u[:, None])
+
+    episodes = [analogue(seed) for seed in range(8)]
+    found = Identified(drift, 'known', drift, (), np.full(1, 2e-3), tuple(episodes[:6]),
+                       tuple(episodes[6:]))
+    (share, name), *_ = likely_causes(found, 0)
+    assert name == 'linear = u1'
+    assert share > 0.9
+    lines = [replace(one, linear=(True,)) for one in episodes]
+    assert not likely_causes(replace(found, fitted=tuple(lines[:6]), held_out=tuple(lines[6:])), 0)

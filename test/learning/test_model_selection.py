@@ -166,3 +166,32 @@ def test_a_lift_is_at_least_as_close_as_the_drift_before_it(bent):
     _, _, drift, lift = bent.contenders
     assert lift.rx <= 1.5 * drift.rx
     assert lift.model.readout.shape == (1, 1 + 3 + 3)
+
+
+def test_starts_that_run_out_of_time_are_kept_and_said():
+    recipes = {'neural drift': NeuralDrift(3), 'identity lift': replace(SMALL, n_z=3)}
+    seen = []
+    found = compare(BENT, bent_samples(), recipes, starts=2, loops=0, budget=1e-9,
+                    watch=lambda now: seen.append((now.name, now.finished)) or False)
+    linear, polynomial, *networks = found.contenders
+    assert not linear.limit
+    assert not polynomial.limit
+    for one in networks:
+        # none is left out
+        assert max(count for name, count in seen if name == one.name) == (
+            2 if one.name == 'neural drift' else 6)
+        assert one.model is None or 'limit of processor time' in one.limit
+    assert any(one.model is not None for one in networks)
+    assert 'limit of processor time' in str(found)
+
+
+def test_a_polynomial_has_fewer_monomials_than_there_are_samples(monkeypatch):
+    tried = []
+    learn = Edmd.learn
+    monkeypatch.setattr(Edmd, 'learn', lambda self, *given: (
+        tried.append(self.degree), learn(self, *given))[1])
+    samples = two_state_samples()
+    part = samples.take(np.unique(samples.episode)[:5])
+    few = len(split_by_episode(part, 0)[0])
+    compare(TWO_STATE, part, {}, degrees=(2, few), loops=0)
+    assert max(tried) == 2

@@ -90,3 +90,21 @@ def test_a_folder_that_is_not_there_is_a_sentence(
                        '--scheduler', '']) == 0
     assert '2 of 2' in (tmp_path / 'report.md').read_text()
     assert 'there is no folder' in capsys.readouterr().err
+
+
+def test_an_interrupt_ends_the_whole_study(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+        ) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    for module in (study, table):
+        monkeypatch.setattr(module, 'SETS', {
+            'tanks': RecordSet(('level [m]',), ('pump [V]',), frames)})
+    monkeypatch.setattr(study, 'by_baseline', interrupted)
+    monkeypatch.setattr(study, 'learned', interrupted)
+    monkeypatch.setattr(study, 'one_plant', interrupted)
+    assert study.main(['--records', str(tmp_path), '--output', str(tmp_path), '--seeds', '1',
+                       '--scheduler', '']) == 1
+    assert capsys.readouterr().err.count('interrupted') == 1
+    assert not json.loads((tmp_path / 'summary.json').read_text())['complete']

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
+import time
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ import torch
 from koopman_ros.execution import Backend, Tell
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.incremental import IncrementalTraining, TrainedLift
+from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
 from koopman_ros.learning.lift.residuals import ScaledSamples
 
@@ -92,21 +94,34 @@ def _one_thread() -> Generator[None]:
 
 
 def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
-               parent: TrainedLift | None, seed: int, starts: int, tracker: Tracker
-               ) -> Generator[tuple[str, TrainedLift | str]]:
-    """Run one round; yield the result of each start in their order, or the reason of a failure."""
+               parent: TrainedLift | None, seed: int, starts: int, tracker: Tracker,
+               budget: float) -> Generator[tuple[str, TrainedLift | str]]:
+    """
+    Run one round; yield the result of each start in their order, or the reason of a failure.
+
+    :param budget: of each start, in s of processor time.
+    """
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     items = {f'start {i + 1} with n_z = {n_z}': (
         recipe.of_start(i) if isinstance(recipe, IncrementalTraining) else recipe, number)
         for i, number in enumerate(seeds)}
-    return backend.run(_start, items, shared=(data, n_z, parent), watch=tracker.told)
+    return backend.run(_start, items, shared=(data, n_z, parent, budget), watch=tracker.told)
 
 
-def _start(shared: tuple[ScaledSamples, int, TrainedLift | None], item: tuple[Recipe, int],
-           tell: Tell) -> TrainedLift | str:
-    (data, n_z, parent), (recipe, seed) = shared, item
+def _start(shared: tuple[ScaledSamples, int, TrainedLift | None, float],
+           item: tuple[Recipe, int], tell: Tell) -> TrainedLift | str:
+    (data, n_z, parent, budget), (recipe, seed) = shared, item
+    end, late = time.process_time() + budget, False
+
+    def monitor(*step: float) -> bool:
+        nonlocal late
+        late = time.process_time() > end
+        return tell(step) or late
+
     try:
         with _one_thread():
-            return recipe.start(data, n_z, parent, seed, lambda *step: tell(step))
+            grown = recipe.start(data, n_z, parent, seed, monitor)
+        return replace(grown, status=MinimumStatus.OUT_OF_TIME) if late and (
+            grown.status is MinimumStatus.INTERRUPTED) else grown
     except torch.linalg.LinAlgError as error:
         return f'a start is degenerate ({error}): check that all states move independently'

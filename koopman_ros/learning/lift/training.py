@@ -138,7 +138,7 @@ class _Candidate:
 def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, seed: int = 0,
           starts: int = 4, watch: Watch | None = None, refuse: bool = True, loops: int = LOOPS,
           device: str = 'cpu', backend: Backend | None = None,
-          begin: LiftedModel | None = None) -> Trained:
+          begin: LiftedModel | None = None, budget: float = math.inf) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
@@ -161,6 +161,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param begin: a lift of a plant of the same kind that the training begins from: its coordinates
         are fitted to the samples in one start, further ones are added as usual. None to begin from
         nothing.
+    :param budget: processor time in s, of which each start gets an equal part.
     :raises TrainingFailed: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes, or when its law fails in closed loop.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe or a lift
@@ -189,7 +190,8 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
 
     def run(n_z: int, parent: TrainedLift | None) -> Generator[tuple[str, TrainedLift | str]]:
         count = 1 if parent is None and first is not None else starts
-        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, tracker)
+        return run_starts(backend, recipe, data, n_z, parent or first, seed, count, tracker,
+                          budget / (starts * len(rounds)))
 
     def judge(grown: TrainedLift | str) -> _Candidate | str:
         return _judged(grown, lambda found: scaling.model(found, **about), parts)
