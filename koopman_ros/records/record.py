@@ -136,7 +136,8 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
         table = table_of(one)
         of_states, of_inputs = (tuple(with_unit(table, signal, report) for signal in some)
                                 for some in (of_states, of_inputs))
-        episodes += TableImport(label, of_states, of_inputs, _names(linear, 'linear'), report).episodes(
+        episodes += TableImport(
+            label, of_states, of_inputs, _names(linear, 'linear'), report).episodes(
             table, seconds_of(table, time, period))
     files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
     if not episodes:
