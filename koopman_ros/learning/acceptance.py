@@ -28,6 +28,7 @@ from koopman_ros.execution import Backend
 from koopman_ros.learning.causes import likely_causes
 from koopman_ros.learning.identification import (
     Drift,
+    DriftModel,
     fitted_starts,
     Identified,
     longest_step,
@@ -44,7 +45,7 @@ from koopman_ros.learning.linearisation import (
 )
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.model import Coordinates, LiftedModel
-from koopman_ros.model_classes import LINEAR
+from koopman_ros.model_classes import BEST, LINEAR
 
 # An error is more than noise when it is this unlikely, and this large beside the range.
 _SIGMAS = 5.0
@@ -78,10 +79,16 @@ class Thresholds:
 
 
 class HeldOut:
-    """The held-out part of a record, and the requirements on a model there."""
+    """
+    The held-out part of a record, and the requirements on a model there.
 
-    def __init__(self, found: Identified, thresholds: Thresholds) -> None:
+    :param compared: whether all classes of models compete.
+    :ivar other_class: advice to compare them; empty if they compete.
+    """
+
+    def __init__(self, found: Identified, thresholds: Thresholds, compared: bool) -> None:
         self._found, self._thresholds = found, thresholds
+        self.other_class = '' if compared else f'set model_class to {BEST}, or '
         self.segments = Segments.of(found.held_out, longest_step(found.held_out))
         self.scale = found.drift.box.states.scale
         self.count = sum(len(episode) for episode in found.held_out)
@@ -182,21 +189,20 @@ class HeldOut:
         cond, most = figures.fit.cond, self._thresholds.condition
         if not cond <= most:
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
-                           f'{most:.3g}: reduce lifted_dimension, or set model_class to best')
+                           f'{most:.3g}: {self.other_class}reduce lifted_dimension')
         if not law_check.accepted:
-            reasons.append(uncontrolled('the estimated drift', law_check))
+            reasons.append(self.uncontrolled('the estimated drift', law_check))
         return tuple(filter(None, reasons))
+
+    def uncontrolled(self, drift: str, check: ClosedLoopTest, remedy: str = '') -> str:
+        """Say that a law does not control a drift, and what to try."""
+        return (f'its law does not control {drift}: {check}; '
+                + (remedy or f'{self.other_class}record more in that range'))
 
 
 def _displaced(drift: Drift, inputs: Array, offset: Array, x: Array, u: Array) -> Array:
     """Evaluate the rate (M, n_x) of a drift with constant additions to its inputs and rates."""
     return drift.rate(x, u + inputs) + offset
-
-
-def uncontrolled(drift: str, check: ClosedLoopTest, remedy: str = (
-        'set model_class to best, or record more in that range')) -> str:
-    """Say that a law does not control a drift, and what to try."""
-    return f'its law does not control {drift}: {check}; {remedy}'
 
 
 @dataclass(frozen=True)
@@ -243,7 +249,9 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     :param watch: called with the share that is done of further loops; True ends.
     :raises Stopped: when `watch` requested it.
     """
-    model, held_out = learned.model, HeldOut(found, thresholds)
+    model, drift = learned.model, found.drift
+    held_out = HeldOut(found, thresholds, isinstance(learned, ClassComparison) and (
+        len(learned.contenders) > 1 or (isinstance(drift, DriftModel) and drift.linear)))
     rmse, drift_rmse = held_out.rmse_of(model), held_out.rmse(found.drift.rate)
     current_rmse = None if current is None else held_out.rmse_of(current)
     chosen = learned.chosen if isinstance(learned, ClassComparison) else None
@@ -258,14 +266,15 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
         reasons = (*filter(None, [beside]), *reasons)
     further = () if reasons else held_out.further_checks(model, loops, watch, backend)
     reasons = (*reasons, *dict.fromkeys(
-        uncontrolled(f'a {drift.form} that explains the record better{words}', check,
-                     drift.remedy) if isinstance(drift, NonAffineDrift) else
-        uncontrolled(f'a {drift.form} that explains the record equally well{words}', check)
+        held_out.uncontrolled(f'a {drift.form} that explains the record better{words}', check,
+                              drift.remedy) if isinstance(drift, NonAffineDrift) else
+        held_out.uncontrolled(f'a {drift.form} that explains the record equally well{words}',
+                              check)
         for drift, check, words in further if check.loops and not check.accepted))
     points = operating_points(model, np.vstack([
         law_check.setpoints, *(check.setpoints for _, check, _ in further)]))
     reasons = (*reasons, *filter(None, [unfounded_instability(
-        model, found, points, held_out.better(rmse))]))
+        model, found, points, held_out.better(rmse), held_out.other_class)]))
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,

@@ -188,7 +188,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     :raises ValueError: when the episodes hold no steady state, and for an unknown class.
     :raises Stopped: when `judging` ended it.
     """
-    held_out = HeldOut(found, thresholds)
+    held_out = HeldOut(found, thresholds, model_class == BEST)
     noise = np.fmin(found.noise, held_out.rmse(found.drift.rate)) / held_out.scale
 
     def judged(one: ModelCandidate) -> ModelCandidate:
@@ -208,8 +208,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     # the mean square of so many white errors strays by this share
     chance = float(np.mean(noise ** 2)) * np.sqrt(2.0 / held_out.count)
     drift = found.drift
-    if model_class == BEST and isinstance(drift, DriftModel) and drift.degree == 1 and not (
-            drift.varying_input_matrix):
+    if model_class == BEST and isinstance(drift, DriftModel) and drift.linear:
         # which is that drift itself
         model_class, begin = LINEAR, None
     alone = model_class != BEST

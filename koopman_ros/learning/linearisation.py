@@ -71,12 +71,14 @@ def _modes(model: LiftedModel, rate: Rate, x: Array, v: Array | None = None
 
 
 def unfounded_instability(model: LiftedModel, found: Identified,
-                          points: Sequence[OperatingPoint], others: Mapping[str, Rate]) -> str:
+                          points: Sequence[OperatingPoint], others: Mapping[str, Rate],
+                          advice: str = '') -> str:
     """
     Say where a model is unstable although the record shows that the plant is not, or nothing.
 
     :param others: rates by name, per time unit of the drift, that explain the held-out part of the
         record at least as well as the model.
+    :param advice: to be followed by another one.
     """
     factor = SECONDS_PER_TIME_UNIT[found.drift.box.time_unit] / model.seconds_per_time_unit
     episodes = [*found.fitted, *found.held_out]
@@ -94,16 +96,14 @@ def unfounded_instability(model: LiftedModel, found: Identified,
             other = float(_modes(model, rate, x)[0, 0].real) / factor
             if other * longest <= 0.0:
                 return (f'{unstable(point)}, although a {name}, which is stable there, explains '
-                        'the held-out data at least as well: set model_class to best, or record '
-                        'around that state')
+                        f'the held-out data at least as well: {advice}record around that state')
     for x, u, duration in _resting(found, episodes):
         modes = _modes(model, lifted_rate(model, model.seconds_per_time_unit),
                        model.states.to_deviation(x[None]), model.inputs.to_deviation(u[None]))
         point = OperatingPoint(x, modes[0])
         if point.growth * factor * duration > _STILL:
             return (f'{unstable(point)}, where the plant rested in the record under a constant '
-                    'input: set model_class to best, or record with steps of the input around '
-                    'that state')
+                    f'input: {advice}record with steps of the input around that state')
     return ''
 
 

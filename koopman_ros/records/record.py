@@ -116,10 +116,12 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     :raises BagReadError: for a bag that cannot be read.
     :raises ValueError: for a table without such a column, with times that cannot be in seconds, or
         of another kind.
+    :raises TypeError: for names that are a table, where the arguments are in another order.
     """
     sources = source if isinstance(source, list | tuple) else [source]
-    of_states, of_inputs = (tuple(map(SignalColumn.of, _names(some))) for some in (states, inputs))
-    _check_names(of_states, of_inputs, _names(linear))
+    of_states, of_inputs = (tuple(map(SignalColumn.of, _names(some, role)))
+                            for some, role in ((states, 'states'), (inputs, 'inputs')))
+    _check_names(of_states, of_inputs, _names(linear, 'linear'))
     report, episodes = ImportReport(), []
     for number, one in enumerate(sources):
         label = os.fspath(one) if isinstance(one, str | os.PathLike) else f'table {number + 1}'
@@ -134,7 +136,8 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
         table = table_of(one)
         of_states, of_inputs = (tuple(with_unit(table, signal, report) for signal in some)
                                 for some in (of_states, of_inputs))
-        episodes += TableImport(label, of_states, of_inputs, _names(linear), report).episodes(
+        episodes += TableImport(
+            label, of_states, of_inputs, _names(linear, 'linear'), report).episodes(
             table, seconds_of(table, time, period))
     files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
     if not episodes:
@@ -148,7 +151,11 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     return Record(plant, tuple(episodes), report, files)
 
 
-def _names(names: Names) -> list[str]:
+def _names(names: Names, argument: str) -> list[str]:
+    if not isinstance(names, str) and np.ndim(names) != 1:
+        raise TypeError(f'{argument} must be a name or a list of names, got a '
+                        f'{type(names).__name__}: the file or table is the first argument of '
+                        'read(source, states, inputs)')
     return [names] if isinstance(names, str) else list(names)
 
 

@@ -135,6 +135,14 @@ def test_a_class_that_is_named_is_learned_alone(found, name):
     assert decision.accepted
 
 
+def test_a_refusal_advises_to_compare_the_classes_unless_they_were_compared(found, best):
+    strict = Thresholds(condition=0.5 * (1.0 + best.figures.fit.cond))
+    for learned, advised in ((best, False), (compared(found, 'polynomial'), True)):
+        (reason,) = evaluate_model(found, learned, None, strict, loops=16).reasons
+        assert reason.startswith('the condition number')
+        assert (f'set model_class to {BEST}' in reason) == advised
+
+
 def test_progress_counts_the_starts_of_all_classes(course, best):
     learning, judging = course
     assert list(dict.fromkeys(now.name for now in learning)) == list(CLASSES[2:])

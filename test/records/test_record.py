@@ -203,6 +203,14 @@ def test_refuses_signals_and_sources_that_are_none(arguments, words):
         read(source, states, inputs, linear=linear)
 
 
+@pytest.mark.parametrize(('arguments', 'words'), [
+    ((['level'], frame(time=SECONDS), ['pump']), 'states .*DataFrame: .* first argument'),
+    (('level', 'pump', {'time': SECONDS}), 'inputs .*dict: .* first argument')])
+def test_a_table_in_the_place_of_names_is_refused(arguments, words):
+    with pytest.raises(TypeError, match=words):
+        read(*arguments)
+
+
 @pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
 def test_refuses_other_files(tmp_path, file):
     (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')

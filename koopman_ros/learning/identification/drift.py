@@ -140,6 +140,11 @@ class DriftModel(Drift):
         return self.input_degree > 0
 
     @property
+    def linear(self) -> bool:
+        """Whether it is linear in states and inputs."""
+        return self.degree == 1 and not self.varying_input_matrix
+
+    @property
     def input_degree(self) -> int:
         """Degree of the polynomial B(x)."""
         terms = self._split[1]

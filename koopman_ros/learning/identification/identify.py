@@ -45,6 +45,8 @@ _SEGMENTS = 15
 _FITTED = 0.6  # share of them that are fitted; they hold the extremes of all signals
 # For two states and an input, six of them may hold the extremes.
 _FEWEST = 8
+# Samples of a simulation of the record, and half-ranges from the measurement at which it is lost.
+_RUN, LOST = 2000, 10.0
 # Mean squared errors this close count as equal: on a few segments that hold one estimate against
 # another, chance alone makes such a difference.
 NEARLY = 1.1
@@ -174,7 +176,8 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     Estimate dx/dt = f(x) + B(x) u from sampled, noisy measurements.
 
     For each degree of f every method gives an estimate; the best on segments held out for the
-    choice is refined by output error, where that pays. Of the degrees that predict about as well
+    choice is refined by output error, where that pays. Degrees whose simulations of the record
+    diverge are left out, unless the drift is unstable. Of the degrees that predict about as well
     as the best, the one with the least Bayesian information criterion (Schwarz 1978) over the
     fitted segments is taken, which reach further than the others, and refitted to all but those
     held out for good.
@@ -223,28 +226,49 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
             scores += candidate.scores
             if candidate.best is not None:
                 best[words[name]] = candidate.best
-    least = min((score.cost for _, score in best.values()), default=math.inf)
-    if not math.isfinite(least):
+    able = [d for d, (_, score) in best.items() if math.isfinite(score.cost)]
+    if not able:
         raise ValueError('; '.join(['no drift fits the episodes: record longer, with steps of the '
                                     'input', *failures]))
-    good = [d for d, (_, score) in best.items() if score.cost <= NEARLY * least]
-    degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
-
-    def monitor(*_: object) -> bool:
-        return progress(f'drift of degree {degree} on all episodes', None)
-
-    monitor()
+    record = Segments.of(cut(episodes, _RUN), step)
+    following = [d for d in able if not _leaves(best[d][0], record)]
+    left = following or able
     everything = Segments.of([*fit, *choose], step)
-    finished = {}
-    for d in {degree, degrees[0]} & set(best):
+    finished: dict[int, DriftModel] = {}
+
+    def finish(d: int) -> DriftModel:
+        def monitor(*_: object) -> bool:
+            return progress(f'drift of degree {degree} on all episodes', None)
+
+        monitor()
         model, score = best[d]
         finished[d] = output_error(model, everything, learn_input_matrix=known is None,
                                    monitor=monitor) if OUTPUT_ERROR in score.method else model
+        return finished[d]
+
+    while True:
+        least = min(best[d][1].cost for d in left)
+        good = [d for d in left if best[d][1].cost <= NEARLY * least]
+        degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
+        if not (_leaves(finish(degree), record) and following[1:]):
+            break
+        left.remove(degree)
+    if degrees[0] in best and degrees[0] not in finished:
+        finish(degrees[0])
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
                       (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
                       alternatives=tuple(best[d][0] for d in good if d != degree),
                       disturbances=plant.disturbance_names)
+
+
+def _leaves(drift: DriftModel, record: Segments) -> bool:
+    """Return whether simulations by a drift that is stable in the middle leave the record."""
+    if drift.growth_rate > 0.0:
+        return False
+    with np.errstate(all='ignore'):
+        errors = record.errors(drift.rate, record.x[0]) / drift.box.states.scale
+    return not np.all(np.abs(errors) < LOST)
 
 
 def usual_degrees(n_x: int) -> tuple[int, ...]:

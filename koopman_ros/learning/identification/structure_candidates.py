@@ -15,14 +15,18 @@ from koopman_ros.core.datasets import Array
 from koopman_ros.learning.identification.chance import SIGMAS
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
-from koopman_ros.learning.identification.identify import NEARLY, OUTPUT_ERROR, Score
+from koopman_ros.learning.identification.identify import (
+    LOST,
+    NEARLY,
+    OUTPUT_ERROR,
+    Score,
+)
 from koopman_ros.learning.identification.innovations_form import Predictor, SETTLING
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import innovations_form, Refinable, Refined
 
 _MOST = 2.0  # times the least squared error that a smaller model may have
-_ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
-_LOST = 10.0  # half-ranges from the measurement
+ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
 
 _Model = TypeVar('_Model', bound=Refinable)
 
@@ -116,11 +120,12 @@ class Choice:
 
 
 def fitted_by_simulation(model: _Model, gain: Array, data: Segments, starts: Array,
-                         monitor: Callable[..., bool]) -> Refined[_Model]:
+                         monitor: Callable[..., bool], iterations: int = ITERATIONS
+                         ) -> Refined[_Model]:
     """Return a model whose simulations err least."""
     penalty = model.penalty if isinstance(model, NetworkDrift) else None
     return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
-                            tolerance=_TOLERANCE, penalty=penalty, iterations=_ITERATIONS,
+                            tolerance=_TOLERANCE, penalty=penalty, iterations=iterations,
                             monitor=monitor)
 
 
@@ -141,7 +146,7 @@ def candidate_of(refined: Refined[Any], start: Predictor[DriftModel], data: Segm
         errors = np.where(np.mean(errors ** 2, axis=0) > np.mean(others ** 2, axis=0),
                           errors, others)
     return StructureCandidate(refined.model, start, record, hidden, errors, refined.starts
-                              ) if np.all(np.abs(errors) < _LOST) else None
+                              ) if np.all(np.abs(errors) < LOST) else None
 
 
 def equals(best: StructureCandidate, able: Sequence[StructureCandidate]
@@ -163,8 +168,9 @@ def smallest_adequate(candidates: Sequence[StructureCandidate]) -> StructureCand
         # of a model that errs wildly in a few blocks the scatter says nothing
         return more > min(SIGMAS * deviation, _MOST - 1.0)
 
-    able = [(len(one.model.theta), float(np.mean(own)), i) for i, (one, own) in enumerate(
-        zip(candidates, squares, strict=True)) if not worse(own)]
+    able = [(len(one.model.theta) + np.count_nonzero(one.late), float(np.mean(own)), i)
+            for i, (one, own) in enumerate(zip(candidates, squares, strict=True))
+            if not worse(own)]
     return candidates[min(able)[-1]]
 
 

@@ -9,15 +9,20 @@ import sys
 import numpy as np
 import pytest
 
-from koopman_ros.core.datasets import cut
+from koopman_ros.control.experiment import Experiment
+from koopman_ros.core.datasets import cut, Episode, PlantDescription
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification import (
     identify,
+    longest_step,
     methods_of,
+    Segments,
     Stopped,
 )
 from support.known_plants import CUBIC, methods, PAIR
 
 NOISE = 0.02
+LEVELS = ('level_1', 'level_2', 'level_3')
 
 
 @pytest.fixture(scope='module')
@@ -223,6 +228,35 @@ def test_extremes_in_every_segment():
         parts[i] = replace(part, x=x, u=u)
     with pytest.raises(ValueError, match='all but 0 of 8 segments'):
         identify(PAIR.plant, [*parts, parts[0].part(0, 5)] + [parts[0].part(0, 9)] * 2)
+
+
+def test_a_degree_whose_simulation_of_the_record_diverges_gives_way_to_a_lower_one():
+    """Three tanks in series, their pump stepped as by the trainer, held for up to 240 s."""
+    period, edge = 5.0, np.full(3, np.inf)
+    steps = Experiment(3600.0, ('pump',), np.array([3.0]), np.array([9.0]), np.ones(1),
+                       np.array([6.0]), 30.0, 240.0, LEVELS, -edge, edge, seed=4).steps
+    (ends, pumped), time = steps[0], period * np.arange(720)
+    u = pumped[np.searchsorted(ends, time, side='right')][:, None]
+
+    def rate(x, u):
+        out = np.sqrt(2.0 * 9.81 * x) * 0.1781 / 15.52
+        return np.array([3.3e-2 * u / 15.52 - out[0], out[0] - out[1], out[1] - out[2]])
+
+    x, levels = np.full(3, (3.3e-2 * 6.0 / 0.1781) ** 2 / (2.0 * 9.81)), []
+    for flow in u[:, 0]:
+        levels.append(x)
+        for _ in range(5):
+            x = runge_kutta_step(lambda x, flow=flow: rate(x, flow), x, period / 5.0)
+    noise = 5e-4 * np.random.default_rng([4, 5]).standard_normal((720, 3))
+    episode = Episode(time, np.array(levels) + noise, time, u)
+    plant = PlantDescription('tanks', LEVELS, ('m',) * 3, ('pump',), ('V',), 's',
+                             np.full(3, np.nan), np.full(1, np.nan), None)
+    found = identify(plant, [episode])
+    # the one that errs least in the segments
+    assert min(found.scores, key=lambda score: score.cost).degree == 4
+    assert found.drift.degree < 4
+    record = Segments.of([episode], longest_step([episode]))
+    assert np.max(np.abs(record.errors(found.drift.rate, record.x[0]))) < 5.0 * np.max(noise)
 
 
 def test_linear_model_that_diverges_does_not_stand_in_the_way(noisy, monkeypatch):
