@@ -192,17 +192,10 @@ class Estimator(ABC):
 
     @cached_property
     def _inverse(self) -> Array:
-        """(n_u, n_x); an input behind a lag acts like its applied value."""
-        model, lagged = self.model, self.model.lagged
-        if not lagged:
-            return model.input_inverse()
-        slope, effect, rows = model.drift_jacobian(np.zeros(model.n_x)), model.B.copy(), [
-            *lagged.values()]
-        for j, i in lagged.items():
-            effect[:, j] = slope[:, i] * model.inputs.scale[j] / model.states.scale[i]
-        effect[rows] = 0.0
-        found = np.asarray(np.linalg.pinv(effect), dtype=np.float64)
-        found[:, rows] = model.input_inverse()[:, rows]
+        """(n_u, n_x) of :func:`effect_of_inputs`, and of B at applied inputs behind a lag."""
+        rows = [*self.model.lagged.values()]
+        found = np.asarray(np.linalg.pinv(effect_of_inputs(self.model)), dtype=np.float64)
+        found[:, rows] = self.model.input_inverse()[:, rows]
         return found
 
     def at_bound(self, w: Array) -> bool:
@@ -223,3 +216,12 @@ class Estimator(ABC):
     @cached_property
     def _max_disturbance(self) -> Array:
         return self.tuning.max_disturbance / self.model.inputs.scale
+
+
+def effect_of_inputs(model: LiftedModel) -> Array:
+    """Return the rates (n_x, n_u) due to the inputs; behind a lag, due to the applied input."""
+    slope, effect = model.drift_jacobian(np.zeros(model.n_x)), model.B.copy()
+    for j, i in model.lagged.items():
+        effect[:, j] = slope[:, i] * model.inputs.scale[j] / model.states.scale[i]
+    effect[[*model.lagged.values()]] = 0.0
+    return effect

@@ -15,7 +15,14 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import SECONDS_PER_MINUTE
-from koopman_ros.estimation.base import Estimate, Estimator, Innovation, INNOVATION_WINDOW, LOST
+from koopman_ros.estimation.base import (
+    effect_of_inputs,
+    Estimate,
+    Estimator,
+    Innovation,
+    INNOVATION_WINDOW,
+    LOST,
+)
 from koopman_ros.estimation.dead_time import largest_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -65,16 +72,19 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         # at one sample a second the bandwidth of a filter is the root of the ratio between the
         # rate of an output that a disturbance causes and the output's noise; its poles are damped
         # by 0.7, so that a disturbance settles as with an observer of the root of twice of that
-        rates = np.abs(outputs.C * model.states.scale @ model.B) / (
+        rates = np.abs(outputs.C * model.states.scale @ effect_of_inputs(model)) / (
             model.inputs.scale * model.seconds_per_time_unit)
         with np.errstate(divide='ignore'):
             disturbance_noise = np.minimum(
                 disturbance_noise, 0.5 * largest_bandwidth(dead_time, slowest) ** 2 * np.min(
                     noise[:, None] / rates, axis=0))
+    guess = _GUESS * half
+    # an applied input that is not measured follows from the commands
+    guess[[i for i in model.lagged.values() if not outputs.C[:, i].any()]] = 0.0
     disturbance_noise, error = (
         np.where(own > 0.0, own, default) for own, default in (
             (tuning.disturbance_noise / math.sqrt(SECONDS_PER_MINUTE), disturbance_noise),
-            (tuning.initial_error, _GUESS * half)))
+            (tuning.initial_error, guess)))
     return noise, disturbance_noise / model.inputs.scale, error / model.states.scale
 
 
@@ -110,7 +120,7 @@ class ExtendedKalmanFilter(Estimator):
     def _directions(self) -> Array:
         """(n_x, n_y) rates of the state that each disturbance adds to, as far as it wanders."""
         model, H = self.model, self._H
-        by_input = model.B * self._wander
+        by_input = effect_of_inputs(model) * self._wander
         # an output that no input moves at once wanders as the others do, each in its own size
         sizes = np.linalg.norm(H, axis=1)
         moved = np.max(np.abs(H @ by_input), axis=1)

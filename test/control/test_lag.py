@@ -62,10 +62,12 @@ def test_a_law_that_knows_the_lag_costs_hardly_more_than_the_optimum(lag, durati
 
 
 @pytest.mark.parametrize(('lag', 'duration'), [(18.0, 300.0), (60.0, 440.0)])
-def test_a_lag_leaves_no_offset_on_a_changed_plant(lag, duration):
-    loop = controller_of(lagged_model(lag))
+@pytest.mark.parametrize('estimator', ['', 'extended_kalman_filter'])
+def test_a_lag_leaves_no_offset_on_a_changed_plant(lag, duration, estimator):
+    loop = controller_of(lagged_model(lag), estimator=estimator)
     run = step(loop, lag, duration, plant=FOULED, period=2.0)
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
+    assert SETPOINT - run.states.min() < 0.8
     # the applied input is calculated, and the disturbance an equivalent change of it
     estimate, states = run.loop.state.estimate, loop.model.states
     assert states.to_physical(estimate.x)[1] == pytest.approx(run.inputs[-1, 0], abs=0.01)
