@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from koopman_ros.control import Weights
 from koopman_ros.core.arrays import Array
@@ -75,6 +74,7 @@ class Regulation:
 
     def starts(self, count: int) -> Array:
         """Return the first (count, n_x) of a Sobol sequence in the box, the same ones always."""
+        from scipy.stats import qmc
         points = qmc.Sobol(self.system.n_x, rng=0).random_base2((count - 1).bit_length())
         spread: Array = qmc.scale(points[:count], self.lower, self.upper)
         return spread

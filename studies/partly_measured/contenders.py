@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-import control
 from koopman_ros.control import Controller, State
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import solve_riccati
@@ -61,6 +60,7 @@ class LinearQuadraticGaussian:
 
     def __init__(self, case: PartialCase, x: Array, u: Array) -> None:
         """Linearise at a steady state (n_x,) and its input (n_u,)."""
+        import control
         system, outputs = case.system, case.outputs
         A, B, C = system.slope(x, u), system.input_matrix(x), outputs.C
         interval = case.period / system.seconds_per_time_unit

@@ -4,7 +4,6 @@
 """Dead times of simulated plants, as training finds them."""
 
 import numpy as np
-from scipy.signal import lfilter
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.learning.identification import find_dead_times
@@ -23,6 +22,7 @@ def one_plant(seed: int) -> tuple[Metrics, Models]:
 
     :return: `largest_error` in samples, and whether it is `within_a_sample`.
     """
+    from scipy.signal import lfilter
     rng = np.random.default_rng(seed)
     late = rng.integers(0, _LONGEST + 1, 1 + seed % 2)
     u = np.empty((_COUNT, len(late)))

@@ -3,15 +3,17 @@
 
 """Margins of the loop at a set-point, and from how far away it gets back there."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from enum import Enum
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.optimize import brentq
-from scipy.signal import cont2discrete
 
-import control
 from koopman_ros.control import Controller, SAFE, State, StepReport, Supervisor
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import runge_kutta_step
@@ -22,6 +24,9 @@ from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input,
 from studies.campaign import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import at_setpoint, COOLANT, COOLANT_RANGE, PERIOD, REACTOR
+
+if TYPE_CHECKING:
+    import control
 
 _STEP = 1e-5  # of scaled deviations and K, for differences
 _KICK = 1e-4  # K
@@ -53,10 +58,10 @@ class Margins:
 
 def linearised_reactor(temperature: float) -> control.StateSpace:
     """Linearise the true reactor at a temperature in K, between samples, with the input held."""
+    import control
     slope = REACTOR.drift_jacobian(np.array([temperature]))
-    a, b, c, d, _ = cont2discrete(
-        (slope, REACTOR.B, np.ones((1, 1)), np.zeros((1, 1))), PERIOD / 60.0)
-    return control.ss(a, b, c, d, PERIOD)
+    whole = expm(PERIOD / 60.0 * np.block([[slope, REACTOR.B], [np.zeros((1, 2))]]))
+    return control.ss(whole[:1, :1], whole[:1, 1:], np.ones((1, 1)), np.zeros((1, 1)), PERIOD)
 
 
 def linearised_controller(controller: Controller, temperature: float) -> control.StateSpace:
@@ -68,6 +73,7 @@ def linearised_controller(controller: Controller, temperature: float) -> control
 
     :param temperature: set-point and measurement, in K.
     """
+    import control
     model = controller.model
     assert model.n_x == model.n_u == 1
     point = np.array([temperature])
@@ -99,6 +105,7 @@ def linearised_controller(controller: Controller, temperature: float) -> control
 
 def margins_at(controller: Controller, temperature: float) -> Margins:
     """Calculate the margins at a set-point in K."""
+    import control
     # the law is positive from measurement to command
     opened = -linearised_controller(controller, temperature) * linearised_reactor(temperature)
     # a little past the highest frequency, where the curve goes back as it came: a crossing at the

@@ -211,10 +211,12 @@ def random_events(controller, rng, count):
                 yield ModeChange(rng.choice([Mode.MANUAL, Mode.AUTOMATIC]))
 
 
-CASES = [(system, None, levels, estimator) for system, levels, estimator in itertools.product(
-    SYSTEMS, LEVELS, ESTIMATORS)] + [
-        (system, measured, levels, estimator) for (system, measured), levels, estimator
-        in itertools.product(PARTLY.items(), LEVELS, ESTIMATORS[2:])]
+# each system with each estimator, and each of both with each order of levels
+CASES = [(system, None, LEVELS[(i + j) % 3], estimator) for (i, system), (j, estimator)
+         in itertools.product(enumerate(SYSTEMS), enumerate(ESTIMATORS))] + [
+    (system, measured, levels, ESTIMATORS[2 + (i + j) % 2])
+    for (i, (system, measured)), (j, levels)
+    in itertools.product(enumerate(PARTLY.items()), enumerate(LEVELS))]
 
 
 @pytest.mark.parametrize('system', SYSTEMS)
@@ -269,8 +271,11 @@ def test_a_law_that_fails_hands_over_to_the_next_level(plugin, failure):
     assert run.codes & {StatusCode.LAW_RAISED, StatusCode.COMMAND_NOT_FINITE}
 
 
-@pytest.mark.parametrize('failure', [*FAILURES, *ESTIMATES], ids=lambda _: '')
-@pytest.mark.parametrize('method', ['predict', 'correct', 'restart', 'as_input'])
+@pytest.mark.parametrize(('method', 'failure'), [
+    *(('correct', failure) for failure in (*FAILURES, *ESTIMATES)),
+    # an error, a result of another type, and one of another size for the others
+    *itertools.product(('predict', 'restart', 'as_input'), (
+        FAILURES[0], FAILURES[1], FAILURES[6], ESTIMATES[0], ESTIMATES[4]))], ids=lambda _: '')
 def test_an_estimator_that_fails_leads_to_a_hold_and_the_safe_input(plugin, method, failure):
     name = plugin(DisturbanceObserver, method, failure)
     run = Checked(tuned('two_tanks', estimator=name, hold_timeout=5.0))

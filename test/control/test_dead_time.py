@@ -147,8 +147,9 @@ def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
                                       uncertainty(loop.model, outputs, own)[1])
 
 
-@pytest.mark.parametrize('levels', [('mpc', 'linear'), ('linear',), ('pi',)])
-@pytest.mark.parametrize('estimator', ['', 'extended_kalman_filter'])
+@pytest.mark.parametrize(('levels', 'estimator'), [
+    (('mpc', 'linear'), 'extended_kalman_filter'), (('linear',), ''),
+    (('pi',), 'extended_kalman_filter')])
 def test_every_law_and_filter_acts_on_the_prediction(levels, estimator):
     gains = {'pi.temperature.gain': 1.0, 'pi.temperature.integral_time': 60.0}
     loop, plant, state = late_reactor(

@@ -81,9 +81,8 @@ def optimal_cost(R):
     return scalar_optimal_cost(REACTOR, START, SETPOINT, R, UNIT)
 
 
-@pytest.mark.parametrize('n_z', [3, 4])
-@pytest.mark.parametrize('law', [recentred, averaged])
-@pytest.mark.parametrize('R', [1.0, 0.1])
+@pytest.mark.parametrize(('n_z', 'law', 'R'), [
+    (3, recentred, 1.0), (3, averaged, 0.1), (4, recentred, 0.1), (4, averaged, 1.0)])
 def test_cost_and_offset_on_the_true_reactor(n_z, law, R):
     cost, end = run_reactor(shipped(f'reactor_nz{n_z}'), law, R, minutes=30.0)
     ratio = cost / optimal_cost(R)

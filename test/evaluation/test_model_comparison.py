@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.control.events import Measurement
@@ -23,6 +22,7 @@ from koopman_ros.evaluation.simulate import at, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
 from support.closed_loops import controller, REACTOR, SECOND, shipped, START
+from support.sampling import sampled
 
 ACCEPTED, REJECTED = MeasurementReport(Arrival.ACCEPTED), MeasurementReport(Arrival.REJECTED)
 A, B = np.array([[-0.02, 0.01], [0.0, -0.05]]), np.array([[0.0], [0.1]])
@@ -59,7 +59,7 @@ def recent(x: np.ndarray, u: np.ndarray, length: float, seconds: float = 1.0) ->
 
 def two_lags(u: np.ndarray, A: np.ndarray = A, B: np.ndarray = B) -> np.ndarray:
     """Respond to deviations (N, 1) of the input from 3, held over the second before each."""
-    step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), 1.0)
+    step, gain = sampled(A, B, 1.0)
     x = np.zeros((len(u), 2))
     for k in range(1, len(u)):
         x[k] = step @ x[k - 1] + gain @ u[k]
@@ -87,7 +87,7 @@ def test_errors_are_those_of_the_best_start_and_disturbance():
         alone = two_lags(part, B=wrong)
         constant = np.concatenate([np.zeros((1, 1)), np.ones((K, 1))])
         columns = [two_lags(constant, B=unit[:, None]) for unit in np.eye(2)]
-        decay = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), 1.0)[0]
+        decay, _ = sampled(A, B, 1.0)
         columns += [np.array([np.linalg.matrix_power(decay, k) @ unit for k in range(K + 1)])
                     for unit in np.eye(2)]
         fit = np.stack([(column * weights).ravel() for column in columns], axis=1)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.learning import compare_classes, evaluate_model, learn_lift, simulate, Thresholds
@@ -16,6 +15,7 @@ from koopman_ros.learning.identification import DriftModel, Identified, identify
 from koopman_ros.learning.pipeline import _failed_runs, DRIFT, LINEAR_MODEL
 from koopman_ros.model import Box, Coordinates, linearised_model, Provenance
 from koopman_ros.records import read
+from support.sampling import sampled
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]])
 N, PERIOD = 200, 0.1
@@ -27,7 +27,7 @@ INPUTS = Coordinates.spanning(('force',), ('N',), -np.ones(1), np.ones(1))
 
 def table(seed=0, x=(1.0, -0.5), push=0.0):
     """Return a run of the oscillator under random steps and a push, solved exactly."""
-    step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), PERIOD)
+    step, gain = sampled(A, B, PERIOD)
     u = np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, N // 10), 10)
     path = [np.array(x)]
     for value in u[:-1]:

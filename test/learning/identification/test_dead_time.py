@@ -5,10 +5,10 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, dlsim
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.learning.identification import find_dead_times
+from support.sampling import sampled
 
 PERIOD = 2.0
 
@@ -34,8 +34,10 @@ def record(seed, dead_times, time_constants, gains=(1.0, -0.7), noise=0.03, coun
     for i in range(1, n):
         A[i, i - 1] = 1.0 / time_constants[i]
     B = np.eye(n, 1) / time_constants[0]
-    system = cont2discrete((A, B, np.eye(n)[-1:], np.zeros((1, 1))), PERIOD)
-    y = dlsim(system, force)[1]
+    step, gain = sampled(A, B, PERIOD)
+    x, y = np.zeros(n), np.empty((count, 1))
+    for k in range(count):
+        y[k], x = x[-1], step @ x + gain[:, 0] * force[k]
     time = PERIOD * np.arange(count)
     return Episode(time, y + noise * np.std(y) * rng.standard_normal(y.shape), time, u)
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.stats import chi2
+from scipy.special import chdtri
 import torch
 
 from koopman_ros.core.datasets import cut, Episode
@@ -143,7 +143,7 @@ def test_errors_are_those_of_the_best_estimate_possible():
     error -= true
     # in units of the Cramer-Rao bound the error is chi-squared with as many degrees of freedom
     distance = error @ cramer_rao(clean, true) @ error
-    assert chi2.ppf(1e-3, 5) < distance < chi2.ppf(0.999, 5)
+    assert chdtri(5, 0.999) < distance < chdtri(5, 1e-3)
 
 
 def estimate(method, plant, records, degree, B=None, window=20):

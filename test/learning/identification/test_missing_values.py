@@ -8,7 +8,6 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete
 
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.learning.identification import DriftModel, identify, Segments
@@ -17,6 +16,7 @@ from koopman_ros.learning.identification.output_error import (
     innovations_form,
     PolynomialCoefficients,
 )
+from support.sampling import sampled
 
 A, B, PERIOD, NOISE = np.array([[-0.5, 0.3], [0.2, -1.0]]), np.array([[1.0], [0.5]]), 0.1, 0.01
 PLANT = PlantDescription('tanks', ('low', 'high'), ('m', 'm'), ('pump',), ('V',), 's',
@@ -26,7 +26,7 @@ PLANT = PlantDescription('tanks', ('low', 'high'), ('m', 'm'), ('pump',), ('V',)
 def record(count=800, seed=0):
     """Return a run of a linear plant under random steps, solved exactly."""
     rng = np.random.default_rng(seed)
-    step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), PERIOD)
+    step, gain = sampled(A, B, PERIOD)
     u = np.repeat(rng.uniform(-1.0, 1.0, count // 10), 10)[:, None]
     x = [np.zeros(2)]
     for value in u[:-1]:

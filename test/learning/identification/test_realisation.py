@@ -5,10 +5,10 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.learning.identification.realisation import realised
+from support.sampling import sampled
 
 PERIOD, LEVEL = 0.5, 3.0
 # three tanks in series, of which the last, or the second and the last are measured
@@ -18,7 +18,7 @@ B = np.array([[1.0], [0.0], [0.0]])
 
 def episode(C, seed=0, samples=400):
     """Return exact outputs above a level, under steps that are held for some samples."""
-    step, gain, *_ = cont2discrete((A, B, np.eye(3), np.zeros((3, 1))), PERIOD)
+    step, gain = sampled(A, B, PERIOD)
     u = np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, samples // 8), 8)[:, None]
     x, path = np.zeros(3), []
     for value in u:
