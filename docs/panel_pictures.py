@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent
 SIZE = {'width': 1280, 'height': 960}  # pixels
 TRAINER = {'model_class': 'polynomial', 'restarts': 1, 'experiment_signal': 'setpoint',
            'experiment_length': 900.0, 'experiment_min_hold_time': 20.0,
-           'experiment_max_hold_time': 60.0, 'max_condition_number': 1e9}
+           'experiment_max_hold_time': 60.0}
 ADDRESS = re.compile(r'the panel is at (\S+)')
 
 

@@ -502,7 +502,7 @@ class LiftedModel:
 
     @cached_property
     def _weights(self) -> Array | None:
-        """Weights (n_x, n_phi) of the features in the drift; None where it is not linear in them."""
+        """Weights (n_x, n_phi) of the features in the drift; None if it is not linear in them."""
         state_alone = self.identity and self.observables.features.n_z == self.n_x
         return self.A - self.pre_feedback_slope if self.readout is None and state_alone else (
             self.readout)

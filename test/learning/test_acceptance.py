@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
-from koopman_ros.learning import evaluate_model, learn_lift, Thresholds
+from koopman_ros.learning import Edmd, evaluate_model, learn_lift, Thresholds
 from koopman_ros.learning.acceptance import disagreement, uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.identification import (
@@ -172,6 +172,14 @@ def test_margin_and_condition_number_decide_and_warnings_are_passed_on(found, tr
     assert judged(condition=1.01 * cond).accepted
     (reason,) = judged(condition=0.99 * cond).reasons
     assert f'condition number of its coordinates, {cond:.3g}' in reason
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_the_condition_number_of_monomials_does_not_matter(found, trained, shipped):
+    model = Edmd(3).learn(shipped.plant, drift_samples(found.drift, found.fitted))
+    strict, loose = (evaluate_model(found, replace(trained, model=model), shipped,
+                                    Thresholds(condition=most)) for most in (1.001, 1e12))
+    assert strict.reasons == loose.reasons
 
 
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):

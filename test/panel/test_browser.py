@@ -34,7 +34,7 @@ PHONE = (390, 844)
 # an experiment of a few seconds, and a training
 TRAINER = {
     'model_class': 'polynomial', 'restarts': 1, 'record_at_start': False,
-    'min_free_disk': 0.0, 'max_condition_number': 1e9, 'experiment_signal': 'setpoint',
+    'min_free_disk': 0.0, 'experiment_signal': 'setpoint',
     'experiment_length': 900.0, 'experiment_min_hold_time': 20.0, 'experiment_max_hold_time': 60.0,
     'temperature.setpoint_min': 40.0, 'temperature.setpoint_max': 50.0}
 MEASUREMENTS = 420  # that are learned from
