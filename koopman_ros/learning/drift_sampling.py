@@ -37,7 +37,7 @@ from koopman_ros.learning.model_selection import (
     ModelCandidate,
     usual_recipes,
 )
-from koopman_ros.model import LiftedModel
+from koopman_ros.model import LiftedModel, model_file
 from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
 
 # More samples of a smooth drift tell nothing new.
@@ -156,11 +156,13 @@ def alternative_models(found: Identified, plant: PlantDescription) -> list[Lifte
         own = drift
         while isinstance(own, LaggedDrift | TransformedDrift):
             own = own.drift
-        # one that holds no steady state, or does not follow the record, is no model
+        # one that holds no steady state, does not follow the record or fits no file is no model
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
             if isinstance(own, DriftModel):
                 known, samples = _estimated(replace(found, drift=drift), plant)
-                models.append(Edmd(own.degree).learn(known, samples))
+                model = Edmd(own.degree).learn(known, samples)
+                model_file.check(model)
+                models.append(model)
     return models
 
 

@@ -169,7 +169,10 @@ def test_models_of_alternative_drifts_are_kept_beside_the_model(
     monkeypatch.setattr(task_module, 'identify_with_characteristics', lambda *_, **__: replace(
         accepted[0].found, alternatives=(
             TransformedDrift(drift.box, drift, np.eye(1), np.zeros(1)),
-            replace(drift, coefficients=1.02 * drift.coefficients))))
+            replace(drift, coefficients=1.02 * drift.coefficients),
+            # more coordinates than a file may have
+            replace(drift, degree=33, coefficients=np.pad(
+                drift.coefficients, ((0, 34 - len(drift.coefficients)), (0, 0)))))))
     (tmp_path / 'new.alternative_7.safetensors').touch()
     told = []
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'),
