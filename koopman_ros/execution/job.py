@@ -122,5 +122,22 @@ def _limit(pid: int) -> None:
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
         resource.prlimit(pid, resource.RLIMIT_CPU, (_TIME, _TIME + _LAST))
         os.setpriority(os.PRIO_PROCESS, pid, _NICE)
+
+
+class ReplayJob(Job):
+    """
+    A run of the program `replay`.
+
+    :param arguments: of the program.
+    """
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        super().__init__('koopman_ros.nodes.replay', arguments, interrupted=130)
         # where sessions share the processors before processes do
-        Path(f'/proc/{pid}/autogroup').write_text(f'{_NICE}\n')
+        with contextlib.suppress(OSError):
+            Path(f'/proc/{self.process.pid}/autogroup').write_text(f'{_NICE}\n')
+
+    @property
+    def said(self) -> str:
+        """Last lines of its standard error."""
+        return '\n'.join(self.errors)

@@ -13,7 +13,7 @@ import time
 
 import yaml
 
-from koopman_ros.execution.job import Job
+from koopman_ros.execution.job import ReplayJob
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.training_report import (
     Learning,
@@ -41,7 +41,7 @@ class LearningWatch:
         self._system, self._wiring = system, wiring
         self._namespace, self._resolve = namespace, resolve
         self._model_file = self._bag = ''
-        self._job: Job | None = None
+        self._job: ReplayJob | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._cancelled = False
         self._read: object = None  # the report that was read last
@@ -90,9 +90,8 @@ class LearningWatch:
         remaps = [part for topic in topics for part in (
             '-r', f'{topic}:={self._resolve(topic)}')]
         try:
-            self._job = Job('koopman_ros.nodes.replay', [
-                '--ros-args', '--params-file', str(file), '-r', f'__ns:={self._namespace}',
-                *remaps], interrupted=130)
+            self._job = ReplayJob(['--ros-args', '--params-file', str(file), '-r',
+                                   f'__ns:={self._namespace}', *remaps])
         except OSError as error:
             self._folder.cleanup()
             return Answer(False, f'the replay cannot be started: {error}')
@@ -115,7 +114,7 @@ class LearningWatch:
         now = self.learning.comparison
         self.learning.comparison = ReplayComparison(
             'cancelled', model=now.model, since=now.since) if self._cancelled else read_comparison(
-                Path(self._folder.name), now.model, now.since, '\n'.join(self._job.errors))
+                Path(self._folder.name), now.model, now.since, self._job.said)
         self._job = None
         self._folder.cleanup()
 

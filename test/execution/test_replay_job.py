@@ -8,13 +8,12 @@ from pathlib import Path
 import resource
 import time
 
-from koopman_ros.execution.job import Job
+from koopman_ros.execution.job import ReplayJob
 from support.nodes import TIMEOUT
 
 
 def test_it_gives_way_and_says_what_is_wrong(tmp_path: Path) -> None:
-    job = Job('koopman_ros.nodes.replay', [
-        '--ros-args', '-p', 'bags:=[none.mcap]', '-p', f'output:={tmp_path}/out'])
+    job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]', '-p', f'output:={tmp_path}/out'])
     try:
         assert os.getpriority(os.PRIO_PROCESS, job.process.pid) >= 10
         for limit in (resource.RLIMIT_DATA, resource.RLIMIT_CPU):
@@ -25,4 +24,4 @@ def test_it_gives_way_and_says_what_is_wrong(tmp_path: Path) -> None:
             time.sleep(0.05)
     finally:
         job.close()
-    assert "bag 'none.mcap' does not exist" in '\n'.join(job.errors)
+    assert "bag 'none.mcap' does not exist" in job.said

@@ -486,7 +486,8 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
         given = row.get_by_role('textbox')
         expect(given).to_have_value('32')
         for text, said in (('31', 'set'), ('x', "✖ refused: 'x' is not a number"),
-                           ('-300', '✖ refused: must be [-273.15, 1000000000] °C'),
+                           ('-300', re.compile('✖ refused: coolant_temperature.max = -300.0 °C '
+                                                'must be in ')),
                            ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 °C must '
                                             'be below')),
                            ('32', 'set')):

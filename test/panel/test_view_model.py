@@ -581,10 +581,7 @@ def test_texts_are_parsed_as_values_of_their_type(value: Any, text: str, read: A
 
 @pytest.mark.parametrize(('given', 'text', 'words'), [
     (parameter('p', 1.0), 'x', 'not a number'), (parameter('p', 1), '1.5', 'whole number'),
-    (parameter('p', True), 'on', 'true or false'), (parameter('p', 1.0), 'nan', 'finite'),
-    (parameter('p', 1.0, range='[0, 2] m', lower=0.0, upper=2.0), '3', r'\[0, 2\] m'),
-    (parameter('p', (1.0,)), 'a', 'numbers'),
-    (parameter('p', 'a', choices=('a', 'b'), range='one of a, b'), 'c', 'one of a, b')])
+    (parameter('p', True), 'on', 'true or false'), (parameter('p', (1.0,)), 'a', 'numbers')])
 def test_wrong_texts_are_refused(
         given: ParameterDescription, text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
