@@ -122,8 +122,8 @@ def test_a_network_saturates_without_a_warning(far):
     lift = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
     x = np.array([far])
     J, M, H = lift.secants(x, -x, np.ones(1))
-    np.testing.assert_allclose([lift.lift(x)[0], J[0, 0], M[0, 0], H[0, 0]], [1.0, 0.0, 1.0 / far, 0.0],
-                               rtol=1e-14, atol=1e-30)
+    np.testing.assert_allclose([lift.lift(x)[0], J[0, 0], M[0, 0], H[0, 0]],
+                               [1.0, 0.0, 1.0 / far, 0.0], rtol=1e-14, atol=1e-30)
 
 
 @every_lift
