@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -65,10 +66,15 @@ class SensorLimits:
         20.0, 'Time after which an unchanged measurement counts as a stuck sensor, if the model '
               'moved by more than half of max_step; 0: no check.', 's', 0.0, 86400.0)
 
-    @property
+    @cached_property
     def unreported(self) -> Array:
         """The largest change (n_y,) that a sensor does not report."""
         return np.where(self.report_on_change > 0.0, self.deadband, 0.0)
+
+    @cached_property
+    def at_rest(self) -> Array:
+        """The largest difference (n_y,) of two measurements of a signal at rest."""
+        return self.jump + self.unreported
 
 
 @dataclass(frozen=True)

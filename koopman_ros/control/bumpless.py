@@ -33,7 +33,7 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
         reach = change_within(limits.rate, seconds)
         command = np.minimum(np.maximum(within, previous - reach), previous + reach)
     command.setflags(write=False)
-    return command, bool((within != wanted).any()), bool((command != within).any())
+    return command, within.tolist() != wanted.tolist(), command.tolist() != within.tolist()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,8 @@ from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.state import State
 from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
-from koopman_ros.core.arrays import Array
+from koopman_ros.control.timing import StepTime
+from koopman_ros.core.arrays import all_finite, Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
@@ -106,10 +107,13 @@ class StateEstimation:
         :return: the state, and whether the applied input follows the command.
         """
         command, tolerance = state.command, self.tuning.tracking_tolerance
-        if command is None or measured is None or not np.isfinite(measured).all():
+        if command is None or measured is None or not all_finite(measured):
             return state, True
         u = np.minimum(np.maximum(command, measured - tolerance), measured + tolerance)
-        return (replace(state, applied=state.applied.corrected(u)), bool((u == command).all()))
+        follows = u.tolist() == command.tolist()
+        if follows and state.applied.values[-1] is command:
+            return state, True
+        return replace(state, applied=state.applied.corrected(u)), follows
 
     def feed_forward(self, state: State) -> Array | None:
         """Return the rate (n_x,) due to the measured disturbances; None without any."""
@@ -144,37 +148,33 @@ class StateEstimation:
             estimate, level.model.drift(estimate.x)
             - self.model.disturbance_rate(signals.center + change)))
 
-    def observe(self, state: State, y: Array, time_ns: int, elapsed: float,
-                quality: tuple[int, ...] | None = None) -> tuple[State, Observation]:
+    def observe(self, state: State, y: Array, time: StepTime, quality: tuple[int, ...] | None
+                ) -> tuple[State, Observation]:
         """
         Check a measurement (n_y,) and take it into account.
 
-        :param elapsed: seconds since the last command.
         :param quality: (n_y,) as of :class:`~koopman_ros.control.Measurement`.
         :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
         before, last, history = state.estimate, state.accepted, state.history
-        predicted = self.predict(state, time_ns, elapsed)
+        predicted = self.predict(state, time)
         x = x_measured = self.position(predicted, y)
         outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def travel(then: Standstill) -> Array:
-            if outside > 0.0 or state.recovery is not None:
+            if before is None or outside > 0.0 or state.recovery is not None:
                 # what the model says of its motion is worth little; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
-            if before is None:
-                return np.zeros_like(y)
-            moved = self.predict(replace(state, estimate=replace(before, w=then.w)), time_ns,
-                                 elapsed)
+            moved = self.predict(replace(state, estimate=replace(before, w=then.w)), time)
             assert moved is not None
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
 
         bad = [name for name, level in zip(self.outputs.names, quality or (), strict=False)
                if level > UNCERTAIN]
         verdict = Verdict(last, reason(StatusCode.BAD_QUALITY, signal=bad[0])) if bad else check(
-            self.tuning.sensor, self.outputs, last, y, time_ns, w, travel)
+            self.tuning.sensor, self.outputs, last, y, time.now_ns, w, travel)
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
@@ -182,10 +182,9 @@ class StateEstimation:
             far = outside > 0.0 and self._beyond(outside) and (
                 self.outputs.determine_state
                 or self._beyond(self.model.distance(self.position(None, y))))
-            lost = far or self._lost(state, time_ns)
-            fresh = predicted is None or verdict.moved or not elapsed > 0.0 or lost
-            predicted = self._corrected(
-                state, predicted, verdict, x, time_ns, elapsed, lost, quality)
+            fresh = (predicted is None or verdict.moved or not time.elapsed > 0.0 or far
+                     or self._lost(state, time))
+            predicted = self._corrected(state, predicted, x, time, fresh, quality)
             if not isinstance(predicted, Estimate):
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
@@ -199,12 +198,10 @@ class StateEstimation:
                 and last is not None):
             # what the observer made of a sensor that does not move is no disturbance
             predicted, history = replace(predicted, w=last.standstill.w), History()
-        now = replace(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted,
+        now = replace(state, accepted=verdict.accepted, time_ns=time.now_ns, estimate=predicted,
                       history=history)
-        corrected_by = None if verdict.fault is not None else (
-            self.model.states.to_deviation(x_measured))
         return self._remembering(
-            now, state, time_ns, elapsed, corrected_by, self._factor(quality)
+            now, state, time, x_measured if verdict.fault is None else None, quality
         ), Observation(verdict, expected, x, outside)
 
     def _beyond(self, outside: float) -> bool:
@@ -233,13 +230,12 @@ class StateEstimation:
                 return self.model.states.to_physical(found)
         return x
 
-    def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   time_ns: int, elapsed: float, lost: bool, quality: tuple[int, ...] | None
-                   ) -> Estimate:
+    def _corrected(self, state: State, predicted: Estimate | None, x: Array, time: StepTime,
+                   fresh: bool, quality: tuple[int, ...] | None) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
-        :param lost: whether the model's prediction is worth nothing, after so long or so far out.
+        :param fresh: whether it starts from the measurement, as the prediction is worth nothing.
         """
         xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
         if (factor := self._factor(quality)) is not None:
@@ -247,10 +243,9 @@ class StateEstimation:
         if predicted is None:
             # the input that acts, it is assumed, held the plant where it is
             return self._started(
-                state, xi, None if state.command is None else self.acting(state, time_ns))
-        if verdict.moved or not elapsed > 0.0 or lost:
-            return estimator.restart(predicted, xi, None)
-        return estimator.correct(predicted, xi, elapsed)
+                state, xi, None if state.command is None else self.acting(state, time.now_ns))
+        return estimator.restart(predicted, xi, None) if fresh else (
+            estimator.correct(predicted, xi, time.elapsed))
 
     def _started(self, state: State, xi: Array, u: Array | None) -> Estimate:
         """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
@@ -271,25 +266,25 @@ class StateEstimation:
         return None if quality is None else np.where(
             np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0)
 
-    def _remembering(self, now: State, before: State, time_ns: int, elapsed: float,
-                     x: Array | None = None, factor: Array | None = None) -> State:
+    def _remembering(self, now: State, before: State, time: StepTime, x: Array | None = None,
+                     quality: tuple[int, ...] | None = None) -> State:
         """Return a state with its estimate in its history, if there may be late values."""
         if not self._longest_ns or now.estimate is None:
             return now
-        pieces = () if before.command is None or not elapsed > 0.0 else tuple(
-            self._pieces(before, time_ns, elapsed))
+        pieces = () if before.command is None or not time.elapsed > 0.0 else tuple(
+            self._pieces(before, time))
         return replace(now, history=now.history.followed_by(
-            Instant(time_ns, now.estimate, pieces, self.feed_forward(before), x, factor),
-            self._longest_ns))
+            Instant(time.now_ns, now.estimate, pieces, self.feed_forward(before),
+                    None if x is None else self.model.states.to_deviation(x),
+                    self._factor(quality)), self._longest_ns))
 
     @cached_property
     def _longest_ns(self) -> int:
         return round(float(np.max(self.tuning.analysis_delay)) * NANOSECONDS)
 
-    def predicted(self, state: State, time_ns: int, elapsed: float) -> State:
-        """Return the state at a time without a measurement; arguments as in :meth:`observe`."""
-        now = replace(state, estimate=self.predict(state, time_ns, elapsed))
-        return self._remembering(now, state, time_ns, elapsed)
+    def predicted(self, state: State, time: StepTime) -> State:
+        """Return the state at a time without a measurement."""
+        return self._remembering(replace(state, estimate=self.predict(state, time)), state, time)
 
     def corrected(self, state: State, index: int, value: float, stamp_ns: int) -> State | None:
         """Return the state corrected by a late value of a state; None if it is too late."""
@@ -303,37 +298,37 @@ class StateEstimation:
         return None if history is None else replace(
             state, history=history, estimate=history.instants[-1].estimate)
 
-    def _lost(self, state: State, time_ns: int) -> bool:
+    def _lost(self, state: State, time: StepTime) -> bool:
         """Whether the state is unknown, because no measurement was accepted for too long."""
         if state.accepted is None:
             return False
-        seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS
+        seconds = (time.now_ns - state.accepted.time_ns) / NANOSECONDS
         # where measurements are always that rare, they are all there is
         return seconds * self.tuning.observer_bandwidth > _LOST and (
-            seconds > _GAP * state.interval)
+            seconds > _GAP * time.interval)
 
-    def predict(self, state: State, time_ns: int, elapsed: float) -> Estimate | None:
+    def predict(self, state: State, time: StepTime) -> Estimate | None:
         """
-        Predict the estimate up to a time without a measurement; arguments as in :meth:`observe`.
+        Predict the estimate up to a time without a measurement.
 
         Where the model does not reach that far, the state is as uncertain as at first, and the
         disturbance is kept.
         """
-        if state.estimate is None or state.command is None or not elapsed > 0.0:
+        if state.estimate is None or state.command is None or not time.elapsed > 0.0:
             return state.estimate
         estimator = self.level(state.supervisor).estimator
         try:
             predicted = estimator.predict_over(
-                state.estimate, self._pieces(state, time_ns, elapsed), self.feed_forward(state))
+                state.estimate, self._pieces(state, time), self.feed_forward(state))
         except np.linalg.LinAlgError:
             predicted = None  # so far out that the model gives no rate
         return predicted if predicted is not None and predicted.finite else replace(
             state.estimate, covariance=None)
 
-    def _pieces(self, state: State, time_ns: int, elapsed: float) -> Iterator[tuple[float, Array]]:
+    def _pieces(self, state: State, time: StepTime) -> Iterator[tuple[float, Array]]:
         """Yield the inputs that acted since the last measurement, with the time of each in s."""
         for seconds, u in state.applied.pieces(
-                time_ns - round(elapsed * NANOSECONDS), time_ns, self.dead_ns):
+                time.now_ns - round(time.elapsed * NANOSECONDS), time.now_ns, self.dead_ns):
             yield seconds, self.model.inputs.to_deviation(u)
 
     def transfer_estimate(self, estimate: Estimate, before: FallbackLevel,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import itertools
 import math
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,9 @@ from koopman_ros.control.laws.base import (
     Target,
 )
 from koopman_ros.control.steady_state import partial_target, reachable_target
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import all_finite, Array
 from koopman_ros.core.plugins import contained, plug_in
-from koopman_ros.core.signals import Outputs
+from koopman_ros.core.signals import numbers, Outputs
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS, PendingInputs
@@ -221,18 +222,18 @@ class FallbackLevel:
     def _checked(self, result: Any) -> LawResult:
         """Return a law's result within the range if its input, or its failure, can be used."""
         for value, kind in ((result, LawResult), (result.info, SolutionInfo),
-                            (result.plan, Plan | None), (result.failure, Reason | None)):
+                            (result.plan, (Plan, NoneType)), (result.failure, (Reason, NoneType))):
             if not isinstance(value, kind):
                 raise TypeError(f'it returned {type(value).__name__}, where {kind} is expected')
         if result.failure is not None:
             return replace(result, u=None)
-        u = np.asarray(result.u, dtype=np.float64)
-        if u.shape != (self.model.n_u,):
-            raise ValueError(f'it returned an input of shape {u.shape}, not ({self.model.n_u},)')
-        if not np.isfinite(u).all():
+        u = numbers('input of the law', result.u, self.model.inputs.names)
+        if not all_finite(u):
             return LawResult(None, reason(StatusCode.COMMAND_NOT_FINITE), result.info)
         within = self.limits.within(u)
-        return replace(result, u=within, clipped=bool(result.clipped or (within != u).any()))
+        clipped = result.clipped or within.tolist() != u.tolist()
+        return LawResult(within, None, result.info, result.memory, result.plan, clipped,
+                         result.passing)
 
     def _within_reach(self, target: Target, w: Array) -> Target:
         """Return the target, or the nearest one where the inputs do not suffice."""

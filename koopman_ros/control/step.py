@@ -38,7 +38,7 @@ from koopman_ros.control.state import (
 )
 from koopman_ros.control.supervisor import HOLD, LevelRequest, MANUAL, SAFE, Supervisor
 from koopman_ros.control.timing import afresh, StepTime, time_of_measurement, time_of_silence
-from koopman_ros.core.arrays import Array, read_only
+from koopman_ros.core.arrays import all_finite, Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode
@@ -91,12 +91,12 @@ class ControlStep(Configuration):
         back = ahead < 0
         if back:
             state = afresh(state, ahead)
-        state, time, missed = time_of_measurement(state, time_ns, countable)
+        time, missed = time_of_measurement(state, time_ns, countable)
 
         def calculate() -> tuple[State, Array, StepReport]:
             known, follows = self.estimation.applied(state, applied)
             known = self.estimation.disturbed(known, disturbances, ages, time_ns)
-            now, seen = self.estimation.observe(known, y, time_ns, time.elapsed, quality)
+            now, seen = self.estimation.observe(known, y, time, quality)
             accepted = seen.verdict.fault is None
             if accepted:
                 now = self._advanced(now, seen.x, time)
@@ -128,7 +128,7 @@ class ControlStep(Configuration):
         time = time_of_silence(state, time_ns)
 
         def calculate() -> tuple[State, Array, StepReport]:
-            now = self.estimation.predicted(state, time.now_ns, time.elapsed)
+            now = self.estimation.predicted(state, time)
             if cause is not None or state.mode is Mode.MANUAL:
                 fault = None if cause is None else reason(cause)
                 return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
@@ -159,7 +159,7 @@ class ControlStep(Configuration):
             # a measurement of 1e300 may overflow on its way; the result is checked and limited
             with np.errstate(all='ignore'):
                 state, command, report = calculate()
-            if not np.isfinite(command).all():
+            if not all_finite(command):
                 raise FloatingPointError(f'the command would be {command.tolist()}')
             if state.estimate is not None:
                 state.estimate.check(self.model.n_x)
@@ -206,7 +206,8 @@ class ControlStep(Configuration):
         done = replace(done, at_range=done.at_range or at_range, at_rate=at_rate,
                        outside=self.model.inputs.violation(u))
         applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)
-        state = replace(state, **changes, command=u, commanded_ns=time.command_ns, applied=applied)
+        state = replace(state, **changes, command=u, commanded_ns=time.command_ns,
+                        applied=applied, interval=time.interval)
         return state, u, self._report(state, why, measured, target, done)
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime
@@ -293,7 +294,7 @@ class ControlStep(Configuration):
         """Return how far a measurement is from the training data; NaN when it is none."""
         try:
             return self.model.distance(
-                self.estimation.position(known, y)) if np.isfinite(y).all() else np.nan
+                self.estimation.position(known, y)) if all_finite(y) else np.nan
         except np.linalg.LinAlgError:
             return np.nan
 

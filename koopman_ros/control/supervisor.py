@@ -107,10 +107,12 @@ class Supervisor:
 
         :param ranges: (name, lower, upper) of the trained range, for the reason.
         """
+        if not outside > 0.0:
+            return LevelRequest(order.laws[0])
         for law, margin in reversed(tuple(zip(order.laws, order.margins, strict=True))):
             below = order.below(law) if law != order.laws[-1] else SAFE
             entered = order.depth(self.settled) >= order.depth(below)
-            if outside > 0.0 and outside > (_HYSTERESIS * margin if entered else margin):
+            if outside > (_HYSTERESIS * margin if entered else margin):
                 return LevelRequest(below, reason(
                     StatusCode.OUTSIDE_TRAINING, ranges=ranges, margin=margin, level=law))
         return LevelRequest(order.laws[0])

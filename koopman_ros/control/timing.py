@@ -26,7 +26,8 @@ class StepTime:
     command_ns: int  #: of the command
     elapsed: float  #: seconds since the last command
     counted: float  #: of these, seconds that count for ramp and rate limit
-    spacing: float = 0.0  #: seconds between samples; 0 when they are not known
+    spacing: float  #: seconds between samples; 0 when they are not known
+    interval: float  #: usual seconds between measurements; infinity before the second
 
 
 def usual_interval(state: State) -> float:
@@ -50,8 +51,8 @@ def afresh(state: State, by_ns: int) -> State:
 
 
 def time_of_measurement(state: State, time_ns: int, countable: float | None
-                         ) -> tuple[State, StepTime, int]:
-    """Return the state with its usual interval, the times of the step, and the missed time."""
+                        ) -> tuple[StepTime, int]:
+    """Return the times of the step, and how many measurements were missed."""
     since_ns = state.commanded_ns
     ahead_of_stamps = since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS
     if ahead_of_stamps:
@@ -60,7 +61,7 @@ def time_of_measurement(state: State, time_ns: int, countable: float | None
     elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
     # neither a gap nor a burst is the spacing of the samples, nor the first of them
     spacing = min(usual_interval(state), elapsed)
-    counted, missed = 0.0, 0
+    counted, missed, interval = 0.0, 0, state.interval
     if state.time_ns is not None and elapsed > 0.0:
         since_ns = state.time_ns
         if state.former_ns is not None and since_ns < state.former_ns < time_ns:
@@ -72,14 +73,14 @@ def time_of_measurement(state: State, time_ns: int, countable: float | None
         # the plant stood under the old command all through a gap
         seconds = min(since, 2.0 * state.interval)
         # a burst of measurements does not make the next regular one a gap
-        state = replace(state, interval=max(seconds, 0.5 * usual_interval(state)))
+        interval = max(seconds, 0.5 * usual_interval(state))
         counted = min(seconds, elapsed)
     if ahead_of_stamps and state.supervisor.level != HOLD:
         # the command has moved in that time already
         counted = 0.0
     if countable is not None:
         counted = min(counted, countable)
-    return state, StepTime(time_ns, time_ns, elapsed, counted, spacing), missed
+    return StepTime(time_ns, time_ns, elapsed, counted, spacing, interval), missed
 
 
 def time_of_silence(state: State, time_ns: int) -> StepTime:
@@ -88,4 +89,4 @@ def time_of_silence(state: State, time_ns: int) -> StepTime:
     elapsed, spacing = max(0.0, (time_ns - since_ns) / NANOSECONDS), usual_interval(state)
     # the command stood still all through a longer silence
     counted = min(elapsed, max(_LONGEST_WATCH, 2.0 * spacing))
-    return StepTime(time_ns, max(time_ns, since_ns), elapsed, counted, spacing)
+    return StepTime(time_ns, max(time_ns, since_ns), elapsed, counted, spacing, state.interval)

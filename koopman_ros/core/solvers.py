@@ -59,8 +59,6 @@ class RiccatiSolution:
     status: RiccatiStatus  #: whether K may be used
 
 
-# values so large that something overflows end in a residual or a gain that is refused
-@np.errstate(all='ignore')
 def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0.0,
                   max_residual: float = 1e-8, max_gain: float = 1e6) -> RiccatiSolution:
     """
@@ -86,9 +84,11 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     try:
         if not Q.any():
             raise np.linalg.LinAlgError('no state is weighted')
-        P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
-            A, B, Q, R)
-        gain = float(np.linalg.norm(K, 2)) if min(K.shape) > 1 else _size(K)
+        # values so large that something overflows end in a residual or a gain that is refused
+        with np.errstate(all='ignore'):
+            P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
+                A, B, Q, R)
+            gain = float(np.linalg.norm(K, 2)) if min(K.shape) > 1 else _size(K)
     except (ArithmeticError, ValueError):
         # a singular matrix, no stable subspace, or numbers that are not finite
         return RiccatiSolution(np.zeros_like(A), np.zeros_like(B.T), math.inf, math.inf,
@@ -184,7 +184,8 @@ def transition(A: Array, interval: float) -> Array:
     D, doublings = _part(A, interval, _size(A) * interval)
     for _ in range(doublings):
         D = 2.0 * D + D.dot(D)
-    return D + np.eye(len(A))
+    D.flat[::len(A) + 1] += 1.0
+    return D
 
 
 def _part(M: Array, interval: float, size: float) -> tuple[Array, int]:
@@ -201,10 +202,12 @@ def _part(M: Array, interval: float, size: float) -> tuple[Array, int]:
 
 
 def spectral_radius(M: Array) -> float:
-    """Return the largest size of an eigenvalue of a finite matrix (n, n)."""
+    """Return the largest size of an eigenvalue of a matrix (n, n); infinity if not finite."""
+    if not math.isfinite(_size(M)):
+        return math.inf
     # of so few numbers in a quarter of the time of numpy.linalg.eigvals
     real, imaginary, *_ = dgeev(M, compute_vl=0, compute_vr=0)
-    return float(np.hypot(real, imaginary).max())
+    return max(map(math.hypot, real.tolist(), imaginary.tolist()))
 
 
 def _solved(M: Array, right: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import all_finite, Array
 from koopman_ros.core.declaration import NoParameters
 from koopman_ros.core.signals import Outputs
 from koopman_ros.model import LiftedModel
@@ -76,8 +76,8 @@ class Estimate:
     @property
     def finite(self) -> bool:
         """Whether state, disturbance and covariance are finite numbers."""
-        return bool(np.isfinite(self.x).all() and np.isfinite(self.w).all() and (
-            self.covariance is None or np.isfinite(self.covariance).all()))
+        return all_finite(self.x) and all_finite(self.w) and (
+            self.covariance is None or bool(np.isfinite(self.covariance).all()))
 
     def under(self, rate: Array | None) -> Estimate:
         """Return the estimate under a further disturbance (n_x,), or None for none."""

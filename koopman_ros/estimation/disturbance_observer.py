@@ -31,9 +31,8 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
     # far out the model's drift grows without bound, and corrections could not bring x back
-    if not (np.abs(x) <= LOST * model.states.half_widths).all():
-        return None
-    return Estimate(x, estimate.w)
+    lost = not (np.abs(x) <= LOST * model.states.half_widths).all()
+    return None if lost else Estimate(x, estimate.w)
 
 
 class DisturbanceObserver(Estimator):
@@ -53,8 +52,8 @@ class DisturbanceObserver(Estimator):
     def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
                  ) -> None:
         super().__init__(model, outputs, tuning, parameters)
-        #: (n_x,) whether a state is measured, and has a disturbance
-        self._measured = np.any(outputs.C != 0.0, axis=0)
+        #: the states that are not measured
+        self._undisturbed = np.flatnonzero(~outputs.C.any(axis=0))
         if not outputs.determine(model.lagged.values()):
             raise ValueError(f'{", ".join(outputs.names)} are measured, which does not determine '
                              f'all {model.n_x} states: measure as many, or set estimator to a '
@@ -82,7 +81,10 @@ class DisturbanceObserver(Estimator):
 
     def bounded(self, w: Array) -> Array:
         """Return the part of a disturbance that acts on measured states, within the bound."""
-        return super().bounded(np.where(self._measured, w, 0.0))
+        if len(self._undisturbed):
+            w = w.copy()
+            w[self._undisturbed] = 0.0
+        return super().bounded(w)
 
 
 class MeasuredState(DisturbanceObserver):

@@ -63,12 +63,12 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
                          StatusCode.OUTSIDE_SENSOR)
     if fault is not None:
         return Verdict(last, fault)
-    changed = Standstill((time_ns,) * len(y), np.zeros(len(y)), w)
+    changed = Accepted(y, time_ns, Standstill((time_ns,) * len(y), np.zeros(len(y)), w))
     if last is None:
-        return Verdict(Accepted(y, time_ns, changed))
+        return Verdict(changed)
     seconds = (time_ns - last.time_ns) / NANOSECONDS
     change = np.abs(y - last.value)
-    excess = change / (limits.jump + limits.unreported + limits.rate * seconds)
+    excess = change / (limits.at_rest + limits.rate * seconds)
     i = int(excess.argmax())
     if excess[i] > 1.0:
         return Verdict(replace(last, jumped=True), reason(
@@ -76,10 +76,10 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
             value=float(y[i]),
             seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
     # back after a jump, and further than noise brings it
-    moved = last.jumped and bool(np.any(change > limits.jump + limits.unreported))
+    moved = last.jumped and bool(np.any(change > limits.at_rest))
     still = change == 0.0
     if not still.any():
-        return Verdict(Accepted(y, time_ns, changed), moved=moved)
+        return Verdict(changed, moved=moved)
     before = last.standstill
     stuck = Standstill(
         tuple(since if same else time_ns

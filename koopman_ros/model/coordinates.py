@@ -150,15 +150,19 @@ class Coordinates:
         :return: largest excess over a side of the box in half its width; 0 inside, infinity for a
             value that is not finite.
         """
-        if not np.isfinite(value).all():
-            return math.inf
         excess = np.maximum(self.lower - value, value - self.upper)
-        return float((2.0 * excess / (self.upper - self.lower)).max(initial=0.0))
+        largest = float((excess / self._half_ranges).max(initial=0.0))
+        return math.inf if math.isnan(largest) else largest
+
+    @cached_property
+    def _half_ranges(self) -> Array:
+        """Half the width (n,) of the training box, in units."""
+        return 0.5 * (self.upper - self.lower)
 
     @cached_property
     def half_widths(self) -> Array:
         """Half the width (n,) of the training box, in scaled deviations."""
-        return frozen(0.5 * (self.upper - self.lower) / self.scale, 'half-ranges', (len(self),))
+        return frozen(self._half_ranges / self.scale, 'half-ranges', (len(self),))
 
     @cached_property
     def corners(self) -> Array:

@@ -442,6 +442,9 @@ class LiftedModel:
         :param u: (..., n_u) scaled deviations.
         :param w: (..., n_x) disturbance.
         """
+        if self.input_terms is None:
+            constant = u @ self.B.T + w
+            return lambda x: self.drift(x) + constant
         return lambda x: self.drift(x) + self.forcing(x, u) + w
 
     @cached_property
@@ -478,7 +481,7 @@ class LiftedModel:
         outside = np.maximum(np.maximum(lower - x, x - upper) / half, 0.0).max(axis=1)
         if self.training_states is not None:
             outside = np.maximum(outside, self.training_states.distance(x, half))
-        return np.where(np.isfinite(x).all(axis=1), outside, np.inf)
+        return np.where(np.isnan(outside), np.inf, outside)
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z); ValueError for another size."""
@@ -509,6 +512,7 @@ class LiftedModel:
 
     def drift(self, x: Array) -> Array:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
+        x = self.states.array('state', x)
         if self._weights is not None:
             return self.observables.features.lift(x) @ self._weights.T
         z, J = self.observables.lift_and_jacobian(x)

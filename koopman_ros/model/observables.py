@@ -158,16 +158,17 @@ class NetworkObservables(Observables):
 
     def _bent(self, slope: Array) -> Array:
         """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""
-        found: Array = (self._below * slope[..., None, :]) @ self.W
-        return found
+        return (slope @ self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
 
     @cached_property
     def _of_states(self) -> Array:
         return np.eye(self.n_z, self.n_x) if self.identity else np.zeros((self.n_z, self.n_x))
 
     @cached_property
-    def _below(self) -> Array:
-        return np.concatenate((np.zeros((self.n_z - len(self.V), len(self.W))), self.V))
+    def _products(self) -> Array:
+        """V_ik W_kj (h, n_z n_x), 0 in the rows of the states."""
+        V = np.concatenate((np.zeros((self.n_z - len(self.V), len(self.W))), self.V))
+        return (V.T[:, :, None] * self.W[:, None, :]).reshape(len(self.W), self.n_z * self.n_x)
 
 
 @final

@@ -6,7 +6,6 @@
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
-import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -76,8 +75,7 @@ class Feedback:
         held = np.zeros((2 * n, 2 * n))
         held[:n, :n], held[:n, n:] = self.drift, self.action
         step = transition(held, interval)[:n]
-        closed = step[:, :n] + step[:, n:]
-        return spectral_radius(closed) if np.isfinite(closed).all() else math.inf
+        return spectral_radius(step[:, :n] + step[:, n:])
 
 
 def closed(model: LiftedModel) -> bool:
@@ -85,8 +83,8 @@ def closed(model: LiftedModel) -> bool:
     return model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes
 
 
-def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-             interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
+def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, **how: float
+             ) -> Feedback:
     """
     Evaluate the law that suits the model.
 
@@ -96,15 +94,9 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     lift, is a poor factorisation of the drift away from its nominal point.
 
     :param x: (n_x,) scaled deviation of the measured state.
-    :param interval: for which the input will be held, in the model's time unit: the gain is that
-        of the sampled regulator, and with 0 that of the continuous one.
-    :param max_gain: bound on the spectral norm of K.
-    :param max_residual: bound on the relative Riccati residual.
-    :raises ValueError: for weights or a state of another size than the model's.
+    :param how: `interval` for which the input will be held, in the model's time unit, `max_gain`
+        and `max_residual`; see :func:`solve_riccati`.
     """
-    weights.check(model)
-    x = model.states.array('state', x)
-    how = {'interval': interval, 'max_gain': max_gain, 'max_residual': max_residual}
     if closed(model):
         result = recentred(model, x, target, weights, **how)
         if result.solved:
@@ -112,8 +104,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     return averaged(model, x, target, weights, **how)
 
 
-def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-              interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8
+def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, **how: float
               ) -> Feedback:
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
@@ -128,8 +119,8 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     Arguments and result as in :func:`feedback`; of use where the input moves every mode of A that
     does not decay.
     """
-    n_x, n_z, B, D = model.n_x, model.n_z, model.input_matrix(x), _input_secant(model, x, target)
-    forcing = target.forcing
+    n_x, n_z, forcing = model.n_x, model.n_z, target.forcing
+    B, D = model.input_matrix(x), _input_secant(model, x, target)
     if model.pre_feedback is not None:
         forcing = forcing - model.pre_feedback_rate(target.x)
     J, M, H = model.observables.secants(x, target.x, forcing)
@@ -145,17 +136,16 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     else:
         C = np.linalg.pinv(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
-    riccati = solve_riccati(A, J.dot(B), Q, weights.R, interval=interval,
-                            max_gain=max_gain, max_residual=max_residual)
-    drift = (model.onto_states(J).dot(model.A.dot(M) + H) if model.readout is None
+    riccati = solve_riccati(A, J.dot(B), Q, weights.R, **how)
+    drift = (model.onto_states(J).dot(A.dot(M)) if model.readout is None
              else _averaged_jacobian(model, x, target, D))
     # N(x) - N(x_ref) = M e
     K = riccati.K.dot(M)
     return Feedback(target.u - K.dot(x - target.x), Form.RECENTRED, riccati, drift, -B.dot(K))
 
 
-def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-             interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
+def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, **how: float
+             ) -> Feedback:
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 
@@ -168,8 +158,7 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     A = _averaged_jacobian(model, x, target, _input_secant(model, x, target))
     B = model.input_matrix(x)
-    riccati = solve_riccati(A, B, weights.Q, weights.R, interval=interval,
-                            max_gain=max_gain, max_residual=max_residual)
+    riccati = solve_riccati(A, B, weights.Q, weights.R, **how)
     return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
                     A, -B @ riccati.K)
 
