@@ -68,7 +68,7 @@ def add_networks(choice: Choice, shared: Shared, items: Mapping[str, tuple[int, 
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
             fitted = [found for _, found in results if found is not None]
         best = min(fitted, key=lambda one: one.cost, default=None)
-        choice.gains(None if best is None else shared.candidate(best))
+        choice.gains(None if best is None else shared.candidate(best), f'network of {units} units')
 
 
 def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[NetworkDrift] | None:

@@ -53,8 +53,10 @@ def _truncated(A: Array, B: Array, C: Array, n_x: int) -> tuple[Array, Array, Ar
     """Return the states that inputs move and outputs show most."""
     if len(A) == n_x:
         return A, B, C
+    # by Schur forms: the equations of all entries are singular to rounding where modes are slow
     left, right = (np.linalg.cholesky(W + _SLIGHT * np.trace(W) * np.eye(len(W))) for W in (
-        solve_discrete_lyapunov(A, B @ B.T), solve_discrete_lyapunov(A.T, C.T @ C)))
+        solve_discrete_lyapunov(F, Q, method='bilinear')
+        for F, Q in ((A, B @ B.T), (A.T, C.T @ C))))
     U, sizes, V = np.linalg.svd(right.T @ left)
     root = np.sqrt(sizes[:n_x])
     out, back = left @ V[:n_x].T / root, (U[:, :n_x] / root).T @ right.T

@@ -97,9 +97,14 @@ class Choice:
         self.candidates: list[StructureCandidate] = []
         self.steps = [*steps]
 
-    def gains(self, one: StructureCandidate | None) -> bool:
-        """Add a candidate; return whether it errs less than those before, not by chance."""
+    def gains(self, one: StructureCandidate | None, name: str = '') -> bool:
+        """
+        Add a candidate; return whether it errs less than those before, not by chance.
+
+        :param name: of one that would have been added, but diverges.
+        """
         if one is None:
+            self.steps += [f'{name}: diverges'] * bool(name)
             return False
         before = self.candidates
         self.candidates = [*before, one]

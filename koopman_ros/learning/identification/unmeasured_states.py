@@ -71,7 +71,7 @@ from koopman_ros.model import Coordinates
 
 HIGHEST_DEGREE = 3
 MOST_UNMEASURED = 3  # states that are tried where their number is not given
-BUDGET = 600.0  # s of processor time of a search
+BUDGET = 300.0  # s of processor time of a search
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 
@@ -202,11 +202,12 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
 
     first, linear, n_y = PolynomialSearch(record), None, len(plant.state_names)
     for count in range(least, hidden + 1):
-        monitor = stage(f'drift of degree 1 with {not_measured(count)}')
+        name = f'drift of degree 1 with {not_measured(count)}'
+        monitor = stage(name)
         if linear is not None and monitor():
             break
         found = first.linear(count, monitor)
-        if found is not None and choice.gains(found):
+        if choice.gains(found, name):
             linear = found
         elif found is not None:
             break
@@ -231,13 +232,14 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         more = PolynomialSearch(
             SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True), first.samples,
             offsets=True)
-        if choice.gains(more.simulated(more.extended(linear), linear.hidden, monitor)):
+        if choice.gains(more.simulated(more.extended(linear), linear.hidden, monitor),
+                        'constant offset of each episode'):
             search, linear = more, choice.candidates[-1]
     kept = None
     if measured is not None and isinstance(measured.drift, DriftModel):
         kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))), 0,
                                 stage(measured.drift.form))
-        choice.gains(kept)
+        choice.gains(kept, measured.drift.form)
     count = linear.hidden
     monitor = stage(f'filter with {not_measured(count)}')
     last = begin = search.from_filters(count, monitor)
@@ -245,10 +247,11 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     for degree in usual_degrees(n_y + count)[1:highest_degree] if count or not measured else ():
         if last is None or choice.explained(explained):
             break
-        monitor = stage(f'drift of degree {degree} with {not_measured(count)}')
+        name = f'drift of degree {degree} with {not_measured(count)}'
+        monitor = stage(name)
         if not monitor():
             last = search.filtered(raised(last), monitor)
-            choice.gains(None if last is None else search.simulated(last, count, monitor))
+            choice.gains(None if last is None else search.simulated(last, count, monitor), name)
     if not choice.explained(explained):
         # in coordinates of a filter, whose hidden states have the range of those in the record
         base = None if begin is None else search.simulated(begin, count, monitor)

@@ -19,6 +19,7 @@ from koopman_ros.learning.identification import (
     Stopped,
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
+from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
 
 PLANT = PlantDescription('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
                          np.zeros(1), None)
@@ -99,6 +100,15 @@ def test_the_best_so_far_is_taken_when_the_time_is_over():
     found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
     assert found.hidden == 1
     assert any('stopped after 0 s: drift of degree 1 with 2' in step for step in found.steps)
+
+
+def test_an_order_whose_simulations_diverge_is_said(monkeypatch):
+    linear = PolynomialSearch.linear
+    monkeypatch.setattr(PolynomialSearch, 'linear', lambda self, hidden, monitor: (
+        None if hidden == 1 else linear(self, hidden, monitor)))
+    found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
+    assert found.hidden == 2
+    assert 'drift of degree 1 with 1 state not measured: diverges' in found.steps
 
 
 def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
