@@ -80,6 +80,8 @@ def command_parser() -> argparse.ArgumentParser:
         help='inputs that are linear from row to row; others are held')
     add('--lag', nargs='+', default=(), metavar='INPUT=S', help='time constants with which inputs '
         'follow their commands, in s; -1: found from a record of all states')
+    add('--as-state', nargs='+', default=(), metavar='INPUT', help='inputs that do not act '
+        'linearly: their commands are states of the model, whose rates the laws set')
     add('--test', nargs='+', default=(), metavar='FILE', help='record of the same signals to test '
         'the model on; it takes no part in the training')
     options = parser.add_argument_group('training, by the parameters of the trainer node')
@@ -159,7 +161,8 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
                      for name, unit in signals.states.items()),
         inputs=tuple(RecordedInput(name, unit, place(name, name, unit))
                      for name, unit in acting.items()),
-        **{**settings.training(signals), 'lag': _lags(options['lag'])})
+        **{**settings.training(signals), 'lag': _lags(options['lag']),
+           'as_state': tuple(options['as_state'])})
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
 
     def on_progress(share: float, text: str) -> bool:

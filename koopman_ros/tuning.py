@@ -212,12 +212,12 @@ class Tuning:
         :raises ValueError: naming the mismatch.
         """
         states, inputs = model.states.names, model.inputs.names
-        controlled = tuple(filter(None, self.controlled)) or tuple(
-            name for i, name in enumerate(states) if i not in model.lagged.values())
+        every = tuple(name for i, name in enumerate(states) if i not in model.lagged.values())
+        controlled = tuple(filter(None, self.controlled)) or every
         if list(controlled) != [name for name in states if name in controlled]:
             raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
                              f'once and in this order, got {", ".join(controlled)}')
-        if len(inputs) < len(controlled) < len(states):
+        if len(inputs) < len(controlled) and controlled not in (states, every):
             raise ValueError(f'{len(inputs)} inputs cannot control {len(controlled)} signals '
                              f'({", ".join(controlled)}): list at most {len(inputs)} in '
                              'controlled, or leave it empty for a compromise between all states')
@@ -226,7 +226,7 @@ class Tuning:
         made = for_signals(replace(self, controlled=controlled), signals)
         tolerance = made.tracking_tolerance.copy()
         # the applied input is a state of the model there
-        tolerance[list(model.lagged)] = UNBOUNDED
+        tolerance[[j for j in model.lagged if j not in model.commanded]] = UNBOUNDED
         made = replace(made, tracking_tolerance=tolerance, plugins={
             name: for_signals(own, signals) for name, own in self.plugins.items()})
         if not np.any(made.state_weight > 0.0):

@@ -31,6 +31,7 @@ from koopman_ros.estimation import (
     PendingInputs,
     Standstill,
     Verdict,
+    with_applied,
 )
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -251,10 +252,8 @@ class StateEstimation:
         """Return the first estimate, at a state (n_x,) that (n_u,) inputs are taken to hold."""
         estimator, model = self.level(state.supervisor).estimator, self.model
         if u is not None and model.lagged:
-            xi, applied = xi.copy(), model.inputs.to_physical(u)
-            for j, i in model.lagged.items():
-                if not self.outputs.C[:, i].any():
-                    xi[i] = (applied[j] - model.states.center[i]) / model.states.scale[i]
+            xi = with_applied(model, xi, u, {
+                j: i for j, i in model.lagged.items() if not self.outputs.C[:, i].any()})
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:
             return started

@@ -56,6 +56,8 @@ class FallbackLevel:
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
+    #: whether it moves commands that are states of the model by itself, instead of the plant
+    integrates: bool = False
 
     @property
     def model(self) -> LiftedModel:
@@ -146,7 +148,7 @@ class FallbackLevel:
             if pending is not None and any(pending.dead_ns) and pending.applied.values:
                 return target, self._ahead(estimate, target, memory, interval, previous, pending)
             return target, self._checked(
-                self.law.compute(estimate, target, memory, interval, previous))
+                self.law.compute(estimate, target, memory, interval, previous), estimate, interval)
         except _NotPredictedError as error:
             return target, LawResult(None, reason(
                 StatusCode.NOT_PREDICTED, seconds=error.args[0]))
@@ -172,7 +174,7 @@ class FallbackLevel:
             estimate, target, memory, interval, previous, LaterInputs(
                 (dead_ns - shortest) / NANOSECONDS, pending.between(shortest, longest)))
         first = result = self._checked(planned or self.law.compute(
-            estimate, target, memory, interval, previous))
+            estimate, target, memory, interval, previous), estimate, interval)
         if first.plan is not None:
             first = replace(first, plan=replace(
                 first.plan, times=first.plan.times + shortest / NANOSECONDS))
@@ -190,8 +192,8 @@ class FallbackLevel:
                 (seconds, np.where(acts, held, known))
                 for seconds, known in pending.between(begin, end)])
             seconds = (end - begin) / NANOSECONDS
-            result = self._checked(
-                self.law.compute(estimate, target, result.memory, seconds, held))
+            result = self._checked(self.law.compute(
+                estimate, target, result.memory, seconds, held), estimate, seconds)
             if result.u is None:
                 return result
             held = limit(self.limits, result.u, held, seconds)[0]
@@ -211,7 +213,7 @@ class FallbackLevel:
             count = max(1, math.ceil(gathered / (_MOST_STEPS * step)))
             v = model.inputs.to_deviation(impulse / gathered)
             for _ in range(count):
-                found = self.estimator.predict(estimate, v, gathered / count)
+                found = self.estimator.advance(estimate, v, gathered / count)
                 ahead += gathered / count
                 if found is None or not found.finite:
                     raise _NotPredictedError(ahead)
@@ -219,7 +221,7 @@ class FallbackLevel:
             gathered, impulse = 0.0, np.zeros(model.n_u)
         return estimate
 
-    def _checked(self, result: Any) -> LawResult:
+    def _checked(self, result: Any, estimate: Estimate, seconds: float) -> LawResult:
         """Return a law's result within the range if its input, or its failure, can be used."""
         for value, kind in ((result, LawResult), (result.info, SolutionInfo),
                             (result.plan, (Plan, NoneType)), (result.failure, (Reason, NoneType))):
@@ -230,10 +232,19 @@ class FallbackLevel:
         u = numbers('input of the law', result.u, self.model.inputs.names)
         if not all_finite(u):
             return LawResult(None, reason(StatusCode.COMMAND_NOT_FINITE), result.info)
+        if self.integrates and self.model.commanded and not self.law.model_free:
+            u = self._moved(u, estimate, seconds)
         within = self.limits.within(u)
         clipped = result.clipped or within.tolist() != u.tolist()
         return LawResult(within, None, result.info, result.memory, result.plan, clipped,
                          result.passing)
+
+    def _moved(self, u: Array, estimate: Estimate, seconds: float) -> Array:
+        """Return the commands after so long, of which a law sets the rates (u - command) / lag."""
+        u, now = u.copy(), self.model.states.to_physical(estimate.x)
+        for j, i in self.model.commanded.items():
+            u[j] = now[i] - math.expm1(-seconds / self.model.lag[j]) * (u[j] - now[i])
+        return u
 
     def _within_reach(self, target: Target, w: Array) -> Target:
         """Return the target, or the nearest one where the inputs do not suffice."""
@@ -263,5 +274,5 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
     for law_name in tuning.fallback_order:
         law = plug_in(law_name, 'law', LAWS, Law, model, tuning)
         estimator = plug_in(name, 'estimator', ESTIMATORS, Estimator, law.model, outputs, tuning)
-        levels[law_name] = FallbackLevel(law_name, law, estimator, tuning.controlled)
+        levels[law_name] = FallbackLevel(law_name, law, estimator, tuning.controlled, True)
     return levels

@@ -89,7 +89,7 @@ class Feasibility:
     @property
     def _too_few_inputs(self) -> bool:
         """Whether the controlled states outnumber the inputs."""
-        return self.level.controls_all and self.level.model.n_u < self.level.model.n_x
+        return len(self.level.controlled) > self.level.model.n_u
 
     def _on_the_way(self, goal: Array, others: Iterable[Array | None]) -> Array | None:
         """Return the last set-point that is held on the way to a goal, None where none is."""

@@ -25,7 +25,7 @@ _REACH = 1e3
 
 
 def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.bool_],
-                anchor: Array, reach: Array) -> Array | None:
+                anchor: Array, reach: Array, *, compromise: bool = False) -> Array | None:
     """
     Solve f(x) + B(x) u + w = 0 for some of y = (x, u) by Gauss-Newton steps.
 
@@ -37,6 +37,7 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
     :param free: (n_x + n_u,) whether a component is solved for.
     :param anchor: (n_x + n_u,) scaled deviations.
     :param reach: (n_x + n_u,) units in which the distance from it is measured.
+    :param compromise: whether the least rate is wanted, where too few components are free.
     :return: (n_x + n_u,), or None where no solution was found.
     """
     n, y = model.n_x, start
@@ -55,8 +56,9 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
             y = y.copy()
             y[free] += step * min(1.0, _LONGEST_STEP / length) if length > 0.0 else step
             rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
-            if np.linalg.norm(rate) <= _RESOLUTION * np.linalg.norm(J) and (
-                    length <= _STILL or not settles):
+            if length <= _STILL if compromise else (
+                    np.linalg.norm(rate) <= _RESOLUTION * np.linalg.norm(J) and (
+                        length <= _STILL or not settles)):
                 return y
     except np.linalg.LinAlgError:
         # a model that gives no numbers
@@ -70,9 +72,10 @@ def partial_target(model: LiftedModel, controlled: NDArray[np.intp], setpoint: A
     Find the steady state that holds some of the states at a set-point.
 
     Where there are inputs to spare it is the one nearest to the nominal point that keeps their
-    range, if there is one; else the range does not count.
+    range, if there is one; else the range does not count. Of more states than inputs it has the
+    least rate.
 
-    :param controlled: (n_c,) indices of the states with a set-point, n_c at most n_u.
+    :param controlled: (n_c,) indices of the states with a set-point.
     :param setpoint: (n_c,) scaled deviations, as all that follows.
     :param w: (n_x,) disturbance of the state's rate.
     :param lower: (n_u,) range of the inputs, to `upper` (n_u,).
@@ -85,7 +88,8 @@ def partial_target(model: LiftedModel, controlled: NDArray[np.intp], setpoint: A
     free[controlled] = False
     y = start.copy()
     y[controlled] = setpoint
-    unlimited = found = equilibrium(model, w, y, free, anchor, reach)
+    unlimited = found = equilibrium(
+        model, w, y, free, anchor, reach, compromise=len(controlled) > model.n_u)
     while found is not None and np.count_nonzero(free) > n:
         excess = np.maximum(lower - found[n:], found[n:] - upper)
         worst = int(np.argmax(excess))

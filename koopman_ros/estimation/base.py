@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -97,6 +97,18 @@ class Estimate:
             raise ValueError('the estimate is not finite')
 
 
+def with_applied(model: LiftedModel, x: Array, u: Array, places: Mapping[int, int]) -> Array:
+    """
+    Return a state (n_x,) with some inputs (n_u,) as they act, all in scaled deviations.
+
+    :param places: of the states that these inputs are, by input.
+    """
+    x, applied = x.copy(), model.inputs.to_physical(u)
+    for j, i in places.items():
+        x[i] = (applied[j] - model.states.center[i]) / model.states.scale[i]
+    return x
+
+
 class Estimator(ABC):
     """
     From measurements to an estimate of state and disturbance; pure, without memory of its own.
@@ -148,6 +160,12 @@ class Estimator(ABC):
         :param u: (n_u,) input that is assumed to hold the plant there, or None.
         """
 
+    def advance(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Predict as :meth:`predict`; states that are commands are those of `u` at once."""
+        commanded = self.model.commanded
+        return self.predict(estimate if not commanded else replace(
+            estimate, x=with_applied(self.model, estimate.x, u, commanded)), u, seconds)
+
     def predict_over(self, estimate: Estimate, pieces: Iterable[tuple[float, Array]],
                      rate: Array | None) -> Estimate | None:
         """
@@ -160,7 +178,7 @@ class Estimator(ABC):
         begin = estimate.under(rate)
         now: Estimate | None = begin
         for seconds, u in pieces:
-            now = now and self.predict(now, u, seconds)
+            now = now and self.advance(now, u, seconds)
         return now if now is None or rate is None else replace(
             now, w=estimate.w + (now.w - begin.w))
 

@@ -126,6 +126,9 @@ def _fields(controller: Controller, code: str) -> dict[str, Any]:
     if not (controller.measured.determine_state or isinstance(estimator, ExtendedKalmanFilter)):
         raise ExportError('applied inputs that are not measured cannot be exported: measure them, '
                           'or set estimator to extended_kalman_filter')
+    if model.commanded:
+        raise ExportError('a command that is a state of the model cannot be exported: train a '
+                          'model without as_state')
     degree = max(getattr(model.observables, 'degree', 0), model.input_matrix_degree)
     if degree > _MAX_DEGREE:
         raise ExportError(f'a polynomial of degree {degree} cannot be exported: train a model of '

@@ -34,8 +34,8 @@ from koopman_ros.learning.identification import (
     longest_step,
     Stopped,
 )
-from koopman_ros.learning.identification.characteristics import NonAffineDrift
 from koopman_ros.learning.identification.drift import prediction_error, Segments
+from koopman_ros.learning.identification.input_functions import NonAffineDrift
 from koopman_ros.learning.lift.metrics import lifted_rate, LiftMetrics
 from koopman_ros.learning.lift.training import Trained
 from koopman_ros.learning.linearisation import (

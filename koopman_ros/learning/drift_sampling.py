@@ -64,7 +64,10 @@ def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> DriftSamples:
         raise ValueError('the estimated drift reproduces none of the episodes: record longer, '
                          'with steps of the input')
     path = segments.path(drift.rate, x0)[:-1]
-    inside = (segments.steps > 0.0) & followed
+    # not at the pulses that move a command which is a state
+    inputs = drift.box.inputs
+    usual = np.all((segments.u >= inputs.lower) & (segments.u <= inputs.upper), axis=2)
+    inside = (segments.steps > 0.0) & followed & usual
     # segment by segment, each in the order of its times
     x, u = (np.swapaxes(a, 0, 1)[inside.T] for a in (path, segments.u))
     kept = _spread(drift.box.states.to_deviation(x))

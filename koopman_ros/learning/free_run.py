@@ -24,7 +24,7 @@ from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.learning.lift.training import Trained
 from koopman_ros.learning.model_selection import ClassComparison
-from koopman_ros.model import Coordinates, LiftedModel
+from koopman_ros.model import COMMANDED, Coordinates, LiftedModel
 from koopman_ros.records import Record
 
 #: whatever has a drift
@@ -225,14 +225,31 @@ def _drift(model: AnyModel, plant: PlantDescription
         model = model.model
     if isinstance(model, LiftedModel):
         model = model.joined
-        return (lifted_rate(model, seconds), model.states, model.inputs,
+        return (*_of_record(lifted_rate(model, seconds), model.states, model.inputs),
                 model.dead_time / seconds)
     drift = model.drift if isinstance(model, Identified) else model
     factor = seconds / SECONDS_PER_TIME_UNIT[drift.box.time_unit]
     dead_time = model.dead_time if isinstance(model, Identified) else np.zeros(
         len(drift.box.inputs))
-    return (lambda x, u: factor * drift.rate(x, u), drift.box.states, drift.box.inputs,
-            dead_time / factor)
+    return (*_of_record(lambda x, u: factor * drift.rate(x, u), drift.box.states,
+                        drift.box.inputs), dead_time / factor)
+
+
+def _of_record(rate: Rate, states: Coordinates, inputs: Coordinates
+               ) -> tuple[Rate, Coordinates, Coordinates]:
+    """Return rate and states without those that are commands, and so inputs of a record."""
+    commands = {states.names.index(COMMANDED + name): j for j, name in enumerate(inputs.names)
+                if COMMANDED + name in states.names}
+    if not commands:
+        return rate, states, inputs
+    kept = [i for i in range(len(states)) if i not in commands]
+
+    def of_others(x: Array, u: Array) -> Array:
+        full = np.empty((*x.shape[:-1], len(states)))
+        full[..., kept], full[..., list(commands)] = x, u[..., list(commands.values())]
+        return rate(full, u)[..., kept]
+
+    return of_others, states.only([states.names[i] for i in kept]), inputs
 
 
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 import glob
 import hashlib
@@ -38,6 +38,7 @@ from koopman_ros.learning.identification import (
     find_lags,
     IdentificationMethod,
     Identified,
+    identify_non_affine,
     identify_structure,
     identify_unmeasured,
     identify_with_characteristics,
@@ -59,7 +60,7 @@ from koopman_ros.learning.record import (
     TrainingRecord,
 )
 from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
-from koopman_ros.model import LiftedModel, load, LONGEST_DEAD_TIME, save
+from koopman_ros.model import COMMANDED, LiftedModel, load, LONGEST_DEAD_TIME, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
 from koopman_ros.records import ImportReport, Record, RecordedInput, RecordedState
@@ -73,6 +74,8 @@ _STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
 # Shares of deciding in which the closed loops are run, and further ones, too.
 _JUDGED, _WRITING = 0.8, 0.9
 DRIFT, LINEAR_MODEL = 'estimated drift', 'best linear model'  #: compared with the new model
+# A command that is a state follows the input of the model with this lag, in samples of the record.
+_COMMAND_LAG = 1.0
 # % of the motion: errors on another day scatter by more than smaller differences say.
 _LESS_FIT = 1.0
 
@@ -120,8 +123,10 @@ class Retrained:
     def lag(self) -> Array:
         """Lags (n_u,) of the inputs, in s."""
         drift = self.found.drift
-        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * drift.lag if isinstance(
-            drift, LaggedDrift) else np.zeros(len(drift.box.inputs))
+        if not isinstance(drift, LaggedDrift):
+            return np.zeros(len(drift.box.inputs))
+        own = [COMMANDED + name not in drift.box.states.names for name in drift.box.inputs.names]
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * drift.lag * own
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""
@@ -172,7 +177,7 @@ class Retrained:
             'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
             'lag': dict(zip(inputs.names, self.lag.tolist(), strict=True)),
             'characteristics': {name: [one.values.tolist(), one.effects.tolist()]
-                                for name, one in inputs.characteristics.items()},
+                                for name, one in self.found.drift.characteristics.items()},
             'constants': {one.name: {
                 'value': one.value, 'standard_error': one.standard_error,
                 'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
@@ -266,21 +271,28 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
     _check_disturbances(plant, episodes)
-    lag = _given_lag(task, plant, episodes) / seconds
+    lag = known = _given_lag(task, plant, episodes) / seconds
     dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
     sought = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
-    if sought:
-        lag = find_lags(plant, _delayed(episodes, dead_time / seconds), lag, sought,
-                        watch=lambda: progress.estimating(0, 1, 'lag'))
-        dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
-    episodes = _behind(_delayed(episodes, dead_time / seconds), lag)
-    # behind a lag no characteristic is sought
-    found = _estimate(task, plant, episodes, methods, progress, backend,
-                      plant.input_names if lag.any() else tuple(task.characteristics))
+    commanded, fixed = episodes, frozenset(task.characteristics)
+    while True:
+        if sought:
+            lag = find_lags(plant, _delayed(commanded, dead_time / seconds), known, sought,
+                            watch=lambda: progress.estimating(0, 1, 'lag'))
+            dead_time = _dead_time(task, plant, _behind(commanded, lag), progress)
+        episodes = _behind(_delayed(commanded, dead_time / seconds), lag)
+        found = _estimate(task, plant, episodes, methods, progress, backend, fixed)
+        if not sought or found.drift.characteristics.keys() <= fixed:
+            break
+        # with the characteristics the lags are found better
+        plant = replace(plant, characteristics=found.drift.characteristics)
+        fixed = frozenset(plant.characteristics)
     found = replace(found, dead_time=found.dead_time + dead_time / seconds,
                     disturbances=plant.disturbance_names)
-    if lag.any():
-        found = with_lag(found, lag)
+    moved = np.isin(plant.input_names, task.as_state) & (lag == 0.0)
+    if lag.any() or moved.any():
+        found = with_lag(found, np.where(moved, _COMMAND_LAG * sample_interval(episodes), lag),
+                         [name for name, own in zip(plant.input_names, moved, strict=True) if own])
     dead_time = seconds * found.dead_time
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(one for one in record.episodes if one.delayed(dead_time) is not None),
@@ -305,6 +317,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     learned = learned.with_model(replace(learned.model, dead_time=dead_time))
     offsets = found.offsets / seconds if len(found.offsets) == len(recorded.episodes) else (
         np.zeros((len(recorded.episodes), len(box.states))))
+    # commands are no states of a record
+    offsets = offsets[:, :offsets.shape[1] - int(np.sum(moved))]
     runs = _free_runs(learned, recorded, test, offsets)
     others = {name: _free_runs(replace(found, drift=drift), recorded, test, offsets)
               for name, drift in ((DRIFT, found.drift), (LINEAR_MODEL, found.linear))}
@@ -502,25 +516,28 @@ class _Progress:
 
 def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episode],
               methods: Mapping[str, IdentificationMethod], progress: _Progress, backend: Backend,
-              linear: tuple[str, ...]) -> Identified:
+              given: Collection[str]) -> Identified:
     """
     Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations.
 
-    :param linear: inputs of which no characteristic is sought.
+    :param given: inputs of which no characteristic is sought.
     """
     seed, watch = task.seed, progress.estimating
     if task.physical_model:
         return estimate_parameters(plant, episodes, plant_class(task.physical_model),
                                    task.constants, seed=seed, watch=watch)
+    if task.as_state:
+        return identify_non_affine(plant, episodes, task.as_state, methods=methods, seed=seed,
+                                   watch=watch, backend=backend)
     if task.unmeasured_states < 0 and not task.model:
-        return identify_structure(plant, episodes, given=linear, methods=methods,
+        return identify_structure(plant, episodes, given=given, methods=methods,
                                   seed=seed, watch=watch, backend=backend,
                                   dead_times=not task.dead_time)
     if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
                                    watch=watch, backend=backend, dead_times=not task.dead_time)
     return identify_with_characteristics(
-        plant, episodes, given=linear, methods=methods, seed=seed, watch=watch,
+        plant, episodes, given=given, methods=methods, seed=seed, watch=watch,
         backend=backend)
 
 

@@ -81,7 +81,8 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         *(f'{what} of {name}: {seconds:.4g} s' for what, values in (
             ('dead time', retrained.dead_time), ('lag', retrained.lag))
           for name, seconds in zip(inputs.names, values.tolist(), strict=True)),
-        *(f'characteristic of {name}: {one}' for name, one in inputs.characteristics.items()),
+        *(f'characteristic of {name}: {one}' for name, one in
+          found.drift.characteristics.items()),
         f'{len(found.fitted)} segments for training, {len(found.held_out)} held out for testing'])
     yield '## Estimates of the drift'
     yield (f'Selected: {found.method}, {found.drift.form}, with the input matrix B'

@@ -59,6 +59,10 @@ class TrainingTask:
     #: time constant with which inputs follow their commands, by name, in s: 0 for none, -1 to find
     #: it from a record of all states; the applied input is a state of the model
     lag: Mapping[str, float] = field(default_factory=dict)
+    #: inputs that do not act linearly, also not through a characteristic: their commands are
+    #: states of the model, and a law sets their rates; behind a lag the applied inputs are. Where
+    #: all states are measured
+    as_state: tuple[str, ...] = ()
     #: those of the inputs that are measured and not manipulated; they have no dead time and no lag
     disturbances: tuple[str, ...] = ()
     #: most states that are not in the bags, see :func:`identify_unmeasured`; the new lift is then
@@ -97,6 +101,7 @@ class TrainingTask:
             for signal in values['inputs'])
         return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
                       'inputs': inputs, 'disturbances': tuple(values.get('disturbances', ())),
+                      'as_state': tuple(values.get('as_state', ())),
                       'methods': tuple(values.get('methods', cls.methods))})
 
 
@@ -114,6 +119,7 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
     if task.physical_model and task.characteristics:
         raise ValueError(f'characteristics name {", ".join(task.characteristics)}, but '
                          f'physical_model = {task.physical_model!r} defines how inputs act')
+    _check_as_state(task)
     if task.constants and not task.physical_model:
         raise ValueError(f'constants name {", ".join(task.constants)}, but no physical_model is '
                          'given')
@@ -125,7 +131,8 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
         some = [name for name in current.states.names
                 if name in {state.name for state in states}]
         # the others are estimated
-        partly = bool(task.physical_model or task.lag) and 0 < len(some) < len(current.states)
+        partly = bool(task.physical_model or task.lag or task.as_state) and (
+            0 < len(some) < len(current.states))
         states = _in_order(states, current.states.only(some) if partly else current.states,
                            'state', task.model)
         inputs = _in_order(inputs, current.inputs, 'input', task.model)
@@ -139,6 +146,21 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
                    disturbance_names=task.disturbances, characteristics={} if (
                        task.physical_model) else {
                        **plant.characteristics, **_characteristics(task, plant)}), states, inputs
+
+
+def _check_as_state(task: TrainingTask) -> None:
+    """Raise ValueError for inputs as states that the rest of a task excludes."""
+    manipulated = [one.name for one in task.inputs if one.name not in task.disturbances]
+    if unknown := ', '.join(name for name in task.as_state if name not in manipulated):
+        raise ValueError(f'as_state names {unknown}: choose from the manipulated inputs '
+                         f'{", ".join(manipulated)}')
+    if both := ', '.join(name for name in task.as_state if name in task.characteristics):
+        raise ValueError(f'as_state and characteristic are both given of {both}: give one of them')
+    if task.as_state and (task.unmeasured_states > 0 or task.physical_model or task.input_gain
+                          or task.input_matrix_degree):
+        raise ValueError('as_state needs all states measured and estimates how inputs act: set '
+                         'unmeasured_states and input_matrix_degree to 0, and give no '
+                         'physical_model and no input_matrix')
 
 
 _Signal = TypeVar('_Signal', RecordedState, RecordedInput)
@@ -174,9 +196,6 @@ def _characteristics(task: TrainingTask, plant: PlantDescription) -> dict[str, C
                             if name not in plant.input_names):
         raise ValueError(f'characteristics name {unknown}: the inputs are '
                          f'{", ".join(plant.input_names)}')
-    if both := ', '.join(name for name in task.characteristics if task.lag.get(name)):
-        raise ValueError(f'lag and characteristic are both given of {both}: give one of them, the '
-                         'one with the larger effect')
     return {name: Characteristic.of(points[::2], points[1::2])
             for name, points in task.characteristics.items()}
 

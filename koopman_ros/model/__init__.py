@@ -7,6 +7,7 @@ from koopman_ros.model.coordinates import Box, Coordinates
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.lifted_model import (
     APPLIED,
+    COMMANDED,
     LiftedModel,
     linearised_model,
     LONGEST_DEAD_TIME,
@@ -16,7 +17,7 @@ from koopman_ros.model.model_file import load, load_with_digest, ModelFileError,
 from koopman_ros.model.observables import NetworkObservables, Observables, PolynomialObservables
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 
-__all__ = ['APPLIED', 'LONGEST_DEAD_TIME', 'Box', 'Coordinates', 'InputTerms', 'LiftedModel',
-           'ModelFileError', 'NetworkObservables', 'Observables', 'PolynomialObservables',
-           'Provenance', 'TrainingStates', 'VerifiedLoops', 'linearised_model', 'load',
-           'load_with_digest', 'save']
+__all__ = ['APPLIED', 'COMMANDED', 'LONGEST_DEAD_TIME', 'Box', 'Coordinates', 'InputTerms',
+           'LiftedModel', 'ModelFileError', 'NetworkObservables', 'Observables',
+           'PolynomialObservables', 'Provenance', 'TrainingStates', 'VerifiedLoops',
+           'linearised_model', 'load', 'load_with_digest', 'save']

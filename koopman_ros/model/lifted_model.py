@@ -37,6 +37,8 @@ from koopman_ros.model_classes import (
 LONGEST_DEAD_TIME = 3600.0  #: s
 #: of the state that is the applied value of an input behind a lag, before the input's name
 APPLIED = 'applied_'
+#: likewise of the state that is the command of an input: a law sets its rate
+COMMANDED = 'commanded_'
 
 # Figures on held-out data in words, by their names in files.
 _FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
@@ -144,8 +146,10 @@ class LiftedModel:
                 lines.append(f'{role} {name}: trained from {shown(low, unit):.6g} to '
                              f'{shown(high, unit):.6g} {display_unit(unit)}')
         lines += [f'{what} of {name}: {seconds:.6g} s' for what, values in (
-            ('dead time', self.dead_time), ('lag', self.lag)) for name, seconds in zip(
-                self.inputs.names, values.tolist(), strict=True) if seconds > 0.0]
+            ('dead time', self.dead_time), ('lag', self.lag)) for j, (name, seconds) in enumerate(
+                zip(self.inputs.names, values.tolist(), strict=True))
+            if seconds > 0.0 and not (what == 'lag' and j in self.commanded)]
+        lines += [f'the law sets the rate of {self.inputs.names[j]}' for j in self.commanded]
         lines += [f'characteristic of {name}: {one}'
                   for name, one in self.inputs.characteristics.items()]
         rates = self.eigenvalues.real
@@ -233,11 +237,19 @@ class LiftedModel:
     @cached_property
     def lagged(self) -> dict[int, int]:
         """Indices of the inputs behind a lag, each with that of the state it applies."""
-        names = self.states.names
-        return {j: names.index(APPLIED + name) for j, name in enumerate(self.inputs.names)
-                if APPLIED + name in names}
+        return {**self._states_of(APPLIED), **self.commanded}
 
-    @property
+    @cached_property
+    def commanded(self) -> dict[int, int]:
+        """Those of them that the controller itself moves: the state is the command."""
+        return self._states_of(COMMANDED)
+
+    def _states_of(self, prefix: str) -> dict[int, int]:
+        names = self.states.names
+        return {j: names.index(prefix + name) for j, name in enumerate(self.inputs.names)
+                if prefix + name in names}
+
+    @cached_property
     def lag(self) -> Array:
         """Time constant (n_u,) of each input in s; 0 without a lag."""
         slope, found = self.drift_jacobian(np.zeros(self.n_x)), np.zeros(self.n_u)

@@ -60,12 +60,16 @@ FIRST = 'first'  # as `warm_start_model`, the first plant of a fleet whose lift 
 
 @dataclass(frozen=True)
 class TrainedInput(InputPlaces):
-    """The same with its static characteristic."""
+    """The same with its effect."""
 
     characteristic: tuple[float, ...] = parameter(
         (0.0,), 'Static characteristic: values of the input and their effects in turn, e.g. [0, '
         '0, 50, 20, 100, 100]; the effects may have any unit; two points: linear; a single 0: '
         'found from the record.')
+    as_state: bool = parameter(
+        False, 'Make the command a state of the model, whose rate the laws set: for an effect on '
+        'the rates that is neither linear nor that of a characteristic. All states must be '
+        'measured.')
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +299,7 @@ class TrainerParameters(SignalParameters):
                 'characteristics': {name: _in_unit(one.characteristic, signals.units[name])
                                     for name, one in self.inputs.items()
                                     if one.characteristic != (0.0,)},
+                'as_state': tuple(name for name, one in self.inputs.items() if one.as_state),
                 'input_matrix_degree': self.input_matrix_degree,
                 'disturbances': tuple(signals.disturbances),
                 'unmeasured_states': self.unmeasured_states, 'physical_model': self.physical_model,
@@ -338,8 +343,11 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
             name in signals.states or not present.lagged)])
         defaults |= {
             'input_matrix_degree': present.input_matrix_degree,
-            **{f'{name}.lag': seconds for name, seconds in zip(
-                inputs.names, present.lag.tolist(), strict=True)},
+            **{f'{name}.as_state': j in present.commanded
+               for j, name in enumerate(inputs.names)},
+            **{f'{name}.lag': 0.0 if j in present.commanded else seconds
+               for j, (name, seconds) in enumerate(zip(
+                   inputs.names, present.lag.tolist(), strict=True))},
             **box_defaults(states, experiment_min=states.lower, experiment_max=states.upper,
                            setpoint_min=states.lower, setpoint_max=states.upper),
             **box_defaults(inputs, experiment_min=inputs.lower, experiment_max=inputs.upper,

@@ -450,3 +450,25 @@ def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, control
         estimate = Estimate(np.zeros(model.n_x), w)
         target = level.compute(np.array(asked), estimate, None, 1.0, None, None)[0]
         assert target.u == pytest.approx(found.u)
+
+
+def test_of_more_states_than_inputs_behind_a_lag_the_target_is_a_compromise():
+    """A mass on a spring behind an actuator: its place can be held, its speed only at 0."""
+    A, B = np.array([[0.0, 1.0, 0.0], [-1.0, -0.5, 1.0], [0.0, 0.0, -2.0]]), np.eye(3)[:, 2:] * 2.0
+    states, inputs = (Coordinates.spanning(names, ('1',) * len(names), np.full(len(names), -2.0),
+                                           np.full(len(names), 2.0))
+                      for names in (('place', 'speed', 'applied_force'), ('force',)))
+    model = linearised_model(A, B, states, inputs, 's', Provenance('spring'))
+    spring = Controller(model, Tuning.for_model(model))
+    assert spring.controlled.names == ('place', 'speed')
+    state = spring.step(State(), np.zeros(2), 0)[0]
+    state, refusal = spring.request_setpoint(state, np.array([0.5, 0.0]))
+    assert refusal is None
+    x, period = np.zeros(3), 0.1
+    ahead = expm(period * np.block([[A, B], [np.zeros((1, 4))]]))[:3]
+    for k in range(1, 200):
+        state, command, _ = spring.step(state, x[:2], k * round(period * SECOND))
+        x = ahead @ np.append(x, command)
+    np.testing.assert_allclose(x, [0.5, 0.0, 0.5], atol=0.01)
+    # a speed cannot be held
+    assert spring.request_setpoint(state, np.array([0.5, 0.4]))[1] is not None

@@ -19,11 +19,14 @@ from support.known_plants import methods
 def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
                      windows: tuple[int, ...] = (20,)) -> Iterator[None]:
     """Estimate by a few methods alone, and try laws in so many loops."""
-    original = task_module.identify_with_characteristics
+    fewer = {'degrees': degrees, 'methods': methods(*windows)}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            task_module, 'identify_with_characteristics', lambda *given, **others: original(
-                *given, **{**others, 'degrees': degrees, 'methods': methods(*windows)}))
+        for original in (task_module.identify_with_characteristics,
+                         task_module.identify_non_affine):
+            def quick(*given, _original=original, **others):
+                return _original(*given, **{**others, **fewer})
+
+            patch.setattr(task_module, original.__name__, quick)
         patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(task_module, 'evaluate_model', partial(evaluate_model, loops=loops))
         yield

@@ -56,6 +56,10 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
     return Target(x_ref, u, forcing, math.hypot(*(drift + forcing).tolist()))
 
 
+# Weight of a rate as the input of a law, as a share of that of its integral, the command.
+_RATE_SHARE = 0.1
+
+
 @dataclass(frozen=True)
 class Weights:
     """
@@ -93,14 +97,21 @@ class Weights:
         """
         Return the weights on a model's scaled deviations that weigh its signals in their units.
 
+        The weight of an input whose command is a state is one of that state, and its rate has
+        little.
+
         :param states: (n_x,) weights of squared state errors, per state unit squared.
         :param inputs: (n_u,) weights of squared input deviations, per input unit squared.
         :raises ValueError: for other sizes, and as the class.
         """
-        return cls(*(
+        Q, R = (
             np.diag(frozen(weights, f'{name} weights', (len(signals),)) * signals.scale ** 2)
             for name, weights, signals in (
-                ('state', states, model.states), ('input', inputs, model.inputs))))
+                ('state', states, model.states), ('input', inputs, model.inputs)))
+        for j, i in model.commanded.items():
+            Q[i, i] = R[j, j] * (model.states.scale[i] / model.inputs.scale[j]) ** 2
+            R[j, j] *= _RATE_SHARE
+        return cls(Q, R)
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,6 +98,13 @@ class Planner:
         self._rate = limits.rate * model.seconds_per_time_unit / inputs.scale
         self._state_lower, self._state_upper = (
             model.states.to_deviation(bound) for bound in (state_lower, state_upper))
+        for j, i in model.commanded.items():
+            # the law sets its rate, and the limits are those of a state
+            self._lower[j], self._upper[j], self._rate[j] = -_INFINITY, _INFINITY, np.inf
+            for bounds, strictest, limit in ((self._state_lower, max, limits.lower[j]),
+                                             (self._state_upper, min, limits.upper[j])):
+                bounds[i] = strictest(
+                    bounds[i], (limit - model.states.center[i]) / model.states.scale[i])
         self._slope = self._jacobian(np.zeros(model.n_x))
         # the same from sample to sample, mostly
         self._grid, self._cost_to_go = lru_cache(8)(self._new_grid), lru_cache(8)(self._new_cost)

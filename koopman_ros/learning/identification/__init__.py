@@ -36,6 +36,7 @@ from koopman_ros.learning.identification.identify import (
     Stopped,
 )
 from koopman_ros.learning.identification.lag import find_lags, lagged, LaggedDrift, with_lag
+from koopman_ros.learning.identification.non_affine import identify_non_affine
 from koopman_ros.learning.identification.output_error import output_error
 from koopman_ros.learning.identification.total_variation import (
     noise_level,
@@ -71,6 +72,7 @@ __all__ = [
     'find_lags',
     'fitted_starts',
     'identify',
+    'identify_non_affine',
     'identify_structure',
     'identify_unmeasured',
     'identify_with_characteristics',

@@ -1,24 +1,22 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Static characteristics of inputs, found from a record, and drifts that are not affine in u."""
+"""Static characteristics of inputs, found from a record."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 import contextlib
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.characteristic import Characteristic
-from koopman_ros.core.datasets import Array, Episode, PlantDescription
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.identification_methods import WeakFormParameters
 from koopman_ros.learning.identification.chance import block_gains, clearly_positive
 from koopman_ros.learning.identification.drift import (
-    Drift,
     DriftModel,
     longest_step,
     prediction_error,
@@ -26,13 +24,13 @@ from koopman_ros.learning.identification.drift import (
 )
 from koopman_ros.learning.identification.identify import Identified, identify
 from koopman_ros.learning.identification.innovations_form import SETTLING
+from koopman_ros.learning.identification.input_functions import Hats, NonAffineDrift
 from koopman_ros.learning.identification.output_error import (
     innovations_form,
     PolynomialCoefficients,
     Refined,
 )
 from koopman_ros.learning.identification.weak_form import weak_form
-from koopman_ros.model import Coordinates
 
 _POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions beside states
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
@@ -73,7 +71,7 @@ def _characteristic(found: Identified, name: str) -> Characteristic | None:
     """Return the characteristic of an input; None where the record does not need one."""
     drift, inputs = found.drift, found.drift.box.inputs
     assert isinstance(drift, DriftModel)
-    functions = _Functions.of(found, (name,), _POINTS)
+    functions = _hats(found, (name,), _POINTS)
     better = functions and _better(found, functions, drift)
     if not functions or not better:
         return None
@@ -101,49 +99,28 @@ def _not_affine(found: Identified) -> NonAffineDrift | None:
     """Return a drift with products of states and functions of the inputs, if it is better."""
     drift = found.drift
     assert isinstance(drift, DriftModel)
-    functions = _Functions.of(found, drift.box.inputs.names, _FEW_POINTS)
+    functions = _hats(found, drift.box.inputs.names, _FEW_POINTS)
     products = drift if drift.varying_input_matrix else replace(drift, B=np.hstack(
         [drift.B] + [0.0 * drift.B] * len(drift.box.states)))
     better = functions and _better(found, functions, products)
     return NonAffineDrift(drift.box, better, functions) if functions and better else None
 
 
-@dataclass(frozen=True)
-class _Functions:
-    """Functions of inputs that are linear between knots, as further inputs."""
-
-    names: tuple[str, ...]  #: of all inputs
-    knots: dict[str, Array]
-
-    @classmethod
-    def of(cls, found: Identified, names: Sequence[str], count: int) -> _Functions | None:
-        """Return those of some inputs, with knots at quantiles; None for inputs of two levels."""
-        inputs = found.drift.box.inputs
-        u = np.concatenate([one.inputs_at(one.time) for one in (*found.fitted, *found.held_out)])
-        knots = {name: np.unique(np.quantile(u[:, inputs.names.index(name)], np.linspace(
-            0.0, 1.0, count))) for name in names}
-        knots = {name: own for name, own in knots.items() if len(own) > 2}
-        return cls(inputs.names, knots) if knots else None
-
-    def beside(self, u: Array) -> Array:
-        """Return inputs (..., n_u) with the functions of them."""
-        more = [np.interp(u[..., self.names.index(name)], own, row)
-                for name, own in self.knots.items() for row in np.eye(len(own))[1:-1]]
-        return np.concatenate((u, np.stack(more, axis=-1)), axis=-1)
-
-    def after(self, inputs: Coordinates) -> Coordinates:
-        """Return the coordinates of the inputs and the functions of them."""
-        count = sum(len(own) - 2 for own in self.knots.values())
-        return inputs.followed_by(Coordinates.spanning(
-            tuple(f'function {k}' for k in range(count)), ('1',) * count, np.zeros(count),
-            np.ones(count)))
+def _hats(found: Identified, names: Sequence[str], count: int) -> Hats | None:
+    """Return functions of some inputs, knots at quantiles; None for inputs of two levels."""
+    inputs = found.drift.box.inputs
+    u = np.concatenate([one.inputs_at(one.time) for one in (*found.fitted, *found.held_out)])
+    knots = {name: np.unique(np.quantile(u[:, inputs.names.index(name)], np.linspace(
+        0.0, 1.0, count))) for name in names}
+    knots = {name: own for name, own in knots.items() if len(own) > 2}
+    return Hats(inputs, knots) if knots else None
 
 
-def _better(found: Identified, functions: _Functions, drift: DriftModel) -> DriftModel | None:
+def _better(found: Identified, functions: Hats, drift: DriftModel) -> DriftModel | None:
     """Return a drift with functions of inputs added; None if it does not err less."""
     episodes, step = [*found.fitted, *found.held_out], longest_step(found.fitted)
-    more = [replace(one, u=functions.beside(one.u), linear=()) for one in episodes]
-    box = replace(drift.box, inputs=functions.after(drift.box.inputs))
+    more = [functions.added(one) for one in episodes]
+    box = replace(drift.box, inputs=functions.coordinates())
     n_x, n_u = len(box.states), len(drift.box.inputs)
     blocks = drift.B.reshape(n_x, -1, n_u)
     start = replace(drift, box=box, B=np.pad(
@@ -176,42 +153,3 @@ def _refined(drift: DriftModel, segments: Segments, steps: int = _MOST_STEPS
         PolynomialCoefficients(drift, learn_input_matrix=True), np.zeros((len(states),) * 2),
         segments, states.to_deviation(segments.x[0]), np.ones(len(states)), smooth=True,
         iterations=steps)
-
-
-@dataclass(frozen=True)
-class NonAffineDrift(Drift):
-    """A drift that is not affine in its inputs."""
-
-    drift: DriftModel  #: of the inputs and functions of them
-    functions: _Functions
-    #: of a law that does not control it
-    remedy: ClassVar[str] = ('use the quantity that acts as the input, or record a narrower range '
-                             'of the inputs')
-
-    __repr__ = short_repr
-
-    @property
-    def form(self) -> str:
-        """The kind of model, in words."""
-        return f'{self.drift.form}, not affine in {", ".join(self.functions.knots)}'
-
-    @property
-    def varying_input_matrix(self) -> bool:
-        """Whether B depends on the state."""
-        return True
-
-    def _with_functions(self, v: Array) -> Array:
-        return self.drift.box.inputs.to_deviation(
-            self.functions.beside(self.box.inputs.to_physical(v)))
-
-    def scaled_rate(self, xi: Array, v: Array) -> Array:
-        """Evaluate the rate in deviations; see :class:`Drift`."""
-        return self.drift.scaled_rate(xi, self._with_functions(v))
-
-    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
-        """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
-        return self.drift.scaled_slope(xi, None if v is None else self._with_functions(v))
-
-    def scaled_input_matrix(self, xi: Array) -> Array:
-        """Evaluate the part of B(x) that is linear in the inputs; see :class:`Drift`."""
-        return self.drift.scaled_input_matrix(xi)[..., :len(self.box.inputs)]

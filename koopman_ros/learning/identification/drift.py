@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 import itertools
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
@@ -72,6 +73,15 @@ class Drift(ABC):
     @abstractmethod
     def scaled_input_matrix(self, xi: Array) -> Array:
         """Evaluate B(x) in deviations: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+
+    def scaled_input_slope(self, xi: Array, v: Array) -> Array:
+        """Evaluate the Jacobian of the scaled rate by inputs (..., n_u): that is B(x)."""
+        return self.scaled_input_matrix(xi)
+
+    @property
+    def characteristics(self) -> Mapping[str, Characteristic]:
+        """The static characteristics of its inputs, by name."""
+        return self.box.inputs.characteristics
 
     def rate(self, x: Array, u: Array) -> Array:
         """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from koopman_ros.core.arrays import short_repr
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.learning.identification.chance import clearly_positive
 from koopman_ros.learning.identification.drift import (
@@ -27,7 +28,7 @@ from koopman_ros.learning.identification.identify import Identified, usual_degre
 from koopman_ros.learning.identification.output_error import output_error
 from koopman_ros.learning.identification.weak_form import weak_form
 from koopman_ros.learning.lift.input_model import InputModel
-from koopman_ros.model import APPLIED, Box, Coordinates
+from koopman_ros.model import APPLIED, Box, COMMANDED, Coordinates
 
 # Times after a change, in time constants, between which an applied input is nearly linear; at the
 # last one it has settled.
@@ -42,6 +43,8 @@ _RATIO, _SHARE, _TOLERANCE = 2.0, 30.0, 0.05
 _DEGREE, _MOST_COEFFICIENTS, _WINDOW = 3, 60, 40
 # Samples of a segment that is simulated.
 _SAMPLES = 240
+# Share of a lag within which a command that is a state changes in a record.
+_RAMP = 1e-3
 
 
 def lagged(episode: Episode, lag: Array, longest: float = 0.0) -> Episode | None:
@@ -89,7 +92,11 @@ def _commanded(episode: Episode, lag: Array) -> Episode:
 
 @dataclass(frozen=True)
 class LaggedDrift(Drift):
-    """A drift behind lags of some inputs: dx/dt = f(x) + B(x) v, dv/dt = (u - v) / lag."""
+    """
+    A drift behind lags of some inputs: dx/dt = f(x, v), dv/dt = (u - v) / lag.
+
+    Behind a lag a static characteristic, or another effect that is not linear, is one of a state.
+    """
 
     drift: Drift  #: of the applied inputs
     lag: Array  #: (n_u,) in time units, 0 for none
@@ -97,10 +104,12 @@ class LaggedDrift(Drift):
     __repr__ = short_repr
 
     @classmethod
-    def of(cls, drift: Drift, lag: Array, commands: Coordinates) -> LaggedDrift:
+    def of(cls, drift: Drift, lag: Array, commands: Coordinates, commanded: Collection[str] = ()
+           ) -> LaggedDrift:
         """Return the drift of the states of another one and of its applied inputs."""
         own = drift.box.inputs.only([drift.box.inputs.names[j] for j in np.flatnonzero(lag)])
-        applied = replace(own, names=tuple(APPLIED + name for name in own.names))
+        applied = replace(own, names=tuple(
+            (COMMANDED if name in commanded else APPLIED) + name for name in own.names))
         return cls(Box(drift.box.states.followed_by(applied), commands, drift.box.time_unit),
                    drift, lag)
 
@@ -114,11 +123,17 @@ class LaggedDrift(Drift):
         """Whether B depends on the state."""
         return self.drift.varying_input_matrix
 
+    @property
+    def characteristics(self) -> Mapping[str, Characteristic]:
+        """Those of its applied inputs, too."""
+        return self.drift.characteristics
+
     def _applied(self, xi: Array, v: Array) -> tuple[Array, Array]:
-        """Return states and inputs of the drift, in its deviations."""
-        n, box = len(self.drift.box.states), self.drift.box.inputs
-        u = box.to_deviation(self.box.inputs.to_physical(v))
-        return xi[..., :n], np.where(self.lag > 0.0, self._spread(xi[..., n:]), u)
+        """Return states of the drift in its deviations, and its inputs in units."""
+        n = len(self.drift.box.states)
+        return xi[..., :n], np.where(
+            self.lag > 0.0, self._spread(self.box.states.to_physical(xi)[..., n:]),
+            self.box.inputs.to_physical(v))
 
     def _spread(self, values: Array) -> Array:
         """Return one value for each input (..., n_u), 0 where it has no lag."""
@@ -127,17 +142,21 @@ class LaggedDrift(Drift):
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations; see :class:`Drift`."""
         behind, states, n = self.lag > 0.0, self.box.states, len(self.drift.box.states)
-        applied = self.box.inputs.to_physical(v) - self._spread(states.to_physical(xi)[..., n:])
-        return np.concatenate((self.drift.scaled_rate(*self._applied(xi, v)), (
-            applied[..., behind] / self.lag[behind] / states.scale[n:])), axis=-1)
+        x, u = self._applied(xi, v)
+        ahead = self.box.inputs.to_physical(v) - u
+        return np.concatenate((self.drift.scaled_rate(x, self.drift.box.inputs.to_deviation(u)), (
+            ahead[..., behind] / self.lag[behind] / states.scale[n:])), axis=-1)
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
         """Evaluate the Jacobian of the scaled rate; see :class:`Drift`."""
         behind, n = self.lag > 0.0, len(self.drift.box.states)
         x, u = self._applied(xi, np.zeros(len(self.lag)) if v is None else v)
         slope = np.zeros((*xi.shape, xi.shape[-1]))
-        slope[..., :n, :n] = self.drift.scaled_slope(x, u)
-        slope[..., :n, n:] = self.drift.scaled_input_matrix(x)[..., behind]
+        inputs = self.drift.box.inputs
+        own = inputs.to_deviation(u)
+        slope[..., :n, :n] = self.drift.scaled_slope(x, own)
+        slope[..., :n, n:] = (self.drift.scaled_input_slope(x, own)
+                              * inputs.slope(u)[..., None, :])[..., behind]
         slope[..., n:, n:] = -np.diag(1.0 / self.lag[behind])
         return slope
 
@@ -152,23 +171,51 @@ class LaggedDrift(Drift):
             rates, (*B.shape[:-2], *rates.shape))), axis=-2)
 
 
-def with_lag(found: Identified, lag: Array) -> Identified:
+def _ramped(episode: Episode, columns: Sequence[int], seconds: float) -> Episode:
+    """Return an episode in which some held inputs move linearly, shortly before they change."""
+    columns = [j for j in columns if not any(episode.linear[j:j + 1])]
+    if not columns:
+        return episode
+    times = episode.input_time
+    short = min([seconds, *(0.5 * np.diff(times))])
+    knots = np.unique(np.concatenate((
+        times, times[1:] - short, [max(times[-1], episode.time[-1]) + short])))
+    linear = list(episode.linear) or [False] * episode.u.shape[1]
+    for j in columns:
+        linear[j] = True
+    return replace(episode, input_time=knots, u=episode.inputs_at(knots), linear=tuple(linear))
+
+
+def with_lag(found: Identified, lag: Array, commanded: Collection[str] = ()) -> Identified:
     """
     Return an estimate on episodes of :func:`lagged` with the commands as inputs.
 
     The applied inputs follow the unmeasured states.
 
     :param lag: (n_u,) in time units, 0 for none.
+    :param commanded: inputs without a lag in the record whose command becomes a state; the input
+        of the model is then a command behind that lag, whose pulses move the state at once.
     """
-    fitted, held_out = (tuple(_commanded(one, lag) for one in some)
-                        for some in (found.fitted, found.held_out))
-    inputs, u = found.drift.box.inputs, np.vstack([one.u for one in (*fitted, *held_out)])
-    commands = Coordinates.spanning(inputs.names, inputs.units, u.min(axis=0), u.max(axis=0))
+    inputs = found.drift.box.inputs
+    moved = [inputs.names.index(name) for name in commanded]
+    fitted, held_out = (tuple(
+        _commanded(_ramped(one, moved, _RAMP * lag[moved].min(initial=np.inf)), lag)
+        for one in some) for some in (found.fitted, found.held_out))
+    u = np.vstack([one.u for one in (*fitted, *held_out)])
+    u[:, moved] = np.clip(u[:, moved], inputs.lower[moved], inputs.upper[moved])
+    commands = replace(
+        Coordinates.spanning(inputs.names, inputs.units, u.min(axis=0), u.max(axis=0)),
+        characteristics={name: one for name, one in inputs.characteristics.items()
+                         if not lag[inputs.names.index(name)]})
     count, zeros = int(np.count_nonzero(lag)), np.zeros
+
+    def of_commands(drift: Drift) -> LaggedDrift:
+        return LaggedDrift.of(drift, lag, commands, commanded)
+
     return replace(
-        found, drift=LaggedDrift.of(found.drift, lag, commands), fitted=fitted, held_out=held_out,
-        linear=LaggedDrift.of(found.linear, lag, commands),
-        alternatives=tuple(LaggedDrift.of(one, lag, commands) for one in found.alternatives),
+        found, drift=of_commands(found.drift), fitted=fitted, held_out=held_out,
+        linear=of_commands(found.linear),
+        alternatives=tuple(map(of_commands, found.alternatives)),
         noise=np.append(found.noise, zeros(count)), hidden=found.hidden + count,
         offsets=np.hstack((found.offsets, zeros((len(found.offsets), count)))) if (
             len(found.offsets)) else found.offsets)

@@ -13,7 +13,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_with_characteristics
-from koopman_ros.learning.identification.characteristics import NonAffineDrift
+from koopman_ros.learning.identification.input_functions import NonAffineDrift
 from koopman_ros.model import load
 from koopman_ros.records import read, RecordedInput, RecordedState
 from support.known_plants import methods
