@@ -18,7 +18,6 @@ from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 
 NOW = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 280.0, 304.0, 0.8
-LARGEST = float(np.finfo(np.float64).max)
 
 
 def plain(model, limits, **settings):

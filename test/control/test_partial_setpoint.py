@@ -14,8 +14,7 @@ from scipy.optimize import lsq_linear
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
 from koopman_ros.control.setpoint import advance, Setpoint
 from koopman_ros.control.steady_state import reachable_target
-from koopman_ros.core.status import StatusCode, StatusFormatter
-from koopman_ros.core.units import Displays
+from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, run_closed_loop, simulate
@@ -26,7 +25,6 @@ from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from support.closed_loops import EPOCH
 
 LEVELS, FLOWS = ('h1', 'h2', 'h3'), ('q1', 'q2')
-say = StatusFormatter(Displays({**dict.fromkeys(LEVELS, 'm'), **dict.fromkeys(FLOWS, 'L/s')}))
 
 
 def tanks(slope, gain, *, level=1.0, flow=3.0):

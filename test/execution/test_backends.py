@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -15,13 +16,24 @@ import pytest
 from koopman_ros.execution import backend_of, SchedulerLost, Serial, WorkerLost
 from koopman_ros.execution.pools import Cluster, Processes
 from koopman_ros.parameters.trainer import trainer_table
-from support.places import KINDS, places
+
+KINDS = ('', 'process', 'joblib:2', 'dask')
 
 
-@pytest.fixture(scope='module', name='places')
-def every_place():
-    with places() as opened:
-        yield opened
+@pytest.fixture(scope='module')
+def places():
+    """Open every back end once; the Dask cluster has two threads in this process."""
+    with contextlib.ExitStack() as stack:
+        with warnings.catch_warnings():
+            # its own imports
+            warnings.simplefilter('ignore')
+            import distributed
+        # its ports are free ones of the loopback interface
+        cluster = stack.enter_context(distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, host='127.0.0.1',
+            protocol='tcp://', dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL))
+        yield {kind: stack.enter_context(backend_of(
+            cluster.scheduler_address if kind == 'dask' else kind)) for kind in KINDS}
 
 
 @pytest.fixture(params=KINDS)

@@ -171,18 +171,6 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     ros.wait_for_status(f'unit_1/{STATUS}', lambda s: s.message == 'ended')
 
 
-def test_process_that_ends_without_measurements_leaves_the_inputs_where_they_are(
-        ros: Harness) -> None:
-    bench = Bench(ros)
-    assert bench.start()[0]
-    while abs(last := bench.answer()) > SAFE - 3.0:
-        pass
-    process, = ros.processes
-    assert process.stop(signal.SIGTERM) == 0
-    assert bench.commands[-1].temperature == last
-    assert 'held there' in process.output()
-
-
 def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     bench.set(experiment_timeout=0.5, **{'coolant_temperature.experiment_rate_limit': 10.0})
@@ -250,6 +238,19 @@ def test_one_input_in_manual_mode_until_the_controller_moves_it_elsewhere(
     ros.node.destroy_publisher(controller)
     bench.ask(False)
     bench.set(experiment_signal='command')
+
+
+def test_process_that_ends_without_measurements_leaves_the_inputs_where_they_are(
+        shared_bench: Bench) -> None:
+    bench, ros = shared_bench, shared_bench.ros
+    # until the graph tells the trainer that no other commands
+    ros.wait_until(lambda: bench.start()[0])
+    while abs(last := bench.answer()) > SAFE - 3.0:
+        pass
+    process, = ros.processes
+    assert process.stop(signal.SIGTERM) == 0
+    assert bench.commands[-1].temperature == last
+    assert 'held there' in process.output()
 
 
 def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coolant(

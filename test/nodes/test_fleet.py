@@ -5,10 +5,13 @@
 
 from pathlib import Path
 
+import pytest
 import yaml
 
 from koopman_ros.model import load
+from koopman_ros.nodes import trainer
 from koopman_ros.testing import Harness
+from support.nodes import run_here
 from support.recorded_runs import linear_run, write_bag
 
 
@@ -42,11 +45,11 @@ def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
     assert not (tmp_path / 'lost.safetensors').exists()
 
 
-def test_plants_of_one_call_are_trained_in_one_place(ros: Harness, tmp_path: Path) -> None:
+def test_plants_of_one_call_are_trained_in_one_place(
+        tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     given = arguments(tmp_path, {'a': ['a.mcap'], 'b': ['b.mcap']})
     site = yaml.safe_load((tmp_path / 'site.yaml').read_text())
     site['/b/trainer']['ros__parameters']['executor'] = 'joblib:2'
     (tmp_path / 'site.yaml').write_text(yaml.safe_dump(site))
-    program = ros.start('trainer', arguments=given)
-    assert program.wait(30.0) == 1
-    assert "executor is '' and 'joblib:2' in different loops" in program.output()
+    assert run_here(trainer, *given) == 1
+    assert "executor is '' and 'joblib:2' in different loops" in ''.join(capfd.readouterr())

@@ -25,7 +25,7 @@ from urllib.request import (
     Request,
 )
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -38,6 +38,7 @@ from koopman_ros.nodes.panel import PanelNode
 from koopman_ros.panel.requests import Action, Answer
 from koopman_ros.panel.snapshot import CONTROLLER, TRAINER
 from koopman_ros.ros import topics
+from koopman_ros.ros.controller_status import TASKS
 from koopman_ros.testing import Harness, NodeProcess
 from support.nodes import complaint, run_here, seconds, temperature, TIMEOUT, value
 from support.users import write_users
@@ -229,6 +230,7 @@ def test_what_was_before_is_read_and_what_is_asked_for_reaches_the_loop_and_is_w
     controller = ros.start('controller')
     ros.start('trainer', {'output': tmp_path / 'bag'})
     ask = ros.speak(Temperature, reactor.SETPOINT, to='controller', subscribers=2)
+    reports: list[DiagnosticArray] = ros.listen(DiagnosticArray, topics.DIAGNOSTICS)
     heard: list[Temperature] = ros.listen(Temperature, reactor.TEMPERATURE)
     # the controller, the trainer and this test miss nothing
     ros.start('plant', {'speed': 50.0, 'lockstep': True, 'lockstep_subscribers': 3})
@@ -236,12 +238,24 @@ def test_what_was_before_is_read_and_what_is_asked_for_reaches_the_loop_and_is_w
     ask.publish(temperature(45.0))
     ros.wait_until(lambda: len(heard) > 200)
     ros.node.destroy_publisher(ask)
+    reports_are_whole(ros, reports)
     desk = Panel(ros, monkeypatch)
     try:
         finds_what_was_before(desk, heard)
         asks_for_all_that_there_is(desk, controller)
     finally:
         desk.close()
+
+
+def reports_are_whole(ros: Harness, reports: list[DiagnosticArray]) -> None:
+    """Each node reports all its tasks in one message, and names the plant."""
+    wanted = {tuple(f'{node}: {task}' for task in tasks) for node, tasks in (
+        ('plant', ('simulation',)), ('controller', TASKS),
+        ('trainer', ('recording', 'experiment', 'training')))}
+    ros.wait_until(lambda: wanted <= {
+        tuple(status.name for status in report.status) for report in reports})
+    assert {status.hardware_id for report in reports for status in report.status} == {
+        'one-state reactor'}
 
 
 def finds_what_was_before(desk: Panel, heard: list[Temperature]) -> None:

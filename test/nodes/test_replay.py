@@ -350,14 +350,3 @@ def test_missing_matplotlib_is_told_in_one_line(
     assert run_here(replay, bags='[run.mcap]') == 1
     assert complaint(capfd).startswith(
         'replay: the plot needs matplotlib, which is not installed: pip install')
-
-
-def test_who_subscribes_is_sent_the_state_twice_where_nothing_happens(ros: Harness) -> None:
-    """The first may come before the subscriber knows the controller, and is lost then."""
-    ros.start('controller')
-    ros.meet('controller')
-    heard = ros.listen(String, topics.EVENT_LOG)
-    ros.wait_until(lambda: len(heard) > 1)
-    records = [parse(message.data) for message in heard]
-    assert {record.event for record in records} == {SNAPSHOT}
-    assert records[1].number == records[0].number + 1

@@ -83,8 +83,6 @@ def check(ros: Harness, node: str, seen: Seen, system: str = 'reactor') -> None:
 
 @pytest.mark.parametrize(('node', 'parameters', 'system'), [
     ('plant', {'system': 'two_state', 'speed': 2.0}, 'reactor'),
-    ('plant', {'speed': 2.0}, 'two_tanks'),
-    ('controller', {'use_sim_time': True}, 'reactor'),
     ('controller', {'use_sim_time': True}, 'two_tanks'),
     ('player', {'rate': 0.0, 'clock': True}, 'reactor')])
 def test_a_node_uses_exactly_the_names_that_its_policy_grants(

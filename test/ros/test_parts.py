@@ -42,7 +42,6 @@ from koopman_ros.ros.signals import MeasuredInputs, SignalSample
 from koopman_ros.testing import Harness
 from support.nodes import temperature, TIMEOUT
 
-SIGNALS = signals_of(load(model_path(reactor.MODEL)))
 NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
 
 

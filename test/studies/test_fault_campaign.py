@@ -18,9 +18,7 @@ from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
 from studies.faults.cases import CASES, refused_values
 from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
-from studies.faults.interceptor import value
 from studies.faults.judge import judge
-from studies.faults.late import reloaded
 from studies.faults.plants import FaultPlant, HEATED_LINE, QUADRUPLE_TANK, REACTOR, TWO_TANKS
 from studies.faults.report import write
 from support.recorded_runs import Recorded, STEADY
@@ -120,20 +118,6 @@ def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_p
     assert result['reasons'] == []
     # with the solver the law would have planned
     assert judge(found, replace(case, missing=()))['reasons'] != []
-
-
-def test_a_late_loop_is_held_without_its_analyser_and_feed_and_with_another_dead_time(
-        tmp_path: Path) -> None:
-    case = CASES['heated_line-feed-nan']
-
-    def play(loop: FaultHarness) -> None:
-        loop.interceptor.late = value(lambda *_: math.nan)
-        reloaded(loop, 32.0)
-        case.play(loop)
-
-    result, _ = run(replace(case, play=play, settle=200.0, afterwards=100.0, recovery=0.0),
-                    tmp_path)
-    assert result['reasons'] == []
 
 
 def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:

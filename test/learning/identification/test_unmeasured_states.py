@@ -4,6 +4,7 @@
 """Drifts of plants of which one output is in the record, beside what is known of them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from koopman_ros.learning.identification import (
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
+from support.known_plants import box
 
 PLANT = PlantDescription('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
                          np.zeros(1), None)
@@ -130,7 +132,7 @@ def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
 
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
-    found = identify_unmeasured(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
+    found = identify_unmeasured(PLANT, [record(saddle, samples=900, gain=2.0, size=1.5)], 1,
                                 highest_degree=2, dead_times=False)
     drift = found.drift
     assert drift.degree >= 2
@@ -187,13 +189,17 @@ def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
     assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
 
 
-def test_no_network_that_may_diverge_far_from_the_data_is_offered(monkeypatch):
-    monkeypatch.setattr(NetworkDrift, 'bounded', False)
-    monkeypatch.setattr(network_candidates, 'UNITS', (1,))
-    monkeypatch.setattr(network_candidates, 'STARTS', 1)
-    found = identify_unmeasured(PLANT, [record(outlet, samples=300, size=0.8)], 1,
-                                highest_degree=1, dead_times=False)
-    assert not any('network' in score.method for score in found.scores)
+@pytest.mark.parametrize(('grows', 'beside', 'allowed'), [
+    (-0.2, -0.2, True), (0.2, -0.2, False), (0.2, 0.2, True)])
+def test_no_network_that_may_diverge_far_from_the_data_is_offered(grows, beside, allowed):
+    """Unless the linear model beside it does as well."""
+    def linear(slope):
+        return DriftModel(box([-1.0], [1.0], [-1.0], [1.0]), 1, np.array([[0.0], [slope]]),
+                          np.eye(1))
+
+    network = NetworkDrift.beside(linear(grows), 2, 0, ridge=1e-4, learn_input_matrix=True)
+    own = SimpleNamespace(model=SimpleNamespace(drift=linear(beside)))
+    assert network_candidates.Shared(own, None, True, 1.0).allowed(network) is allowed
 
 
 def test_a_record_whose_simulations_all_diverge_is_refused():

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The same bits whether work runs here, in processes or on Dask: one set of workers for all."""
+"""The same bits whether work runs here or in processes: one set of workers for all."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
+from koopman_ros.execution import backend_of
 from koopman_ros.learning import train
 from koopman_ros.learning.identification import (
     identify,
@@ -20,11 +22,10 @@ from koopman_ros.learning.record import read_record
 from koopman_ros.model import Coordinates, linearised_model, Provenance
 from support.known_plants import CUBIC, methods, PAIR
 from support.long_records import bags_of, source
-from support.places import places
 from support.small_plants import BENT, bent_samples, bits, SMALL
 
-# a process of its own is one of two
-KINDS = ('', 'joblib:2', 'dask')
+# test_backends holds the others to the same results
+KINDS = ('', 'joblib:2')
 RECIPE = replace(SMALL, n_z=3)
 
 
@@ -38,16 +39,15 @@ def expected():
     return bits(trained(None).model)
 
 
-@pytest.fixture(scope='module', name='places')
-def every_place():
-    with places(KINDS) as opened:
-        yield opened
+@pytest.fixture(scope='module')
+def places():
+    with contextlib.ExitStack() as stack:
+        yield {kind: stack.enter_context(backend_of(kind)) for kind in KINDS}
 
 
-@pytest.mark.parametrize('kind', KINDS[1:])
-def test_the_bits_do_not_depend_on_where_starts_run(kind, expected, places):
+def test_the_bits_do_not_depend_on_where_starts_run(expected, places):
     threads = torch.get_num_threads()
-    assert bits(trained(places[kind]).model) == expected
+    assert bits(trained(places['joblib:2']).model) == expected
     assert torch.get_num_threads() == threads
 
 
@@ -137,7 +137,7 @@ def test_the_same_is_read_whoever_reads(bags, places):
 # Ends and interrupts: last, as a process that is ended at work is started anew.
 
 
-@pytest.mark.parametrize('kind', ['', 'dask'])
+@pytest.mark.parametrize('kind', KINDS)
 def test_the_watch_follows_and_can_end_starts_anywhere(kind, places):
     seen = []
 
