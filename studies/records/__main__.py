@@ -115,7 +115,7 @@ def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, sc
     if dead_times:
         further.append((PLANTS, {'dead_times': one_plant}))
     for count, experiments in further:
-        # an interrupt is one of all
+        # an interrupt ends them all
         if campaign.complete:
             campaign.add(run_campaign(count, experiments, scheduler))
     return campaign
