@@ -50,7 +50,7 @@ class InputTerms:
             return u
         phi = PolynomialObservables.total_degree(x.shape[-1], degree).lift(x)
         products = phi[..., :, None] * u[..., None, :]
-        # not -1, which numpy cannot tell of no rows
+        # -1 is ambiguous for an array without rows
         count = phi.shape[-1] * u.shape[-1]
         return np.concatenate([u, products.reshape(*u.shape[:-1], count)], axis=-1)
 

@@ -111,9 +111,11 @@ def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, sc
         others |= {f'{name}/{method}': partial(by_baseline, one, files, method)
                    for method, baseline in BASELINES.items() if find_spec(baseline.package)}
     campaign = run_campaign(1, others, scheduler)
-    further = [(seeds, own), *[(PLANTS, {'dead_times': one_plant})] * dead_times]
+    further = [(seeds, own)]
+    if dead_times:
+        further.append((PLANTS, {'dead_times': one_plant}))
     for count, experiments in further:
-        # an interrupt is one of all
+        # an interrupt ends them all
         if campaign.complete:
             campaign.add(run_campaign(count, experiments, scheduler))
     return campaign

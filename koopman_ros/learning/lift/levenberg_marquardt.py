@@ -25,8 +25,7 @@ class MinimumStatus(Enum):
     CONVERGED = 'converged: a step no longer lowers the cost noticeably'
     MAX_ITERATIONS = ('reached the iteration limit while still improving: if the held-out errors '
                       'are too large, increase `max_iterations` or the number of starts')
-    OUT_OF_TIME = ('stopped at its limit of processor time: if the held-out errors are too large, '
-                   'set model_class to this class, which then has the time of all')
+    OUT_OF_TIME = 'stopped at its limit of processor time: name one class for more'
     STALLED = ('no damped step lowers the cost: the start is degenerate or the data contain '
                'values that are not finite; check the data and try another seed')
     INTERRUPTED = 'interrupted: the best parameters so far are kept'
