@@ -26,15 +26,19 @@ from koopman_ros.evaluation.closed_loop_test import (
 )
 from koopman_ros.execution import Backend
 from koopman_ros.learning.causes import likely_causes
+from koopman_ros.learning.ensemble import disagreement, inconsistency
 from koopman_ros.learning.identification import (
     Drift,
     DriftModel,
-    fitted_starts,
     Identified,
     longest_step,
     Stopped,
 )
-from koopman_ros.learning.identification.drift import prediction_error, Segments
+from koopman_ros.learning.identification.drift import (
+    autocorrelation,
+    prediction_error,
+    Segments,
+)
 from koopman_ros.learning.identification.input_functions import NonAffineDrift
 from koopman_ros.learning.lift.metrics import lifted_rate, LiftMetrics
 from koopman_ros.learning.lift.training import Trained
@@ -56,8 +60,6 @@ _LEAST_AUTOCORRELATION = 0.3
 _MOST_ALTERNATIVES = 5
 # Rounds of closed loops, at least, from which the share of failures is stated.
 _ROUNDS = 4
-# They differ where the mean square of their rates does by more than this share of the motion.
-_DIFFERENT = 0.1
 # A share of the set-points' range that may be missing: noise moves the ends of a record.
 _MISSING = 0.05
 
@@ -277,48 +279,15 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     reasons = (*reasons, *filter(None, [unfounded_instability(
         model, found, points, held_out.better(rmse), held_out.other_class)]))
     warnings = _warnings(found, model, drift_rmse,
-                         _autocorrelation(found.drift, held_out.segments))
+                         autocorrelation(found.drift, held_out.segments))
     return AcceptanceResult(reasons, warnings, rmse, drift_rmse, current_rmse,
                             held_out.linear_rmse, found.noise, law_check, further, points)
-
-
-def _autocorrelation(drift: Drift, segments: Segments) -> Array:
-    """Return the autocorrelation (n_x,) of a drift's errors from one measurement to the next."""
-    starts = fitted_starts(drift.rate, segments, drift.box.states.scale)[0]
-    errors = segments.errors(drift.rate, starts)
-    products, squares = np.zeros((2, errors.shape[2]))
-    for j in range(errors.shape[1]):
-        own = errors[segments.sampled[:, j], j]
-        products += np.sum(own[1:] * own[:-1], axis=0)
-        squares += 0.5 * np.sum(own[1:] ** 2 + own[:-1] ** 2, axis=0)
-    return products / np.where(squares > 0.0, squares, 1.0)
-
-
-def disagreement(found: Identified) -> str:
-    """Say by how much, and where most, drifts that explain the record equally well differ."""
-    if not found.alternatives:
-        return ''
-    box = found.drift.box
-    episodes = [*found.fitted, *found.held_out]
-    x, u = (np.concatenate(parts) for parts in (
-        [one.interpolated() for one in episodes], [one.inputs_at(one.time) for one in episodes]))
-    own = found.drift.rate(x, u)
-    differences = np.array([(one.rate(x, u) - own) / box.states.scale
-                            for one in found.alternatives])
-    squares = np.mean(differences ** 2, axis=(1, 2))
-    share = float(np.sqrt(np.max(squares) / np.mean((own / box.states.scale) ** 2)))
-    if share <= _DIFFERENT:
-        return ''
-    worst = x[int(np.argmax(np.max(np.sum(differences ** 2, axis=2), axis=0)))]
-    return (f'{1 + len(found.alternatives)} drifts that explain the record equally well differ by '
-            f'{100.0 * share:.0f} % of the motion, most at {box.states.text(worst)}: record '
-            'longer, with steps of the input around that state')
 
 
 def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
               ) -> tuple[str, ...]:
     """Say where the best drift errs by more than white noise explains."""
-    warnings = [*found.warnings, *filter(None, [disagreement(found)])]
+    warnings = [*found.warnings, *filter(None, [disagreement(found), inconsistency(found)])]
     count = sum(len(episode) for episode in found.held_out)
     measured = len(model.states) - found.hidden
     for i, (name, unit) in enumerate(zip(model.states.names[:measured], model.states.units,

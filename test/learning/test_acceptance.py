@@ -16,8 +16,9 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 from koopman_ros.learning import Edmd, evaluate_model, learn_lift, Thresholds
-from koopman_ros.learning.acceptance import disagreement, uncovered_setpoints
+from koopman_ros.learning.acceptance import uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
+from koopman_ros.learning.ensemble import disagreement
 from koopman_ros.learning.identification import (
     DriftModel,
     identify,

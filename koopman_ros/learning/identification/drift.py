@@ -367,6 +367,18 @@ def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:
     return np.sqrt(np.average(squares, axis=0, weights=weights))
 
 
+def autocorrelation(drift: Drift, segments: Segments) -> Array:
+    """Return the autocorrelation (n_x,) of a drift's errors from one measurement to the next."""
+    starts = fitted_starts(drift.rate, segments, drift.box.states.scale)[0]
+    errors = segments.errors(drift.rate, starts)
+    products, squares = np.zeros((2, errors.shape[2]))
+    for j in range(errors.shape[1]):
+        own = errors[segments.sampled[:, j], j]
+        products += np.sum(own[1:] * own[:-1], axis=0)
+        squares += 0.5 * np.sum(own[1:] ** 2 + own[:-1] ** 2, axis=0)
+    return products / np.where(squares > 0.0, squares, 1.0)
+
+
 def _grid(episode: Episode, longest: float) -> Array:
     inside = (episode.input_time > episode.time[0]) & (episode.input_time < episode.time[-1])
     knots = np.union1d(episode.time, episode.input_time[inside])

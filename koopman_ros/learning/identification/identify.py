@@ -19,7 +19,14 @@ from koopman_ros.core.plugins import contained, plugin_class, short_name
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
+from koopman_ros.learning.identification.degree_choice import (
+    following,
+    information,
+    NEARLY,
+    nearly_best,
+)
 from koopman_ros.learning.identification.drift import (
+    autocorrelation,
     box_of,
     Drift,
     DriftModel,
@@ -45,11 +52,8 @@ _SEGMENTS = 15
 _FITTED = 0.6  # share of them that are fitted; they hold the extremes of all signals
 # For two states and an input, six of them may hold the extremes.
 _FEWEST = 8
-# Samples of a simulation of the record, and half-ranges from the measurement at which it is lost.
-_RUN, LOST = 2000, 10.0
-# Mean squared errors this close count as equal: on a few segments that hold one estimate against
-# another, chance alone makes such a difference.
-NEARLY = 1.1
+_RUN = 2000  # samples of a simulation of the record
+_COLOUR = 0.95  # highest autocorrelation of errors that counts
 
 # Called with (steps done, steps in all, what is done now); True ends the estimation.
 Watch = Callable[[int, int, str], bool]
@@ -230,9 +234,8 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     if not able:
         raise ValueError('; '.join(['no drift fits the episodes: record longer, with steps of the '
                                     'input', *failures]))
-    record = Segments.of(cut(episodes, _RUN), step)
-    following = [d for d in able if not _leaves(best[d][0], record)]
-    left = following or able
+    record, costs = Segments.of(cut(episodes, _RUN), step), {d: best[d][1].cost for d in able}
+    left = following({d: best[d][0] for d in able}, costs, record)
     everything = Segments.of([*fit, *choose], step)
     finished: dict[int, DriftModel] = {}
 
@@ -246,11 +249,13 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
                                    monitor=monitor) if OUTPUT_ERROR in score.method else model
         return finished[d]
 
+    likeliest = min(left, key=lambda d: costs[d])
+    colour = np.clip(autocorrelation(best[likeliest][0], fitter), 0.0, _COLOUR)
     while True:
-        least = min(best[d][1].cost for d in left)
-        good = [d for d in left if best[d][1].cost <= NEARLY * least]
-        degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
-        if not (_leaves(finish(degree), record) and following[1:]):
+        good = nearly_best(left, costs)
+        degree = min(good, key=lambda d: information(best[d][0], fitter, known is None, colour))
+        models = {**{d: best[d][0] for d in left}, degree: finish(degree)}
+        if len(left) == 1 or degree in following(models, costs, record):
             break
         left.remove(degree)
     if degrees[0] in best and degrees[0] not in finished:
@@ -260,15 +265,6 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
                       (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
                       alternatives=tuple(best[d][0] for d in good if d != degree),
                       disturbances=plant.disturbance_names)
-
-
-def _leaves(drift: DriftModel, record: Segments) -> bool:
-    """Return whether simulations by a drift that is stable in the middle leave the record."""
-    if drift.growth_rate > 0.0:
-        return False
-    with np.errstate(all='ignore'):
-        errors = record.errors(drift.rate, record.x[0]) / drift.box.states.scale
-    return not np.all(np.abs(errors) < LOST)
 
 
 def usual_degrees(n_x: int) -> tuple[int, ...]:
@@ -398,16 +394,6 @@ def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
             raise ValueError(f'the identification method {name!r} cannot be configured: '
                              f'{contained(error)}') from error
     return found
-
-
-def _information(model: DriftModel, segments: Segments, learned_B: bool) -> float:
-    """Return the Bayesian information criterion, but for a constant."""
-    scale = model.box.states.scale
-    # an error below rounding tells nothing
-    rmse = np.maximum(prediction_error(model.rate, segments, scale) / scale, 1e-12)
-    count = int(np.sum(segments.sampled))
-    size = model.coefficients.size + learned_B * model.B.size
-    return 2.0 * count * float(np.sum(np.log(rmse))) + size * math.log(count)
 
 
 def _score(model: DriftModel, segments: Segments, method: str) -> Score:

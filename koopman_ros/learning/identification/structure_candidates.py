@@ -14,13 +14,9 @@ import numpy as np
 from koopman_ros.core.datasets import Array
 from koopman_ros.learning.identification.chance import SIGMAS
 from koopman_ros.learning.identification.data_split import SplitRecord
+from koopman_ros.learning.identification.degree_choice import LOST, NEARLY
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
-from koopman_ros.learning.identification.identify import (
-    LOST,
-    NEARLY,
-    OUTPUT_ERROR,
-    Score,
-)
+from koopman_ros.learning.identification.identify import OUTPUT_ERROR, Score
 from koopman_ros.learning.identification.innovations_form import Predictor, SETTLING
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import innovations_form, Refinable, Refined
