@@ -3,7 +3,13 @@
 
 """Estimation of state and disturbance from measurements."""
 
-from koopman_ros.estimation.base import Estimate, Estimator, Innovation, with_applied
+from koopman_ros.estimation.base import (
+    Estimate,
+    Estimator,
+    Innovation,
+    with_applied,
+    with_commands,
+)
 from koopman_ros.estimation.dead_time import (
     AppliedInputs,
     held_means,
@@ -35,4 +41,5 @@ __all__ = ['ESTIMATORS', 'Accepted', 'Analysis', 'AppliedInputs', 'DisturbanceOb
            'Estimate', 'Estimator', 'ExtendedKalmanFilter', 'History', 'Innovation', 'Instant',
            'MeasuredDisturbances', 'MeasuredState', 'PendingInputs', 'Standstill',
            'UnscentedKalmanFilter', 'Verdict', 'check', 'check_disturbances', 'equivalent_bias',
-           'held_means', 'largest_bandwidth', 'with_applied']
+           'held_means', 'largest_bandwidth', 'with_applied',
+           'with_commands']

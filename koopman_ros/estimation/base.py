@@ -109,6 +109,12 @@ def with_applied(model: LiftedModel, x: Array, u: Array, places: Mapping[int, in
     return x
 
 
+def with_commands(model: LiftedModel, estimate: Estimate, u: Array) -> Estimate:
+    """Return an estimate whose states that are commands are those inputs (n_u,) that act."""
+    return estimate if not model.commanded else replace(
+        estimate, x=with_applied(model, estimate.x, u, model.commanded))
+
+
 class Estimator(ABC):
     """
     From measurements to an estimate of state and disturbance; pure, without memory of its own.
@@ -162,9 +168,7 @@ class Estimator(ABC):
 
     def advance(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Predict as :meth:`predict`; states that are commands are those of `u` at once."""
-        commanded = self.model.commanded
-        return self.predict(estimate if not commanded else replace(
-            estimate, x=with_applied(self.model, estimate.x, u, commanded)), u, seconds)
+        return self.predict(with_commands(self.model, estimate, u), u, seconds)
 
     def predict_over(self, estimate: Estimate, pieces: Iterable[tuple[float, Array]],
                      rate: Array | None) -> Estimate | None:

@@ -17,7 +17,7 @@ from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.estimation import Estimate, held_means
+from koopman_ros.estimation import Estimate, held_means, with_commands
 from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.model import LiftedModel
 
@@ -191,7 +191,7 @@ def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
         None, model.states.to_deviation(controller.position(windows.x[0])), inputs[0])
     known = [estimate := estimate.under(-rates[0])]
     for y, u, rate, seconds in zip(windows.x[1:], inputs, rates, steps, strict=True):
-        predicted = (estimator.predict(estimate.under(rate), u, seconds)
+        predicted = (estimator.advance(estimate.under(rate), u, seconds)
                      or estimate.under(rate)).under(-rate)
         x = outputs.state(y, model.states.to_physical(predicted.x))
         estimate = estimator.correct(predicted, model.states.to_deviation(x), seconds)
@@ -204,7 +204,8 @@ def _predicted(controller: Controller, windows: PredictionWindows) -> Array:
         ahead: Estimate | None = known[places[0]]
         errors = []
         for k in places:
-            ahead = ahead and simulated(model, ahead.under(rates[k]), inputs[k], steps[k])
+            ahead = ahead and simulated(model, with_commands(
+                model, ahead.under(rates[k]), inputs[k]), inputs[k], steps[k])
             ahead = ahead and ahead.under(-rates[k])
             if ahead is None or not bool(np.isfinite(ahead.x).all()):
                 break

@@ -221,7 +221,8 @@ class ControllerNode(ManagedNode):
         report = outcome.report
         acting = outcome.state.disturbances
         # behind a lag of the model the command counts
-        recent = replace(event, applied=None) if self._loop.controller.model.lagged else event
+        model = self._loop.controller.model
+        recent = replace(event, applied=None) if model.lagged != model.commanded else event
         self._recent.add(
             recent, report.measurement, before.command, self._settings.model_check_length,
             None if acting is None else acting.value)

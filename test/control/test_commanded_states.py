@@ -13,6 +13,7 @@ from koopman_ros.control.laws import Weights
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.evaluation.model_comparison import compare, PredictionWindows
 from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.tuning import InputLimits, Tuning
 
@@ -97,6 +98,22 @@ def test_it_acts_on_the_prediction_over_a_dead_time(model):
                      fallback_order=('sdre',))
     assert np.max(path) < 0.51
     assert path[-1] == pytest.approx(0.5, abs=2e-3)
+
+
+def test_recent_measurements_are_predicted_with_commands_that_act_at_once(model):
+    loop = Controller(model, Tuning.for_model(model))
+    u = np.repeat(np.random.default_rng(0).uniform(-0.6, 0.6, 10), 5)[:, None]
+    path = [np.zeros(1)]
+    for value in u:
+        x = path[-1]
+        for _ in range(4):
+            x = runge_kutta_step(lambda x, u=value: rate(x, u), x, PERIOD / 4)
+        path.append(x)
+    windows = PredictionWindows(np.array(path), u, np.full(len(u), PERIOD), np.arange(
+        30, 50)[None])
+    found = compare(loop, loop, windows)
+    assert found is not None
+    assert found.candidate[0] < 0.01
 
 
 def test_the_weight_of_the_input_is_one_of_its_command(model):

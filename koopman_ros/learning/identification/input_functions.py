@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import short_repr
@@ -18,7 +19,6 @@ from koopman_ros.core.datasets import Array, Episode
 from koopman_ros.core.solvers import differences
 from koopman_ros.learning.identification.drift import Drift, DriftModel
 from koopman_ros.model import Coordinates, PolynomialObservables
-from koopman_ros.model.observables import Monomials
 
 
 @dataclass(frozen=True)
@@ -80,30 +80,34 @@ class Hats(InputFunctions):
 
 
 @dataclass(frozen=True)
-class Powers(InputFunctions):
-    """Monomials from the second degree on, of the scaled deviations of some inputs."""
+class Legendre(InputFunctions):
+    """
+    Products of Legendre polynomials, from the second degree on, of scaled deviations of inputs.
 
-    exponents: NDArray[np.int64]  #: (k, n_u)
+    Unlike their powers, inputs spread over their range do not move them together.
+    """
+
+    degrees: NDArray[np.int64]  #: (k, n_u) of the factors
 
     @staticmethod
-    def of(inputs: Coordinates, names: Sequence[str], degree: int) -> Powers:
+    def of(inputs: Coordinates, names: Sequence[str], degree: int) -> Legendre:
         """Return those of some inputs, to a total degree."""
         rows = [inputs.names.index(name) for name in names]
         some = PolynomialObservables.total_degree(len(rows), degree).exponents
         some = some[some.sum(axis=1) > 1]
-        exponents = np.zeros((len(some), len(inputs)), dtype=np.int64)
-        exponents[:, rows] = some
-        return Powers(replace(inputs, characteristics={}), exponents)
+        degrees = np.zeros((len(some), len(inputs)), dtype=np.int64)
+        degrees[:, rows] = some
+        return Legendre(replace(inputs, characteristics={}), degrees)
 
     @property
     def arguments(self) -> Sequence[frozenset[int]]:
-        """The inputs of each monomial."""
-        return [frozenset(np.flatnonzero(row).tolist()) for row in self.exponents]
+        """The inputs of each product."""
+        return [frozenset(np.flatnonzero(row).tolist()) for row in self.degrees]
 
     def values(self, u: Array) -> Array:
-        """Evaluate the monomials; see :class:`InputFunctions`."""
-        return Monomials(np.ones(len(self.exponents)), self.exponents).at(
-            self.inputs.to_deviation(u))
+        """Evaluate the products; see :class:`InputFunctions`."""
+        each = legvander(self.inputs.to_deviation(u), int(np.max(self.degrees)))
+        return np.prod([each[..., j, own] for j, own in enumerate(self.degrees.T)], axis=0)
 
 
 @dataclass(frozen=True)

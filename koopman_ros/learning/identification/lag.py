@@ -221,6 +221,10 @@ def with_lag(found: Identified, lag: Array, commanded: Collection[str] = ()) -> 
             len(found.offsets)) else found.offsets)
 
 
+class _DivergedError(Exception):
+    """A simulation of a search diverges."""
+
+
 def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
               sought: Sequence[int], *, watch: Callable[[], object] = lambda: None) -> Array:
     """
@@ -257,21 +261,19 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         watch()
         behind = np.where(np.arange(len(lag)) == j, tried, lag)
         parts = cut_behind(behind)
-        segments, found = Segments.of(parts, step), np.full(len(parts), np.inf)
-        # a polynomial of lower degree where one diverges
-        for d in range(degree, 0, -1):
-            start = drift or weak_form(parts, box, d, inputs.weights, _WINDOW, inputs.degree)
-            refined = output_error(start, segments, learn_input_matrix=inputs.weights is None)
-            found = np.mean(fitted_starts(refined.rate, segments, box.states.scale)[1]
-                            / box.states.scale ** 2, axis=1)
-            if np.isfinite(found).all():
-                drift = refined
-                break
-            if drift is not None:
-                break
+        segments = Segments.of(parts, step)
+        start = drift or weak_form(parts, box, degree, inputs.weights, _WINDOW, inputs.degree)
+        refined = output_error(start, segments, learn_input_matrix=inputs.weights is None)
+        found = np.mean(fitted_starts(refined.rate, segments, box.states.scale)[1]
+                        / box.states.scale ** 2, axis=1)
+        if np.isfinite(found).all():
+            drift = refined
+        elif degree > 1:
+            raise _DivergedError
         return found
 
-    for j in sought:
+    def search(j: int) -> float:
+        """Return the lag of an input, 0 for none."""
         best = tried = 0.5 * step
         without = squares(j, 0.0)
         least = np.inf
@@ -282,15 +284,24 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
                 break
             tried *= _RATIO
         found = best * math.exp(minimize_scalar(
-            lambda log, j=j, best=best: np.mean(squares(j, best * math.exp(log))),
+            lambda log: np.mean(squares(j, best * math.exp(log))),
             bounds=(-math.log(_RATIO), math.log(min(_RATIO, longest / best))), method='bounded',
             options={'xatol': _TOLERANCE}).x)
         errors = squares(j, found)
         if not clearly_positive(without - errors):
-            continue
+            return 0.0
         assert drift is not None
         # a linear plant may exchange the lag for a time constant: the actuator is the faster one
         times = 1.0 / np.maximum(-np.linalg.eigvals(drift.slope(box.states.center)).real, 1e-9)
-        lag[j] = next((other for other in sorted(times.tolist()) if step / 4.0 < other < found
-                       and not clearly_positive(squares(j, other) - errors)), found)
+        return next((other for other in sorted(times.tolist()) if step / 4.0 < other < found
+                     and not clearly_positive(squares(j, other) - errors)), found)
+
+    for j in sought:
+        while True:
+            try:
+                lag[j] = search(j)
+                break
+            except _DivergedError:
+                # one of lower degree does not, and lags are compared by one degree
+                degree, drift = degree - 1, None
     return lag

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import contextlib
 from dataclasses import replace
+import math
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,12 @@ import numpy as np
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.learning.identification.drift import Drift, DriftModel
 from koopman_ros.learning.identification.identify import Identified, identify, usual_degrees
-from koopman_ros.learning.identification.input_functions import NonAffineDrift, Powers
+from koopman_ros.learning.identification.input_functions import Legendre, NonAffineDrift
 from koopman_ros.learning.identification.structure_candidates import compared
 from koopman_ros.learning.identification.unmeasured_states import free_run_errors
-from koopman_ros.model import Box
+from koopman_ros.model import Box, Coordinates
 
-_POWERS = 5  # of the inputs
+_HIGHEST_FUNCTION, _MOST_FUNCTIONS = 7, 20  # degree in the inputs, and number
 _HIGHEST_DEGREE = 4  # of the drift without them
 
 
@@ -29,7 +30,7 @@ def identify_non_affine(plant: PlantDescription, episodes: Sequence[Episode],
     """
     Estimate dx/dt = f(x, u) as :func:`identify`, f a polynomial in x and in some inputs.
 
-    Powers of the inputs have factors of degree 1 in x, or 2 where simulations then err less.
+    Legendre of the inputs have factors of degree 1 in x, or 2 where simulations then err less.
 
     :param plant: without B; see :func:`identify`, like the options.
     :param names: inputs that do not act linearly.
@@ -39,7 +40,7 @@ def identify_non_affine(plant: PlantDescription, episodes: Sequence[Episode],
         raise ValueError(f'the input matrix is given, by which {", ".join(names)} would act '
                          'linearly: give no input_matrix')
     linear = identify(plant, episodes, **{**options, 'degrees': (1,)})
-    functions = Powers.of(linear.drift.box.inputs, names, _POWERS)
+    functions = _functions(linear.drift.box.inputs, names)
     m, k = len(plant.input_names), len(functions.arguments)
     more = replace(
         plant, input_names=functions.coordinates().names, input_units=(
@@ -65,3 +66,11 @@ def identify_non_affine(plant: PlantDescription, episodes: Sequence[Episode],
     return replace(found, drift=of_inputs(found.drift), linear=linear.drift, fitted=fitted,
                    held_out=held_out, alternatives=tuple(map(of_inputs, found.alternatives)),
                    dead_time=np.zeros(()), warnings=linear.warnings)
+
+
+def _functions(inputs: Coordinates, names: Sequence[str]) -> Legendre:
+    """Return polynomials of some inputs, to the highest degree with few enough of them."""
+    count = len(names)
+    return Legendre.of(inputs, names, max(
+        degree for degree in range(2, _HIGHEST_FUNCTION + 1)
+        if degree == 2 or math.comb(count + degree, degree) - 1 - count <= _MOST_FUNCTIONS))

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import differences
 from koopman_ros.learning.identification import (
+    find_dead_times,
     find_lags,
     identify,
     identify_with_characteristics,
@@ -119,3 +120,19 @@ def test_a_characteristic_behind_a_lag_is_one_of_the_applied_input(lag):
                        np.ones(n + 1))
     np.testing.assert_allclose(drift.scaled_slope(xi, v), both[:, :n], atol=1e-6)
     np.testing.assert_allclose(drift.scaled_input_matrix(xi), both[:, n:], atol=1e-6)
+
+
+@pytest.mark.parametrize(('lag', 'late', 'count'), [
+    ([10.0], 6.0, 700),
+    # simulations by a cubic drift diverge
+    ([3.0], 12.0, 1000)])
+def test_a_lag_and_a_dead_time_of_the_same_input_are_found(lag, late, count):
+    lag = np.array(lag)
+    episode = record(lag, count)[0]
+    episode = replace(episode, input_time=episode.input_time - late)
+    dead_time = find_dead_times([episode], [False]).values
+    found = find_lags(plant_of(1), [episode.delayed(dead_time)], np.zeros(1), [0])
+    # behind the lag the dead time is found again
+    dead_time = find_dead_times([lagged(episode, found)], [False]).values
+    np.testing.assert_allclose(dead_time, late, atol=0.5)
+    np.testing.assert_allclose(found, lag, rtol=0.15)
