@@ -66,6 +66,8 @@ class PlayerNode(LoopNode):
         self._measured = {'/' + name.lstrip('/') for name in settings.measurement} & set(played)
         self._parts: tuple[int, set[str]] = (0, set())  # stamp and topics of those that are
         self._lockstep = settings.rate == 0.0
+        # set-points are due in the time of the plant
+        self._simulated = table is not None and bool(self.get_parameter('use_sim_time').value)
 
         # the subscription first: a controller that hears the measurement has then seen it, too
         self._clock_publisher = self.create_publisher(
@@ -120,11 +122,14 @@ class PlayerNode(LoopNode):
                    if publisher.get_subscription_count() < wanted]
         if self._answers is not None and wanted and not self._answers.get_publisher_count():
             missing.append(self._answers.topic_name)
+        if self._simulated and not self._now():
+            missing.append(topics.CLOCK)
         if not missing:
             self._began = True
             # before the time counts: the first message of a type takes a tenth of a second
             self._next = next(self._messages, None)
-            self._due = self._wall_start = self._said = time.monotonic()
+            self._due, self._wall_start = self._now(), time.monotonic()
+            self._said = self._wall_start
             self.get_logger().info(f'playing {self._settings.bag}')
         elif time.monotonic() - self._wall_start > self._settings.wait_timeout:
             self._give_up(
@@ -132,9 +137,14 @@ class PlayerNode(LoopNode):
                 f'{self._settings.wait_timeout:g} s: start the controller first, or set '
                 'wait_for_subscribers to 0')
 
+    def _now(self) -> float:
+        """Return the time in s at which messages are due."""
+        return (self.get_clock().now().nanoseconds / NANOSECONDS if self._simulated
+                else time.monotonic())
+
     def _play_in_time(self) -> None:
         """Publish the messages that are due, and wait for the next."""
-        while self._next is not None and self._due <= time.monotonic():
+        while self._next is not None and self._due <= self._now():
             message = self._next
             self._publish(message)
             self._next = next(self._messages, None)
@@ -145,8 +155,10 @@ class PlayerNode(LoopNode):
         if self._next is None:
             self._finish()
             return
-        left_ns = round((self._due - time.monotonic()) * NANOSECONDS)
-        self._timer.timer_period_ns = min(max(left_ns, 1), 100 * _POLL_PERIOD_NS)
+        left_ns = round((self._due - self._now()) * NANOSECONDS)
+        # a simulation may be faster than the wall's clock, which the timer follows
+        self._timer.timer_period_ns = _POLL_PERIOD_NS if self._simulated else min(
+            max(left_ns, 1), 100 * _POLL_PERIOD_NS)
         self._timer.reset()
         self._say_progress()
 

@@ -30,7 +30,7 @@ from koopman_ros.nodes import player
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.trainer import player_table, preset_wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.time_conversion import stamp_nanoseconds
+from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness
 from support.bag_samples import DEFAULT_QOS, TEMPERATURE
 from support.nodes import complaint, run_here, temperature, TIMEOUT
@@ -251,6 +251,21 @@ def test_setpoints_of_a_csv_are_steps_or_ramps_at_once_or_ahead(
     for message, after in zip(heard, stamps, strict=True):
         at = stamp_nanoseconds(message.header.stamp) / NANOSECONDS
         assert at == (0.0 if after is None else pytest.approx(began + after, abs=10.0))
+
+
+def test_setpoints_of_a_csv_are_due_in_the_time_of_a_simulation(
+        ros: Harness, tmp_path: Path) -> None:
+    (tmp_path / 'day.csv').write_text('time [s],temperature [degC]\n0,45\n3600,40\n')
+    heard = ros.listen(Temperature, reactor.SETPOINT)
+    clock = ros.node.create_publisher(Clock, topics.CLOCK, topics.CLOCK_QOS)
+    process = ros.start('player', {
+        'bag': tmp_path / 'day.csv', 'use_sim_time': True, 'setpoint_lead': 60.0})
+    for seconds, count in ((100.0, 1), (3640.0, 2)):
+        now = Clock(clock=stamp_message(round(seconds * NANOSECONDS)))
+        ros.wait_until(lambda now=now, count=count: (clock.publish(now), len(heard))[1] == count)
+    assert ros.wait_for_end(process) == 0
+    assert [(message.header.stamp.sec, message.temperature) for message in heard] == [
+        (100, 45.0), (3700, 40.0)]
 
 
 @pytest.mark.parametrize(('parameters', 'words'), [
