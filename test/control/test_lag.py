@@ -61,10 +61,9 @@ def test_a_law_that_knows_the_lag_costs_hardly_more_than_the_optimum(lag, durati
     assert SETPOINT - ignorant.states.min() > 0.3
 
 
-@pytest.mark.parametrize(('lag', 'duration'), [(18.0, 300.0), (60.0, 440.0)])
-def test_a_lag_leaves_no_offset_on_a_changed_plant(lag, duration):
-    loop = controller_of(lagged_model(lag))
-    run = step(loop, lag, duration, plant=FOULED, period=2.0)
+def test_a_lag_leaves_no_offset_on_a_changed_plant():
+    loop = controller_of(lagged_model(18.0))
+    run = step(loop, 18.0, 300.0, plant=FOULED, period=2.0)
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
     # the applied input is calculated, and the disturbance an equivalent change of it
     estimate, states = run.loop.state.estimate, loop.model.states
