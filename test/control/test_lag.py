@@ -61,8 +61,8 @@ def test_a_law_that_knows_the_lag_costs_hardly_more_than_the_optimum(lag, durati
     assert SETPOINT - ignorant.states.min() > 0.3
 
 
-@pytest.mark.parametrize(('lag', 'duration'), [(18.0, 300.0), (60.0, 440.0)])
-@pytest.mark.parametrize('estimator', ['', 'extended_kalman_filter'])
+@pytest.mark.parametrize(('lag', 'duration', 'estimator'), [
+    (18.0, 300.0, ''), (60.0, 440.0, 'extended_kalman_filter')])
 def test_a_lag_leaves_no_offset_on_a_changed_plant(lag, duration, estimator):
     loop = controller_of(lagged_model(lag), estimator=estimator)
     run = step(loop, lag, duration, plant=FOULED, period=2.0)

@@ -136,9 +136,8 @@ CHANGED_HERE = [*CHANGED][::2]
     *((CHANGED[name], {}) for name in CHANGED_HERE),
     (REACTOR, {'actuator': Actuator(lag=10.0, delay=1.0)}),
     # a biased measurement of the coolant brings no offset
-    *((CHANGED['UA −20 %'], {'input_sensor': lambda u, _, error=error: u + error})
-      for error in (-1.5, 1.5))],
-    ids=[*CHANGED_HERE, 'lag and delay', 'told less', 'told more'])
+    (CHANGED['UA −20 %'], {'input_sensor': lambda u, _: u - 1.5})],
+    ids=[*CHANGED_HERE, 'lag and delay', 'told less'])
 def test_what_is_not_the_model_is_brought_to_its_setpoint(plant, others):
     loop = asked(controller(), plant, **others)
     samples = loop.run(RESPONSE + MORE)
@@ -146,12 +145,11 @@ def test_what_is_not_the_model_is_brought_to_its_setpoint(plant, others):
     assert plant is REACTOR or abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
 
 
-@pytest.mark.parametrize('step', [-3.0, 1.5])
-def test_two_state_reactor_under_the_lift_of_the_one_state_one(step):
+def test_two_state_reactor_under_the_lift_of_the_one_state_one():
     plant = two_state_reactor()
     loop = Reactor(controller(), plant, kelvin=float(plant.nominal_state[1]))
     loop.run(10)
-    setpoint = float(plant.nominal_state[1]) + step
+    setpoint = float(plant.nominal_state[1]) - 3.0
     loop.ask(setpoint)
     # its own slow mode, -1.05/min, takes 224 s to fade to a fiftieth
     assert settled(loop.run(420), setpoint, 1e-3) <= 224 + 130

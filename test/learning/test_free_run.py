@@ -47,9 +47,9 @@ def drift(slope=A):
                       B * INPUTS.scale / STATES.scale[:, None])
 
 
-@pytest.mark.parametrize('model', [lifted(), lifted('min'), drift()])
-@pytest.mark.parametrize('states', [['position [m]', 'speed [m/s]'], ['speed [m/s]'],
-                                    ['speed [m/s]', 'position [m]']])
+@pytest.mark.parametrize(('model', 'states'), [
+    (lifted(), ['position [m]', 'speed [m/s]']), (lifted('min'), ['speed [m/s]']),
+    (drift(), ['speed [m/s]', 'position [m]']), (drift(), ['speed [m/s]'])])
 def test_a_right_model_follows_the_record(model, states):
     tables = [table(), {**table(1, (0.0, 1.5)), 'position': np.where(
         np.arange(N) % 20, np.nan, table(1, (0.0, 1.5))['position'])}]

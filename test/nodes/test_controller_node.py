@@ -190,6 +190,51 @@ def test_limits_ramp_and_weights_change_while_the_loop_runs(bench: Bench) -> Non
     assert bench.active_since(STEADY - 1.1) == at + 11.0
 
 
+def test_two_thermometers_of_one_clock_hold_the_coolant_while_both_measure(
+        bench: Bench) -> None:
+    ros, times = bench.ros, itertools.count(2)
+    ros.set_parameters('controller', recovery_time=0.0)
+    second = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
+
+    def held() -> bool:
+        at = next(times)
+        bench.measure(STEADY, float(at))
+        bench.sent += 1
+        second.publish(temperature(STEADY + 1.0, at + 0.5))
+        ros.wait_until(lambda: seconds(bench.commands[-1]) == at + 0.5)
+        return any(status.level == DiagnosticStatus.ERROR and status.message.startswith(
+            'the last command is held: two nodes') for status in ros.statuses)
+
+    ros.wait_until(held)
+    ros.node.destroy_publisher(second)
+    del ros.statuses[:]
+    bench.measure_until(lambda _: bool(ros.statuses) and (
+        ros.statuses[-1].level != DiagnosticStatus.ERROR), next(times) + 100.0)
+
+
+def test_what_the_operator_requests_is_done_without_measurements(bench: Bench) -> None:
+    ros = bench.ros
+    ros.set_parameters('controller', **{
+        'coolant_temperature.rate_limit': 4.0, 'temperature.setpoint_ramp': 4.0})
+    for k in range(1, 10):
+        bench.measure(STEADY, 1.0 + 0.1 * k)
+    manual = ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
+    ros.set_bool('controller/set_automatic', False)
+    last, held = len(bench.commands) - 1, bench.commands[-1].temperature
+    manual.publish(temperature(held - 3.0))
+    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 3.0))
+    ros.set_bool('controller/set_automatic', True)
+    bench.ask(STEADY - 3.0)
+    ros.wait_until(lambda: bench.active == pytest.approx(STEADY - 3.0))
+    bench.status(lambda s: s.level == DiagnosticStatus.WARN and (
+        'the last measurement is' in s.message))
+    # at most a second counts for the first command after a silence
+    own = bench.commands[last:]
+    for before, after in itertools.pairwise(own):
+        passed = seconds(after) - seconds(before)
+        assert abs(after.temperature - before.temperature) <= 4.0 * min(passed, 1.0) + 1e-6
+
+
 def measure_on(bench: Bench, count: int, first: float) -> float:
     """Measure a falling temperature once a second; return the time of the last."""
     for k in range(count):
@@ -362,7 +407,8 @@ def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
         status = ros.wait_for_status(f'{name}: control', lambda s: (
             'stop all but one' in s.message and 'UNKNOWN' not in s.message))
         assert status.level == DiagnosticStatus.WARN
-        assert status.message == (
+        # a busy machine may also complain of the age of the last measurement
+        assert status.message.startswith(
             '2 nodes command the coolant: /controller, /controller_2; stop all but one')
     assert '2 nodes command the coolant' in second.output()
     assert second.stop() == 0

@@ -240,47 +240,6 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
                         seconds(bench.commands[-1]) + 1.0)
 
 
-def test_two_thermometers_of_one_clock_hold_the_coolant_while_both_measure(ros: Harness) -> None:
-    bench, times = Bench(ros, {'recovery_time': 0.0}), itertools.count(2)
-    second = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
-
-    def held() -> bool:
-        at = next(times)
-        bench.measure(STEADY, float(at))
-        bench.sent += 1
-        second.publish(temperature(STEADY + 1.0, at + 0.5))
-        ros.wait_until(lambda: seconds(bench.commands[-1]) == at + 0.5)
-        return any(status.level == DiagnosticStatus.ERROR and status.message.startswith(
-            'the last command is held: two nodes') for status in ros.statuses)
-
-    ros.wait_until(held)
-    ros.node.destroy_publisher(second)
-    del ros.statuses[:]
-    bench.measure_until(lambda _: bool(ros.statuses) and (
-        ros.statuses[-1].level != DiagnosticStatus.ERROR), next(times) + 100.0)
-
-
-def test_what_the_operator_requests_is_done_without_measurements(ros: Harness) -> None:
-    bench = Bench(ros, {'coolant_temperature.rate_limit': 4.0, 'temperature.setpoint_ramp': 4.0})
-    for k in range(1, 10):
-        bench.measure(STEADY, 1.0 + 0.1 * k)
-    manual = ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
-    ros.set_bool('controller/set_automatic', False)
-    last, held = len(bench.commands) - 1, bench.commands[-1].temperature
-    manual.publish(temperature(held - 3.0))
-    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 3.0))
-    ros.set_bool('controller/set_automatic', True)
-    bench.ask(STEADY - 3.0)
-    ros.wait_until(lambda: bench.active == pytest.approx(STEADY - 3.0))
-    bench.status(lambda s: s.level == DiagnosticStatus.WARN and (
-        'the last measurement is' in s.message))
-    # at most a second counts for the first command after a silence
-    own = bench.commands[last:]
-    for before, after in itertools.pairwise(own):
-        passed = seconds(after) - seconds(before)
-        assert abs(after.temperature - before.temperature) <= 4.0 * min(passed, 1.0) + 1e-6
-
-
 def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
         ros: Harness, tmp_path: Path) -> None:
     ros.environment['ROS_HOME'] = str(tmp_path)
