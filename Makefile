@@ -122,8 +122,8 @@ studies-saddle: SEEDS = 10
 studies-saddle: $(VENV)/saddle.stamp  ## control of the unstable reactor, temperature measured only, SEEDS=10, 30 min
 	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
 
-studies-export: $(VENV)/run.stamp  ## compare exported C code with the controller: bundled models and 50 random ones, 10,000 samples each, 1 h
-	$(BIN)/python -m studies.exported_loops
+studies-export: $(VENV)/run.stamp  ## compare exported C code with the controller: bundled models and 50 random ones, 10,000 samples each, 1 h -> out/studies-export
+	$(BIN)/python -m studies.exported_loops --output out/studies-export
 
 studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## comparison with do-mpc and LQG on three partly measured plants, SEEDS=10, 5 min -> out/studies-partial

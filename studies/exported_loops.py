@@ -9,16 +9,16 @@ can be exported.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import itertools
+import json
 import math
 from pathlib import Path
 import re
 import subprocess
 import sys
 import tempfile
-import time
 from typing import Any
 
 import numpy as np
@@ -27,9 +27,11 @@ from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import StatusCode
-from koopman_ros.export import compiled_example
+from koopman_ros.execution import backend_of, Tell
+from koopman_ros.export import c_code, compiled
 from koopman_ros.export.c_code import CODES
 from koopman_ros.export.command_line import loop
+from koopman_ros.export.cortex_m4 import measured
 from koopman_ros.export.vectors import vectors
 from koopman_ros.model import (
     Coordinates,
@@ -43,6 +45,7 @@ from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.tuning import DisturbanceLimits, InputLimits, SensorLimits, Tuning
 
 INTERVAL = 0.5  # s, of the random loops
+_MEASURED = 20  # calls on an emulated Cortex-M4F
 FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wconversion', '-Werror', '-O1')
 SANITIZERS = ('-fsanitize=address,undefined', '-fno-sanitize-recover')
 #: largest relative difference of a command that is not due to rounding
@@ -69,44 +72,39 @@ class Agreement:
     rounding: tuple[float, float]
     different: tuple[int, ...]  #: samples with another level, status or cause
     seen: frozenset[tuple[str, ...]]  #: the levels, statuses and causes
-    seconds: float  #: of a step in C
 
 
 def compared(controller: Controller, samples: int, interval: float, seed: int = 0,
              compiler: str = 'gcc', flags: Sequence[str] = ()) -> Agreement:
     """Compile the code of a loop, run both over a sequence, and compare the answers."""
-    with tempfile.TemporaryDirectory() as place:
-        program = compiled_example(controller, interval, Path(place), compiler, (*FLAGS, *flags))
-        rows = list(vectors(controller, samples, interval, seed))
-        calls = ''.join(f'{",".join(call.row(controller))}\n' for call, _ in rows)
-        begin = time.perf_counter()
-        answers = _answers(program, calls)
-        seconds = (time.perf_counter() - begin) / samples
-        wanted, n = [answer for _, answer in rows], controller.model.n_u
-        error, different = disagreement(controller, wanted, answers)
-        rounding = (0.0, 0.0)
-        if error > TOLERANCE:
-            exact = [answer.split(',') for answer in _answers(_extended(Path(place)), calls)]
-            rounding = (disagreement(controller, exact, [','.join(row) for row in wanted])[0],
-                        disagreement(controller, exact, answers)[0])
+    rows = list(vectors(controller, samples, interval, seed))
+    calls = ''.join(f'{",".join(call.row(controller))}\n' for call, _ in rows)
+    wanted, n = [answer for _, answer in rows], controller.model.n_u
+    code = c_code(controller, interval)
+    answers = _answers(code, calls, compiler, (*FLAGS, *flags))
+    error, different = disagreement(controller, wanted, answers)
+    rounding = (0.0, 0.0)
+    if error > TOLERANCE:
+        exact = [answer.split(',') for answer in _answers(
+            {name: _extended(text) for name, text in code.items()}, calls, 'gcc', ('-O1',))]
+        rounding = (disagreement(controller, exact, [','.join(row) for row in wanted])[0],
+                    disagreement(controller, exact, answers)[0])
     return Agreement(error, rounding, different,
-                     frozenset(tuple(answer[n:]) for answer in wanted), seconds)
+                     frozenset(tuple(answer[n:]) for answer in wanted))
 
 
-def _answers(program: Path, calls: str) -> list[str]:
-    return subprocess.run([program], input=calls, capture_output=True, text=True,
-                          check=True).stdout.splitlines()
+def _answers(code: Mapping[str, str], calls: str, compiler: str, flags: Sequence[str]
+             ) -> list[str]:
+    with tempfile.TemporaryDirectory() as place:
+        program = compiled(code, Path(place), compiler, flags)
+        return subprocess.run([program], input=calls, capture_output=True, text=True,
+                              check=True).stdout.splitlines()
 
 
-def _extended(folder: Path) -> Path:
-    """Return the program of a folder, compiled with numbers of 80 bits."""
-    for path in folder.glob('*.[ch]'):
-        text = re.sub(r'\bdouble\b', 'long double', path.read_text())
-        path.write_text(text.replace('<math.h>', '<tgmath.h>').replace('%.17g', '%.20Lg'))
-    program = folder / 'extended'
-    subprocess.run(['gcc', '-O1', folder / 'controller.c', folder / 'example.c', '-lm', '-o',
-                    program], check=True)
-    return program
+def _extended(code: str) -> str:
+    """Return code for numbers of 80 bits."""
+    code = re.sub(r'\bdouble\b', 'long double', code)
+    return code.replace('<math.h>', '<tgmath.h>').replace('%.17g', '%.20Lg')
 
 
 def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answers: Sequence[str]
@@ -125,23 +123,68 @@ def disagreement(controller: Controller, wanted: Sequence[Sequence[str]], answer
 
 
 def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
-    """Yield name, loop and seconds between samples of each bundled model that can be exported."""
+    """Yield name, loop and seconds between samples of each bundled model."""
     for path in sorted((config_directory() / 'models').glob('*.safetensors')):
         name = path.stem
         parameters = config_directory() / 'plants' / f'{_PLANTS.get(name, name)}.yaml'
-        controller = loop(name, 'sdre', parameters)[1]
-        if not controller.model.inputs.characteristics:
-            yield name, controller, _INTERVALS.get(name, 1.0)
+        found = loop(name, 'sdre', parameters)[1]
+        # no analyser reports to a loop in C
+        tuning = replace(found.tuning, analysis_delay=0.0 * found.tuning.analysis_delay)
+        yield name, Controller(found.model, tuning, found.measured), _INTERVALS.get(name, 1.0)
 
 
-def random_loops(first: int = 0) -> Iterator[tuple[int, Controller]]:
-    """Yield loops with their numbers, without those whose outputs do not suffice."""
-    for seed in itertools.count(first):
+def random_loops() -> Iterator[tuple[str, Controller, float]]:
+    """Yield the same of random models, without those whose outputs do not suffice."""
+    for seed in itertools.count():
         try:
-            yield seed, random_loop(seed)
+            yield f'random {seed}', random_loop(seed), INTERVAL
         except ValueError as error:
             if 'do not determine' not in str(error):
                 raise
+
+
+def _row(samples: int, named: tuple[str, int], _: Tell) -> dict[str, Any]:
+    """Compare a loop, and measure the code of a bundled one; for the summary."""
+    name, seed = named
+    loops = itertools.chain(bundled_loops(), random_loops())
+    found, interval = next((found, interval) for one, found, interval in loops if one == name)
+    seen = compared(found, samples, interval, seed)
+    row = {'error': seen.error, 'rounding': seen.rounding, 'other_codes': len(seen.different),
+           # where rounding errors grow, the C code may have as large ones as the controller
+           'differs': bool(seen.different) or (
+               seen.error > TOLERANCE and not seen.rounding[1] <= 10.0 * seen.rounding[0])}
+    if not name.startswith('random'):
+        calls = [','.join(call.row(found))
+                 for call, _ in vectors(found, _MEASURED, interval, seed)]
+        with tempfile.TemporaryDirectory() as place:
+            compiled(c_code(found, interval), Path(place), 'gcc', FLAGS)
+            cortex = measured(Path(place), calls)
+        row |= {} if cortex is None else {
+            size: getattr(cortex, size) for size in ('code', 'state', 'stack', 'instructions')}
+    return row
+
+
+def agreement_text(summary: Mapping[str, Any]) -> str:
+    """Return the result of a comparison in a sentence."""
+    rows = summary['loops'].values()
+    rounded = [row for row in rows if row['error'] > TOLERANCE]
+    text = (f'{sum(row["differs"] for row in rows)} of {len(rows)} loops differ in '
+            f'{summary["samples"]:,} samples each; commands agree to '
+            f'{max(row["error"] for row in rows if row not in rounded):.0e}')
+    return f'{text}, but for rounding errors in {len(rounded)}' if rounded else text
+
+
+def sizes_text(summary: Mapping[str, Any]) -> str:
+    """Return what the code of the bundled models takes on a Cortex-M4F, from least to most."""
+    rows = [row for row in summary['loops'].values() if 'code' in row]
+
+    def least_to_most(name: str, unit: float) -> str:
+        values = [row[name] / unit for row in rows]
+        return f'{min(values):.2g} to {max(values):.2g}'
+
+    return (f'{least_to_most("code", 1e3)} kB of code, {least_to_most("state", 1e3)} kB of state, '
+            f'{least_to_most("stack", 1e3)} kB of stack, {least_to_most("instructions", 1e6)} '
+            'million instructions per step')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -149,26 +192,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser('exported_loops', description=__doc__)
     parser.add_argument('--samples', type=int, default=10_000)
     parser.add_argument('--random', type=int, default=50, help='number of random models')
+    parser.add_argument('--executor', default='joblib', help='as the parameter of the trainer')
+    parser.add_argument('--output', type=Path, help='folder of the summary')
     options = parser.parse_args(arguments)
-    wrong, worst = 0, 0.0
-    loops = itertools.chain(bundled_loops(), (
-        (f'random {seed}', controller, INTERVAL)
-        for seed, controller in itertools.islice(random_loops(), options.random)))
-    for k, (name, controller, interval) in enumerate(loops):
-        found = compared(controller, options.samples, interval, k)
-        # where rounding errors grow, the C code may have as large ones as the controller
-        bad = bool(found.different) or (
-            found.error > TOLERANCE and not found.rounding[1] <= 10.0 * found.rounding[0])
-        wrong, worst = wrong + bad, max(worst, found.error)
-        print(f'{name}: relative difference {found.error:.1e} (rounding errors '
-              f'{found.rounding[0]:.1e}, in C {found.rounding[1]:.1e}), '
-              f'{len(found.different)} other codes, '
-              f'{1e6 * found.seconds:.0f} us a step in C{" <- differs" if bad else ""}',
-              flush=True)
-    print(f'{wrong} loops differ; largest relative difference {worst:.1e}')
-    return int(wrong > 0)
-
-
+    loops = itertools.chain(bundled_loops(), itertools.islice(random_loops(), options.random))
+    items = {name: (name, seed) for seed, (name, _, _) in enumerate(loops)}
+    summary: dict[str, Any] = {'samples': options.samples, 'loops': {}}
+    with backend_of(options.executor) as backend:
+        for name, found in backend.run(_row, items, shared=options.samples):
+            summary['loops'][name] = found
+            print(f'{name}: {found}', flush=True)
+    print(agreement_text(summary), sizes_text(summary), sep='\n')
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+        (options.output / 'exported_loops.json').write_text(json.dumps(summary, indent=1) + '\n')
+    return int(any(one['differs'] for one in summary['loops'].values()))
 def random_loop(seed: int) -> Controller:
     """Return the loop of a number, with a time constant of about 20 s."""
     rng = np.random.default_rng(seed)

@@ -15,7 +15,7 @@ from koopman_ros.control import Controller
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo.loop import Row
-from koopman_ros.export import compiled_example
+from koopman_ros.export import c_code, compiled
 from koopman_ros.export.vectors import Call
 
 
@@ -32,8 +32,8 @@ class ExportedLoop:
         compiler = os.environ.get('CC', 'cc')
         if shutil.which(compiler) is None:
             raise ValueError(f'the C compiler {compiler} is not installed: install gcc, or set CC')
-        program = compiled_example(controller, sample_period, folder, compiler,
-                                   ('-std=c99', '-O2'))
+        program = compiled(c_code(controller, sample_period), folder, compiler,
+                           ('-std=c99', '-O2'))
         self._controller, self._step_time = controller, step_time
         self._setpoint = np.array([setpoints[name] for name in controller.controlled.names])
         self._process = subprocess.Popen([program], stdin=subprocess.PIPE,

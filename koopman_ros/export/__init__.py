@@ -3,6 +3,6 @@
 
 """Export of a control loop as C code."""
 
-from koopman_ros.export.c_code import c_code, compiled_example, ExportError
+from koopman_ros.export.c_code import c_code, compiled, ExportError
 
-__all__ = ['ExportError', 'c_code', 'compiled_example']
+__all__ = ['ExportError', 'c_code', 'compiled']

@@ -9,7 +9,7 @@ expressions: a network and its derivatives take thirty lines of C for any model,
 CasADi.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from importlib.resources import files
 import math
@@ -45,7 +45,8 @@ CODES = tuple(StatusCode[name] for name in (
 # they have none in C. Any other one that is set is refused.
 _WITHOUT_TABLE = re.compile(
     r'MODEL_(PROVENANCE|TIME_UNIT|PRE_FEEDBACK|DEAD_TIME)|OBSERVABLES_(V|IDENTITY|EXPONENTS)'
-    r'|(STATES|INPUTS|DISTURBANCES)_(NAMES|UNITS|LOWER|UPPER)|DISTURBANCES_TIMEOUT|SENSOR_DEADBAND'
+    r'|(STATES|INPUTS|DISTURBANCES)_(NAMES|UNITS|LOWER|UPPER)|INPUTS_CHARACTERISTICS'
+    r'|DISTURBANCES_TIMEOUT|SENSOR_DEADBAND'
     r'|TUNING_((STATE|INPUT)_WEIGHT|DEAD_TIME|CONTROLLED|OBSERVER_BANDWIDTH|MAX_DISTURBANCE'
     r'|(MEASUREMENT|DISTURBANCE|ANALYSIS)_NOISE|INITIAL_ERROR|UNCERTAIN_NOISE_FACTOR|ESTIMATOR'
     r'|FALLBACK_ORDER|(LEARNED|LINEAR)_MODEL_MARGIN|SAFE_VALUE|PLUGINS)')
@@ -57,12 +58,12 @@ class ExportError(ValueError):
 
 def c_code(controller: Controller, interval: float) -> dict[str, str]:
     """
-    Return ``controller.h`` and ``controller.c`` of a loop.
+    Return ``controller.h``, ``controller.c`` and ``example.c`` of a loop.
 
     :param interval: shortest time between two calls in s, for which inputs under way are kept.
     :raises ExportError: for a law, an estimator or a model that the C code does not support.
     """
-    texts = {name: template(name) for name in ('controller.h', 'controller.c')}
+    texts = {name: template(name) for name in ('controller.h', 'controller.c', 'example.c')}
     tables = _fields(controller, texts['controller.c']) | _tables(controller, interval)
     about = [f'A control loop of {controller.model.provenance.plant}, exported by koopman_ros '
              f'{__version__}.', *(f'{role}: {", ".join(f"{name} [{unit}]" for name, unit in of)}'
@@ -75,8 +76,7 @@ def c_code(controller: Controller, interval: float) -> dict[str, str]:
         'SIZES': '\n'.join(f'#define KOOPMAN_{name} {value}' for name, value in sizes.items()),
         'CODES': ',\n'.join(['    KOOPMAN_OK', *(f'    KOOPMAN_{code.name}' for code in CODES)]),
         'TABLES': '\n'.join(_table(name, value) for name, value in tables.items())}
-    return {name: re.sub('@([A-Z]+)@', lambda found: parts[found[1]], text)
-            for name, text in texts.items()}
+    return {name: filled(text, parts) for name, text in texts.items()}
 
 
 def template(name: str) -> str:
@@ -84,15 +84,18 @@ def template(name: str) -> str:
     return (files(__package__) / 'templates' / name).read_text()
 
 
-def compiled_example(controller: Controller, interval: float, folder: Path, compiler: str,
-                     flags: Sequence[str]) -> Path:
+def filled(text: str, parts: Mapping[str, str]) -> str:
+    """Return a template with its parts in place of their names."""
+    return re.sub('@([A-Z]+)@', lambda found: parts[found[1]], text)
+
+
+def compiled(code: Mapping[str, str], folder: Path, compiler: str, flags: Sequence[str]) -> Path:
     """
-    Write the code of a loop and the example to a folder, and compile them; return the program.
+    Write the code of a loop to a folder, and compile its example; return the program.
 
     :raises subprocess.CalledProcessError: where the code does not compile.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    code = {**c_code(controller, interval), 'example.c': template('example.c')}
     for name, text in code.items():
         (folder / name).write_text(text)
     program = folder / 'example'
@@ -170,8 +173,10 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         psi = np.hstack((np.eye(model.n_z, n) * model.identity, psi))
     else:
         psi = np.eye(model.n_z)
+    # of each input, without points where it has no characteristic
+    curves = [model.inputs.characteristics.get(name) for name in model.inputs.names]
     linear, unit, none = model.linearised, model.seconds_per_time_unit, np.zeros(0)
-    order = (model.n_z if closed(model) else n) + m
+    order = model.n_z if closed(model) else n
     fastest = np.max(np.abs(np.linalg.eigvals(linear.A))) if kalman else linear.fastest_rate
     dead = [round(seconds * 1e9) for seconds in tuning.dead_times(model).tolist()]
     return {
@@ -179,8 +184,8 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'ND': len(model.disturbances), 'NP': 2 * n if kalman else 1, 'NXU': n + m,
         'WIDTH': 1 + 2 * n if kalman else 1, 'N_PSI': psi.shape[1], 'N_PHI': psi.shape[1] - n,
         'LAWS': len(controller.levels), 'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
-        'MOST': max(max(order, n + m, n_y, 2 * n * kalman) ** 2, n * max(
-            model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
+        'MOST': max(max(order, m, n_y, 2 * n * kalman) ** 2, order * m, n * max(
+            n + m, model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
         'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
         'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == n_y, 'TIME_UNIT': unit,
@@ -204,6 +209,12 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'HALF_WIDTH': model.states.half_widths, 'CORNERS': model.states.corners,
         'LOWER_V': model.inputs.to_deviation(tuning.limits.lower),
         'UPPER_V': model.inputs.to_deviation(tuning.limits.upper),
+        'INPUTS_EFFECT': [float(u if curve is None else curve.effect(u)) for u, curve in zip(
+            model.inputs.center, curves, strict=True)],
+        'CURVES': np.cumsum([0, *(0 if one is None else len(one.values) for one in curves)]),
+        **{f'CURVE_{name.upper()}': [value for one in curves if one is not None
+                                     for value in getattr(one, name).tolist()]
+           for name in ('values', 'effects')},
         'SAFE': controller.safe_input, 'NOMINAL': controller.nominal_input,
         'DEAD_TIME': dead, 'LONGEST_DEAD_TIME': max(dead),
         'SHORTEST_DEAD_TIME': min(dead), 'MARGIN': controller.order.margins,

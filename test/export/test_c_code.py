@@ -12,10 +12,11 @@ import pytest
 
 from koopman_ros.control import Controller
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.paths import model_path
 from koopman_ros.export import c_code, ExportError
 from koopman_ros.export.command_line import main
+from koopman_ros.export.cortex_m4 import measured
+from koopman_ros.export.vectors import vectors
 from koopman_ros.model import LiftedModel, load, PolynomialObservables
 from koopman_ros.parameters.controller import built, table_of
 from studies.exported_loops import (
@@ -27,9 +28,9 @@ from studies.exported_loops import (
     random_loop,
     SANITIZERS,
 )
-from support import cortex_m4
 
 PLANTS = Path(__file__).parents[2] / 'config' / 'plants'
+CROSS_COMPILER = ('arm-none-eabi-gcc', 'qemu-system-arm')
 BUNDLED = {name: (controller, interval) for name, controller, interval in bundled_loops()}
 
 
@@ -39,8 +40,9 @@ def needs(*programs: str) -> pytest.MarkDecorator:
 
 @pytest.mark.parametrize(('name', 'compiler', 'flags'), [
     pytest.param(name, compiler, flags, marks=needs(compiler)) for name, compiler, flags in (
-        ('reactor_nz4', 'clang', ()), ('fed_reactor', 'gcc', ()), ('quadruple_tank', 'gcc', ()),
-        ('two_state_example', 'gcc', SANITIZERS), ('two_state_saddle', 'gcc', ()))])
+        ('reactor_nz4', 'clang', ()), ('fed_reactor', 'gcc', ()), ('heated_line', 'gcc', ()),
+        ('quadruple_tank', 'gcc', ()), ('two_state_example', 'gcc', SANITIZERS),
+        ('two_state_saddle', 'gcc', ()))])
 def test_code_of_bundled_models_gives_the_commands_and_codes_of_the_controller(
         name: str, compiler: str, flags: tuple[str, ...]) -> None:
     controller, interval = BUNDLED[name]
@@ -60,18 +62,24 @@ def test_code_of_any_kind_of_loop_gives_the_commands_and_codes_of_the_controller
     assert len({status for _, status, _ in seen}) >= 8
 
 
-@needs(cortex_m4.COMPILER, cortex_m4.EMULATOR)
+@needs(*CROSS_COMPILER)
 def test_a_cortex_m4_gives_the_same_commands(tmp_path: Path) -> None:
-    assert main(['reactor_nz4', '--parameters', str(PLANTS / 'reactor.yaml'), '--sample_period',
-                 '1', '--output', str(tmp_path)]) == 0
-    rows = (tmp_path / 'test_vectors.csv').read_text().splitlines()[1:41]
-    found = cortex_m4.run(tmp_path, '\n'.join(rows))
-    controller, _ = BUNDLED['reactor_nz4']
-    error, different = disagreement(controller, [row.split(',')[-4:] for row in rows],
-                                    found.answers.splitlines())
+    controller, interval = BUNDLED['reactor_nz4']
+    for name, text in c_code(controller, interval).items():
+        (tmp_path / name).write_text(text)
+    rows = list(vectors(controller, 20, interval))
+    found = measured(tmp_path, [','.join(call.row(controller)) for call, _ in rows])
+    assert found is not None
+    error, different = disagreement(controller, [answer for _, answer in rows], found.answers)
     assert error <= 1e-9
     assert not different
     assert found.stack < 20480
+
+
+def test_without_a_cross_compiler_nothing_is_measured(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('PATH', str(tmp_path))
+    assert measured(tmp_path, []) is None
 
 
 @needs('gcc')
@@ -93,7 +101,10 @@ def test_the_program_writes_an_example_that_repeats_its_test_vectors(
     error, different = disagreement(BUNDLED['two_tanks'][0], wanted, answers)
     assert error <= 1e-9
     assert not different
-    assert '@' not in (tmp_path / 'README.md').read_text()
+    readme = (tmp_path / 'README.md').read_text()
+    assert '@' not in readme
+    size = 'kB of stack' if all(map(shutil.which, CROSS_COMPILER)) else 'gcc-arm-none-eabi'
+    assert size in readme
 
 
 @pytest.mark.parametrize(('parameters', 'options', 'words'), [
@@ -118,11 +129,6 @@ def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
     with pytest.raises(ExportError, match='acados'):
         c_code(Controller(controller.model, replace(
             controller.tuning, fallback_order=('mpc', 'sdre'))), 1.0)
-    inputs = controller.model.inputs
-    curved = replace(controller.model, inputs=replace(inputs, characteristics={
-        inputs.names[0]: Characteristic.of([inputs.lower[0], 290.0, inputs.upper[0]], [0, 1, 3])}))
-    with pytest.raises(ExportError, match='characteristic'):
-        c_code(Controller(curved, controller.tuning), 1.0)
     powers = PolynomialObservables(np.array([[1], [11]]))
     model = replace(controller.model, observables=powers, A=-np.eye(2))
     with pytest.raises(ExportError, match='degree 11'):

@@ -11,7 +11,7 @@
 @TABLES@
 
 #define OF_X NX, STATES_CENTER, STATES_SCALE
-#define OF_U NU, INPUTS_CENTER, INPUTS_SCALE
+#define OF_U NU, INPUTS_EFFECT, INPUTS_SCALE
 #define OF_D ND, DISTURBANCES_CENTER, DISTURBANCES_SCALE
 #define NEVER INT64_MIN
 #define SECOND 1e9
@@ -62,12 +62,14 @@ static mat transposed(mat A) {
 
 static mat symmetric(mat A) { return scaled(0.5, plus(A, 1.0, transposed(A))); }
 
-static mat mul(mat A, mat B) {
-    mat C = zeros(A.m, B.n);
+/* C + f A B */
+static mat plus_mul(mat C, double f, mat A, mat B) {
     EACH(i, A.m) EACH(k, A.n) EACH(j, B.n)
-        C.a[i * B.n + j] += A.a[i * A.n + k] * B.a[k * B.n + j];
+        C.a[i * B.n + j] += f * A.a[i * A.n + k] * B.a[k * B.n + j];
     return C;
 }
+
+static mat mul(mat A, mat B) { return plus_mul(zeros(A.m, B.n), 1.0, A, B); }
 
 /* The block (m, n) of A from row i and column j on */
 static mat block(mat A, int i, int j, int m, int n) {
@@ -126,7 +128,7 @@ static mat solve(mat A, mat B) {
 static mat inverse(mat A) {
     mat X = scaled(1.0 / (size(A) * size(A) + 1e-300), transposed(A)), change = X;
     for (int k = 0; k < 100 && size(change) > 1e-9 * size(X); k++) {
-        change = plus(X, -1.0, mul(mul(X, A), X));
+        change = plus(X, -1.0, A.m < A.n ? mul(X, mul(A, X)) : mul(mul(X, A), X));
         X = plus(X, 1.0, change);
     }
     return X;
@@ -152,6 +154,28 @@ static mat deviation(int n, const double *center, const double *scale, const dou
 static mat physical(int n, const double *center, const double *scale, mat x) {
     EACH(i, n) x.a[i] = center[i] + x.a[i] * scale[i];
     return x;
+}
+
+/* The function of input i from `x` to `y`, piecewise linear with slope 1 beyond its ends: its
+ * characteristic or the inverse. */
+static double mapped(int i, const double *x, const double *y, double at) {
+    int k = CURVES[i], last = CURVES[i + 1] - 1;
+    double inside = last > k ? within(at, x[k], x[last]) : at;
+    if (last < k || isinf(at)) return at;
+    while (k < last - 1 && inside > x[k + 1]) k++;
+    return y[k] + (y[k + 1] - y[k]) / (x[k + 1] - x[k]) * (inside - x[k]) + (at - inside);
+}
+
+static mat input_deviation(const double *u) {
+    double effect[NU];
+    EACH(i, NU) effect[i] = mapped(i, CURVE_VALUES, CURVE_EFFECTS, u[i]);
+    return deviation(OF_U, effect);
+}
+
+static mat physical_input(mat v) {
+    v = physical(OF_U, v);
+    EACH(i, NU) v.a[i] = mapped(i, CURVE_EFFECTS, CURVE_VALUES, v.a[i]);
+    return v;
 }
 
 static double apart(const double *a, const double *b) {
@@ -305,32 +329,43 @@ static mat input_matrix(int linear, mat x, mat u, mat *J) {
     return B;
 }
 
-/* f(x) + B(x) u + w and, where J is not NULL, its derivative J (NX, NX + NU) by x and u */
-static mat rate_under(int linear, mat x, mat u, mat w, mat *J) {
-    mat slope, by_input, B = input_matrix(linear, x, u, &by_input);
-    mat f = drift(linear, x, J ? &slope : NULL);
+static mat joined(mat x, mat u) {
+    mat y = zeros(NXU, 1);
+    put(&y, 0, 0, x);
+    put(&y, NX, 0, u);
+    return y;
+}
+
+static mat state_of(mat y) { return block(y, 0, 0, NX, 1); }
+
+static mat input_of(mat y) { return block(y, NX, 0, NU, 1); }
+
+/* f(x) + B(x) u + w of y = (x, u) and, where J is not NULL, its derivative J (NX, NXU) */
+static mat rate_under(int linear, mat y, mat w, mat *J) {
+    mat x = state_of(y), slope, by_input, B = input_matrix(linear, x, input_of(y), &by_input);
+    w = plus(w, 1.0, drift(linear, x, J ? &slope : NULL));
     if (J) {
         *J = zeros(NX, NXU);
         put(J, 0, 0, plus(slope, 1.0, by_input));
         put(J, 0, NX, B);
     }
-    return plus(plus(f, 1.0, mul(B, u)), 1.0, w);
+    return plus_mul(w, 1.0, B, input_of(y));
 }
 
-/* D (NX, NX) with (B(x) - B(x_ref)) u = D (x - x_ref) */
-static mat input_secant(mat x, mat x_ref, mat u) {
+/* D (NX, NX) with (B(x) - B(x_ref)) u_ref = D (x - x_ref) for y_ref = (x_ref, u_ref) */
+static mat input_secant(mat x, mat y_ref) {
     mat D = zeros(NX, NX), J;
     EACH(node, N_TERMS ? 5 : 0) {
-        input_matrix(0, between(x_ref, x, node), u, &J);
+        input_matrix(0, between(state_of(y_ref), x, node), input_of(y_ref), &J);
         D = plus(D, SHARES[node], J);
     }
     return D;
 }
 
-/* The mean of the drift's derivative (NX, NX) between two states */
-static mat averaged(mat x, mat x_ref) {
-    mat mean = zeros(NX, NX), J;
-    if (READ_OUT) return secants(NX, MODEL_READOUT, x, x_ref, x, &J);
+/* The mean (NX, NX) of the derivative of f + B u_ref between two states */
+static mat averaged(mat x, mat y_ref) {
+    mat mean = input_secant(x, y_ref), x_ref = state_of(y_ref), J;
+    if (READ_OUT) return plus(mean, 1.0, secants(NX, MODEL_READOUT, x, x_ref, x, &J));
     EACH(node, 5) {
         drift(0, between(x_ref, x, node), &J);
         mean = plus(mean, SHARES[node], J);
@@ -340,112 +375,131 @@ static mat averaged(mat x, mat x_ref) {
 
 /* --- The sampled Riccati equation --- */
 
-/* F is replaced by D of exp(F h) = I + D, and W by the integral of exp(F t)' W exp(F t): their
- * power series over a part of h, which is then doubled. */
-static void over_interval(double h, mat *F, mat *W) {
-    mat D, S, power, term, SF;
-    int doublings;
-    frexp(size(*F) * h, &doublings);
-    doublings = doublings > -2 ? doublings + 2 : 0;
-    h = ldexp(h, -doublings);
-    D = power = scaled(h, *F);
-    S = term = scaled(h, *W);
-    for (int k = 2; k < 18; k++) {
-        power = scaled(h / k, mul(power, *F));
-        D = plus(D, 1.0, power);
-        SF = scaled(h / k, mul(term, *F));
-        term = plus(SF, 1.0, transposed(SF));
-        S = plus(S, 1.0, term);
-    }
-    for (; doublings > 0; doublings--) {
-        SF = mul(S, D);
-        S = plus(scaled(2.0, S), 1.0, plus(plus(SF, 1.0, transposed(SF)), 1.0,
-                                           mul(transposed(D), SF)));
-        D = plus(scaled(2.0, D), 1.0, mul(D, D));
-    }
-    *F = D;
-    *W = S;
-}
-
 /* P of the discrete equation P = A' P (I + G P)^-1 A + H with A = I + D, in place of H, by
  * doubling (E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77 (2004)); returns 0
  * where A does not vanish. D keeps its digits where the interval is short. */
 static int doubled(mat D, mat G, mat *H) {
     mat one = diagonal(D.n, 1.0);
     EACH(step, 40) {
-        mat left = plus(one, 1.0, mul(G, *H)), V = solve(left, G);
-        mat Y = solve(left, plus(D, -1.0, mul(G, *H)));     /* (I + G H)^-1 A = I + Y */
-        mat HY = plus(*H, 1.0, mul(*H, Y)), AV = plus(V, 1.0, mul(D, V));
-        *H = symmetric(plus(plus(*H, 1.0, HY), 1.0, mul(transposed(D), HY)));
-        G = symmetric(plus(plus(G, 1.0, AV), 1.0, mul(AV, transposed(D))));
-        D = plus(plus(D, 1.0, Y), 1.0, mul(D, Y));          /* A (I + Y) - I */
+        mat left = plus_mul(one, 1.0, G, *H), more;
+        mat Y = solve(left, plus_mul(D, -1.0, G, *H));      /* (I + G H)^-1 A = I + Y */
+        left = solve(left, G);
+        left = plus_mul(left, 1.0, D, left);
+        more = plus(G, 1.0, left);
+        G = symmetric(plus_mul(more, 1.0, left, transposed(D)));
+        left = plus_mul(*H, 1.0, *H, Y);
+        more = plus(*H, 1.0, left);
+        *H = symmetric(plus_mul(more, 1.0, transposed(D), left));
+        more = plus(D, 1.0, Y);
+        D = plus_mul(more, 1.0, D, Y);                      /* A (I + Y) - I */
         if (size(plus(one, 1.0, D)) < 1e-10) return all_finite(*H);
     }
     return 0;
 }
 
-/* D, G and P of the equation that `doubled` solves, of a plant F over an interval with the weights
- * W, or of one in continuous time. */
-static void reduced(mat F, mat W, int held, mat *D, mat *G, mat *P) {
-    int n = F.n - NU;
-    mat A = block(F, 0, 0, n, n), B = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
-    mat R = block(W, n, n, NU, NU), cross = block(W, n, 0, NU, n), by_cross = solve(R, cross);
-    *G = mul(B, solve(R, transposed(B)));
-    *D = plus(A, -1.0, mul(B, by_cross));
-    *P = plus(Q, -1.0, mul(transposed(cross), by_cross));
-    if (held) return;
-    /* by a Cayley transform beyond all modes, which leaves the solution as it is */
-    double far = size(A) + sqrt(size(*G) * size(Q));
-    mat less = plus(A, -1.0, diagonal(n, far)), back = solve(less, diagonal(n, 1.0));
-    mat X = mul(back, *G), Y = plus(transposed(less), 1.0, mul(Q, X));
-    Y = solve(Y, diagonal(n, 2.0 * far));
+/* Replace D, G and P of an equation in continuous time by those of the discrete one with the same
+ * solution: a Cayley transform beyond all modes. */
+static void discretised(mat *D, mat *G, mat *P, double far) {
+    mat one = diagonal(D->n, 1.0), less = plus(*D, -far, one), back = solve(less, one), Y;
+    less = plus_mul(transposed(less), 1.0, mul(*P, back), *G);
+    Y = solve(less, scaled(2.0 * far, one));
+    *G = mul(back, mul(*G, Y));
+    *P = mul(Y, mul(*P, back));
     *D = transposed(Y);
-    *G = mul(X, Y);
-    *P = mul(mul(Y, Q), back);
+}
+/* x' = A x + B u with the cost x' Q x + u' R u + 2 u' S x */
+typedef struct {
+    mat A, B, Q, S, R;
+} regulator;
+
+/* The same where the input is held for h, with A less I: of F = (A, B; 0, 0) exp(F h), and the
+ * integral of exp(F t)' W exp(F t), by their power series. */
+static void hold(double h, regulator *r) {
+    mat A = scaled(h, r->A), B = scaled(h, r->B), Q = scaled(h, r->Q), R, S = r->S;
+    r->A = A;
+    r->B = B;
+    r->Q = Q;
+    r->R = scaled(h, r->R);
+    mat power = A, by_input = B;
+    for (int k = 2; k < 18; k++) {
+        power = scaled(1.0 / k, mul(A, power));
+        by_input = scaled(1.0 / k, mul(A, by_input));
+        R = mul(S, B);
+        S = scaled(1.0 / k, plus_mul(mul(S, A), 1.0, transposed(B), Q));
+        Q = scaled(2.0 / k, symmetric(mul(Q, A)));
+        r->A = plus(r->A, 1.0, power);
+        r->B = plus(r->B, 1.0, by_input);
+        r->R = plus(r->R, 2.0 / k, symmetric(R));
+        r->S = plus(r->S, 1.0, S);
+        r->Q = plus(r->Q, 1.0, Q);
+    }
+}
+
+/* From an input that is held for h to one that is held twice as long */
+static void hold_twice(regulator *r) {
+    mat QA = plus_mul(r->Q, 1.0, r->Q, r->A), SB = mul(r->S, r->B), B_T = transposed(r->B);
+    r->R = plus(scaled(2.0, r->R), 2.0, symmetric(SB));
+    r->R = plus_mul(r->R, 1.0, B_T, mul(r->Q, r->B));
+    r->S = plus_mul(scaled(2.0, r->S), 1.0, r->S, r->A);
+    r->S = plus_mul(r->S, 1.0, B_T, QA);
+    r->Q = plus_mul(plus(r->Q, 1.0, QA), 1.0, transposed(r->A), QA);
+    r->B = plus_mul(scaled(2.0, r->B), 1.0, r->A, r->B);
+    r->A = plus_mul(scaled(2.0, r->A), 1.0, r->A, r->A);
+}
+
+/* The regulator of x' = A x + B u, of which the first NX states are weighted, with an input that is
+ * held for h; the continuous one where h is 0. */
+static regulator sampled(mat A, mat B, double h) {
+    regulator r = {A, B, zeros(A.n, A.n), zeros(NU, A.n), zeros(NU, NU)};
+    int doublings;
+    EACH(i, NX) r.Q.a[i * A.n + i] = STATE_WEIGHT[i];
+    EACH(i, NU) r.R.a[i * NU + i] = INPUT_WEIGHT[i];
+    if (!(h > 0.0)) return r;
+    frexp((size(A) + size(B)) * h, &doublings);
+    doublings = doublings > -2 ? doublings + 2 : 0;
+    hold(ldexp(h, -doublings), &r);
+    while (doublings-- > 0) hold_twice(&r);
+    return r;
 }
 
 /* The gain K (NU, n) of a solution P; returns a status. */
-static int gain_of(mat F, mat W, int held, mat P, mat *K) {
-    int n = F.n - NU;
-    mat A = block(F, 0, 0, n, n), B = block(F, 0, n, n, NU), Q = block(W, 0, 0, n, n);
-    mat PA = mul(P, A), PB = mul(P, B), square = scaled(held, mul(transposed(A), PA));
-    mat right = plus(block(W, n, 0, NU, n), 1.0, transposed(PB));
-    right = plus(right, held, mul(transposed(PB), A));
-    *K = solve(plus(block(W, n, n, NU, NU), held, mul(transposed(B), PB)), right);
-    mat feedback = mul(transposed(right), *K);
+static int gain_of(const regulator *r, int held, mat P, mat *K) {
+    mat PA = mul(P, r->A), right = transposed(mul(P, r->B)), inner = r->R, rest = r->Q;
+    if (held) inner = plus_mul(inner, 1.0, right, r->B);
+    if (held) right = plus_mul(right, 1.0, right, r->A);
+    right = plus(right, 1.0, r->S);
+    *K = solve(inner, right);
     /* the equation less P on both sides, whose terms shrink with the interval */
-    mat rest = plus(plus(Q, 1.0, square), -1.0, feedback);
-    rest = plus(plus(rest, 1.0, PA), 1.0, transposed(PA));
-    double terms = size(Q) + 2.0 * size(PA) + size(square) + size(feedback);
+    double terms = size(rest) + 2.0 * size(PA);
+    rest = plus(rest, 2.0, symmetric(PA));
+    PA = scaled(held, mul(transposed(r->A), PA));
+    right = mul(transposed(right), *K);
+    rest = plus(plus(rest, 1.0, PA), -1.0, right);
+    terms += size(PA) + size(right);
     if (!(size(rest) / terms <= TUNING_MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
     right = scaled(1.0 / TUNING_MAX_GAIN, *K);
     return contracts(mul(right, transposed(right))) ? KOOPMAN_OK : KOOPMAN_GAIN_TOO_LARGE;
 }
 
 /* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
- * continuous one where h is 0; the first NX states are weighted. Returns a status. */
+ * continuous one where h is 0. Returns a status. */
 static int riccati(mat A, mat B, double h, mat *K) {
-    int n = A.n, N = n + NU, held = h > 0.0;
-    mat F = zeros(N, N), W = F, D, G, P;
     if (!all_finite(A) || !all_finite(B)) return KOOPMAN_NOT_STABILISABLE;
-    put(&F, 0, 0, A);
-    put(&F, 0, n, B);
-    EACH(i, NX) W.a[i * N + i] = STATE_WEIGHT[i];
-    EACH(i, NU) W.a[(n + i) * N + n + i] = INPUT_WEIGHT[i];
-    if (held) over_interval(h, &F, &W);
-    reduced(F, W, held, &D, &G, &P);
-    return doubled(D, G, &P) ? gain_of(F, W, held, P, K) : KOOPMAN_NOT_STABILISABLE;
+    regulator r = sampled(A, B, h);
+    mat G = mul(r.B, solve(r.R, transposed(r.B))), P = solve(r.R, r.S);
+    A = plus_mul(r.A, -1.0, r.B, P);
+    P = plus_mul(r.Q, -1.0, transposed(r.S), P);
+    if (!(h > 0.0)) discretised(&A, &G, &P, size(r.A) + sqrt(size(G) * size(r.Q)));
+    return doubled(A, G, &P) ? gain_of(&r, h > 0.0, P, K) : KOOPMAN_NOT_STABILISABLE;
 }
 
 /* Whether e' = slope e - B K e(last sample) decays, or e' = (slope - B K) e where h is 0 */
 static int decays(mat slope, mat B, mat K, double h) {
-    mat F = zeros(NXU, NXU), W = F;
-    put(&F, 0, 0, h > 0.0 ? slope : plus(slope, -1.0, mul(B, K)));
-    if (h > 0.0) put(&F, 0, NX, B);
-    if (!all_finite(F) || !all_finite(K)) return 0;
-    over_interval(h > 0.0 ? h : 1.0, &F, &W);
-    return contracts(plus(plus(diagonal(NX, 1.0), 1.0, block(F, 0, 0, NX, NX)), -1.0,
-                          mul(block(F, 0, NX, NX, NU), K)));
+    int held = h > 0.0;
+    if (!held) slope = plus_mul(slope, -1.0, B, K);
+    if (!all_finite(slope) || !all_finite(B) || !all_finite(K)) return 0;
+    regulator r = sampled(slope, B, held ? h : 1.0);
+    return contracts(plus_mul(plus(diagonal(NX, 1.0), 1.0, r.A), -held, r.B, K));
 }
 
 /* --- The control law --- */
@@ -460,43 +514,44 @@ static mat limited(mat u, const double *previous, double seconds) {
     return u;
 }
 
-/* Of the re-centred law: e = N(x) - N(x_ref), M with e = M (x - x_ref), and loop and push of
- * e' = (A + H C) e + N' B v; returns its slope in terms of x. */
-static mat recentred(mat x, mat x_ref, mat u_ref, mat w, mat *loop, mat *push, mat *e, mat *M) {
-    mat N, N_ref, H, J, A = of(NZ, NZ, MODEL_A), pre = of(NX, NX, PRE_FEEDBACK);
-    mat D = input_secant(x, x_ref, u_ref), B_ref = input_matrix(0, x_ref, u_ref, &J);
-    w = plus(plus(w, 1.0, mul(B_ref, u_ref)), -1.0, mul(pre, x_ref));
+/* Of the re-centred law towards y_ref: e = N(x) - N(x_ref), M with e = M (x - x_ref), and loop and
+ * push of e' = (A + H C) e + N' B v; returns its slope in terms of x. */
+static mat recentred(mat x, mat y_ref, mat w, mat *loop, mat *push, mat *e, mat *M) {
+    mat x_ref = state_of(y_ref), u_ref = input_of(y_ref), N, H, J;
+    w = plus_mul(w, 1.0, input_matrix(0, x_ref, u_ref, &J), u_ref);
+    w = plus_mul(w, -1.0, of(NX, NX, PRE_FEEDBACK), x_ref);
     *M = secants(NZ, LIFT, x, x_ref, w, &H);
-    *e = plus(lift(NZ, LIFT, x, &N), -1.0, lift(NZ, LIFT, x_ref, &N_ref));
-    H = plus(H, 1.0, mul(N, plus(D, -1.0, pre)));
-    *loop = A;
-    put(loop, 0, 0, plus(block(A, 0, 0, NZ, NX), 1.0, H));
+    *e = lift(NZ, LIFT, x_ref, &N);
+    *e = plus(lift(NZ, LIFT, x, &N), -1.0, *e);
+    J = plus(input_secant(x, y_ref), -1.0, of(NX, NX, PRE_FEEDBACK));
+    H = plus_mul(H, 1.0, N, J);
+    *loop = of(NZ, NZ, MODEL_A);
+    put(loop, 0, 0, plus(block(*loop, 0, 0, NZ, NX), 1.0, H));
     *push = mul(N, input_matrix(0, x, u_ref, &J));
-    if (READ_OUT) return plus(averaged(x, x_ref), 1.0, D);
-    return mul(inverse(N), plus(mul(A, *M), 1.0, H));
+    if (READ_OUT) return averaged(x, y_ref);
+    return mul(inverse(N), plus_mul(H, 1.0, of(NZ, NZ, MODEL_A), *M));
 }
 
-/* The law u = u_ref - K e of a model towards a target (x_ref, u_ref): a command in its units,
- * within its range; returns a status. */
-static int law(int linear, const koopman_estimate *estimate, mat target, double interval, mat *u) {
-    mat x = of(NX, 1, estimate->x), x_ref = block(target, 0, 0, NX, 1);
-    mat u_ref = block(target, NX, 0, NU, 1), slope = of(NX, NX, SLOPE), J, K, M, e, loop, push;
+/* The law u = u_ref - K e of a model towards a target y_ref = (x_ref, u_ref): a command in its
+ * units, within its range; returns a status. */
+static int law(int linear, const koopman_estimate *from, mat y_ref, double interval, mat *u) {
+    mat x = of(NX, 1, from->x), slope = of(NX, NX, SLOPE), K, M, e, loop, push;
     double h = interval / TIME_UNIT;
     int status = KOOPMAN_NOT_STABILISABLE;
     if (CLOSED && !linear) {
-        slope = recentred(x, x_ref, u_ref, of(NX, 1, estimate->w), &loop, &push, &e, &M);
+        slope = recentred(x, y_ref, of(NX, 1, from->w), &loop, &push, &e, &M);
         status = riccati(loop, push, h, &K);
     }
-    push = input_matrix(linear, x, u_ref, &J);
+    push = input_matrix(linear, x, input_of(y_ref), &loop);
     if (status != KOOPMAN_OK) {
-        if (!linear) slope = plus(averaged(x, x_ref), 1.0, input_secant(x, x_ref, u_ref));
+        if (!linear) slope = averaged(x, y_ref);
         M = diagonal(NX, 1.0);
-        e = plus(x, -1.0, x_ref);
+        e = plus(x, -1.0, state_of(y_ref));
         status = riccati(slope, push, h, &K);
     }
     if (status != KOOPMAN_OK) return status;
     if (!decays(slope, push, mul(K, M), h)) return KOOPMAN_PREDICTED_UNSTABLE;
-    *u = physical(OF_U, plus(u_ref, -1.0, mul(K, e)));
+    *u = physical_input(plus_mul(input_of(y_ref), -1.0, K, e));
     if (!all_finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
     *u = limited(*u, NULL, 0.0);
     return KOOPMAN_OK;
@@ -507,7 +562,7 @@ static int law(int linear, const koopman_estimate *estimate, mat target, double 
 /* Solve f(x) + B(x) u + w = 0 for y = (x, u) by Gauss-Newton steps, each to the solution nearest
  * to an anchor in units of reach, 0 for a number that stays; returns 0 where there is none. */
 static int equilibrium(int linear, mat w, const double *reach, mat anchor, mat *y) {
-    mat J, rate = rate_under(linear, block(*y, 0, 0, NX, 1), block(*y, NX, 0, NU, 1), w, &J);
+    mat J, rate = rate_under(linear, *y, w, &J);
     EACH(count, 30) {
         mat by_reach = J, away = plus(*y, -1.0, anchor);
         double length = 0.0, slope;
@@ -526,7 +581,7 @@ static int equilibrium(int linear, mat w, const double *reach, mat anchor, mat *
         }
         *y = plus(*y, length > 0.5 ? 0.5 / length : 1.0, step);
         slope = size(J);
-        rate = rate_under(linear, block(*y, 0, 0, NX, 1), block(*y, NX, 0, NU, 1), w, &J);
+        rate = rate_under(linear, *y, w, &J);
         if (size(rate) <= 1e-9 * slope && (length <= 1e-6 || free <= NX)) return 1;
     }
     return 0;
@@ -568,13 +623,14 @@ static int find_target(int linear, const double *setpoint, mat w, mat *y) {
         reach[k] = 0.0;
     }
     if (CONTROLS_ALL) {
-        mat f = rate_under(linear, block(*y, 0, 0, NX, 1), zeros(NU, 1), w, &J);
+        put(y, NX, 0, zeros(NU, 1));
+        mat f = rate_under(linear, *y, w, &J);
         put(y, NX, 0, scaled(-1.0, mul(inverse(block(J, 0, NX, NX, NU)), f)));
     } else {
         if (!equilibrium(linear, w, reach, none, y)) return 0;
         bring_within(linear, w, reach, none, 0.0, INFINITY, NU - NC, y);
     }
-    u = physical(OF_U, block(*y, NX, 0, NU, 1));
+    u = physical_input(input_of(*y));
     EACH(i, NU) inside = inside && u.a[i] >= LIMITS_LOWER[i] && u.a[i] <= LIMITS_UPPER[i];
     if (NU > 1 && NC <= NU && !inside) {
         EACH(k, NXU) reach[k] = 1e3;
@@ -614,8 +670,9 @@ static int predicted(int linear, koopman_estimate *e, const double *input, doubl
     EACH(k, count) {
         mat sum = zeros(NX, WIDTH);
         EACH(stage, STAGES) {
-            mat at = plus(all, AHEAD[stage] * h, rate), x = block(at, 0, 0, NX, 1);
-            x = rate_under(linear, x, deviation(OF_U, input), of(NX, 1, e->w), KALMAN ? &J : NULL);
+            mat at = plus(all, AHEAD[stage] * h, rate), x;
+            x = rate_under(linear, joined(block(at, 0, 0, NX, 1), input_deviation(input)),
+                           of(NX, 1, e->w), KALMAN ? &J : NULL);
             if (KALMAN) rate = mul(block(J, 0, 0, NX, NX), at);
             put(&rate, 0, 0, x);
             EACH(i, KALMAN ? NX : 0) rate.a[i * WIDTH + 1 + NX + i] += 1.0;
@@ -658,7 +715,8 @@ static void correct(koopman_estimate *e, mat x, double seconds) {
  * which u and the measured disturbances, of the rate `feed`, hold the plant. */
 static void restart(int linear, koopman_estimate *e, mat x, const mat *u, mat feed) {
     mat w = e->known ? of(NX, 1, e->w) : zeros(NX, 1);
-    if (u) w = as_disturbance(scaled(-1.0, rate_under(linear, x, *u, zeros(NX, 1), NULL)));
+    if (u) w = as_disturbance(scaled(-1.0, rate_under(
+        linear, joined(x, *u), zeros(NX, 1), NULL)));
     if (u && ND > 0) w = as_disturbance(plus(w, -1.0, feed));
     store(x, e->x);
     store(w, e->w);
@@ -774,10 +832,9 @@ static mat position(const koopman_estimate *e, const double *y) {
     state = plus(state, 1.0, mul(onto, plus(rest, -1.0, mul(C, state))));
     if (e->known || !RESTS || !all_finite(state)) return state;
     EACH(k, NXU) reach[k] = k >= NX || !MEASURED[k];
-    found = zeros(NXU, 1);
-    put(&found, 0, 0, deviation(OF_X, state.a));
+    found = joined(deviation(OF_X, state.a), zeros(NU, 1));
     if (!equilibrium(0, zeros(NX, 1), reach, zeros(NXU, 1), &found)) return state;
-    return physical(OF_X, block(found, 0, 0, NX, 1));
+    return physical(OF_X, state_of(found));
 }
 
 /* Whether a measurement (NY) itself is so far from the training data that no law acts there. */
@@ -877,7 +934,7 @@ static int observe(koopman_state *s, const double *y, double elapsed, double *ou
     x = deviation(OF_X, state->a);
     if (!e->known) {
         if (s->commanded) piece(s, s->now, s->now, held);
-        u = deviation(OF_U, held);
+        u = input_deviation(held);
         restart(linear, e, x, s->commanded ? &u : NULL, feed_forward(s));
     } else if (moved || !(elapsed > 0.0) || (*outside > MARGIN[LAWS - 1] && far(y))
                || (silent * OBSERVER_BANDWIDTH > 2.0 && silent > 1.5 * s->interval)) {
@@ -965,7 +1022,7 @@ static void recover(koopman_state *s, int fault, double outside) {
     s->recovering = 0;
     if (s->supervisor.level != KOOPMAN_SAFE || fault != KOOPMAN_OK) return;
     mat x = deviation(OF_X, position(&s->estimate, s->accepted).a), J;
-    mat u = plus(deviation(OF_U, NOMINAL), -1.0, deviation(OF_U, SAFE));
+    mat u = plus(input_deviation(NOMINAL), -1.0, input_deviation(SAFE));
     mat toward = mul(transposed(x), mul(input_matrix(0, x, u, &J), u));
     if (outside > 0.0 ? !(toward.a[0] < 0.0) : !(was && s->led)) return;
     if (!was && !kept) return;

@@ -4,7 +4,7 @@
  * Start on QEMU's mps2-an386, and a wrapper that measures each step: with -icount shift=0 an
  * instruction takes 1 ns, and the timer counts at 25 MHz.
  */
-#include "controller.h"
+#include <controller.h>
 
 #include <stdio.h>
 
@@ -39,5 +39,6 @@ void __wrap_koopman_step(koopman_state *s, const koopman_inputs *in, koopman_out
     deep = (uint32_t)(top - below) * 4u;
     most = count > most ? count : most;
     deepest = deep > deepest ? deep : deepest;
-    fprintf(stderr, "%lu %lu\n", (unsigned long)most, (unsigned long)deepest);
+    fprintf(stderr, "%lu %lu %lu\n", (unsigned long)most, (unsigned long)deepest,
+            (unsigned long)sizeof *s);
 }
