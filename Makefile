@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help learn demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
+.PHONY: help learn demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-late studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -109,6 +109,9 @@ studies-sensors: $(VENV)/train.stamp  ## training on noisy sensor data, 10 seeds
 
 studies-robustness: $(VENV)/bench.stamp  ## margins, region of attraction, disturbances, noise, narrow data, 3 min -> out/studies-robustness
 	$(BIN)/python -m studies.robustness
+
+studies-late: $(VENV)/bench.stamp  ## dead times of 10 to 120 s, measured feed, learning a dead time, 2 min -> out/studies-late
+	$(BIN)/python -m studies.late_reactor
 
 studies-general: SEEDS = 10
 studies-general: $(VENV)/bench.stamp  ## control of seven plants with models of each class, SEEDS=10 -> out/studies-general

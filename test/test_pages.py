@@ -33,6 +33,7 @@ from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
+from studies import late_reactor
 from studies.records.table import table_of as records_table
 from support.nodes import type_support
 
@@ -116,9 +117,6 @@ DISTURBANCES = {  # names in the summary of the rows on the page
     '…, coolant lag 5; 10; 20 s': tuple(f'{STEP}, coolant lags by {n} s' for n in (5, 10, 20)),
     '…, lag, measured': tuple(
         f'{STEP}, coolant lags by {n} s, measured' for n in (5, 10, 20)),
-    '…, coolant 1; 10 s delay': (f'{STEP}, coolant one sample late', f'{STEP}, coolant 10 s late'),
-    '…, delay, measured': (
-        f'{STEP}, coolant one sample late, measured', f'{STEP}, coolant 10 s late, measured'),
     '…, coolant stuck at 298 K or above for 15 min; after it': (
         f'{STEP}, coolant stuck at 298.15 K for 15 min, after its end',),
     '…, stuck, measured': (
@@ -202,6 +200,17 @@ def test_table_of_noisy_data_has_the_figures_of_its_summary() -> None:
 def test_table_of_measured_records_is_that_of_its_summary() -> None:
     summary = json.loads((ROOT / 'docs/results/records.json').read_text())
     assert records_table(summary) in (ROOT / 'docs/results/records.md').read_text()
+
+
+def test_table_of_a_late_coolant_is_that_of_its_summary_and_keeps_its_bounds() -> None:
+    summary = json.loads((ROOT / 'docs/results/late_reactor.json').read_text())
+    assert late_reactor.table_of(summary) in (ROOT / 'docs/results/robustness.md').read_text()
+    assert summary['learned_dead_time_seconds'] == pytest.approx(
+        late_reactor.RECORD_LATE, abs=late_reactor.RECORD_PERIOD / 2.0)
+    for shares in summary['late'].values():
+        for found in shares.values():
+            assert found['overshoot_kelvin'] < 0.3
+            assert found['cost'] < 1.05 * summary['least_cost']
 
 
 @each_page

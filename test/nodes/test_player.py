@@ -4,6 +4,7 @@
 """The bag of a closed loop, and the player: recorded inputs into a fresh controller."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 import re
 import time
@@ -264,9 +265,13 @@ def test_setpoints_of_a_csv_are_due_in_the_time_of_a_simulation(
     clock = ros.node.create_publisher(Clock, topics.CLOCK, topics.CLOCK_QOS)
     process = ros.start('player', {
         'bag': tmp_path / 'day.csv', 'use_sim_time': True, 'setpoint_lead': 60.0})
-    for seconds, count in ((100.0, 1), (3640.0, 2)):
-        now = Clock(clock=stamp_message(round(seconds * NANOSECONDS)))
-        ros.wait_until(lambda now=now, count=count: (clock.publish(now), len(heard))[1] == count)
+
+    def received(seconds: float, count: int) -> bool:
+        clock.publish(Clock(clock=stamp_message(round(seconds * NANOSECONDS))))
+        return len(heard) == count
+
+    ros.wait_until(partial(received, 100.0, 1))
+    ros.wait_until(partial(received, 3640.0, 2))
     assert ros.wait_for_end(process) == 0
     assert [(message.header.stamp.sec, message.temperature) for message in heard] == [
         (100, 45.0), (3700, 40.0)]
