@@ -20,11 +20,6 @@ from koopman_ros.estimation import Estimate, ExtendedKalmanFilter
 from studies.equations import EQUATIONS
 from studies.partly_measured.cases import PartialCase
 
-with warnings.catch_warnings():
-    # it tells what it would do with other packages
-    warnings.simplefilter('ignore', UserWarning)
-    import do_mpc
-
 # It calls functions of numpy on values of casadi, which would warn of what is to come.
 casadi.GlobalOptions.setNumpyMode(-1)
 # of those tried among the quickest on every plant
@@ -34,6 +29,15 @@ _IPOPT: dict[str, Any] = {
 _PENALTY = 1e3  # of a violated limit of a state, in its scale
 _WINDOW = 20  # samples that the estimator looks back
 _SETTLING = 400  # samples after which a filter's covariance stands still
+
+
+def _do_mpc() -> Any:
+    """Import do-mpc, which takes 2 s, only where it plans."""
+    with warnings.catch_warnings():
+        # it tells what it would do with other packages
+        warnings.simplefilter('ignore', UserWarning)
+        import do_mpc
+    return do_mpc
 
 
 class DoMpcPlanner:
@@ -47,7 +51,7 @@ class DoMpcPlanner:
     def __init__(self, case: PartialCase) -> None:
         self._case, n, n_u = case, case.system.n_x, case.system.n_u
         self._model = _model(case, measuring=False)
-        self._planner = planner = do_mpc.controller.MPC(self._model)
+        self._planner = planner = _do_mpc().controller.MPC(self._model)
         interval = case.period / case.system.seconds_per_time_unit
         planner.settings.n_horizon = horizon(case)
         planner.settings.t_step = interval
@@ -119,7 +123,7 @@ class WithWindow:
     def __init__(self, case: PartialCase) -> None:
         self._case, self._planner = case, DoMpcPlanner(case)
         self._model = _model(case, measuring=True)
-        self._window = window = do_mpc.estimator.MHE(self._model, ['d'])
+        self._window = window = _do_mpc().estimator.MHE(self._model, ['d'])
         window.settings.n_horizon = _WINDOW
         window.settings.t_step = case.period / case.system.seconds_per_time_unit
         window.settings.meas_from_data = True
@@ -172,7 +176,7 @@ def _guess(case: PartialCase, y: Array) -> Array:
 def _model(case: PartialCase, *, measuring: bool) -> Any:
     """Return the plant with disturbances along some directions, as a model of do-mpc."""
     n, n_u = case.system.n_x, case.system.n_u
-    model = do_mpc.model.Model('continuous', 'SX')
+    model = _do_mpc().model.Model('continuous', 'SX')
     x = model.set_variable('_x', 'x', shape=(n, 1))
     u = model.set_variable('_u', 'u', shape=(n_u, 1))
     d = model.set_variable('_p', 'd', shape=(case.directions.shape[1], 1))
