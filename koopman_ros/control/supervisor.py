@@ -57,14 +57,9 @@ class FallbackOrder:
         return self.levels[self.depth(level) + 1]
 
     @property
-    def largest_margin(self) -> float:
-        """The distance beyond which no law acts."""
-        return self.margins[-1]
-
-    @property
     def return_margin(self) -> float:
         """The distance up to which a law takes over from the safe input."""
-        return _HYSTERESIS * self.largest_margin
+        return _HYSTERESIS * self.margins[-1]
 
 
 @dataclass(frozen=True, slots=True)
