@@ -38,6 +38,7 @@ class SplitRecord:
                  hidden: bool
                  ) -> None:
         self.plant, self.episodes = plant, list(episodes)
+        self._seed, self._hidden = seed, hidden
         signals = len(plant.state_names) + len(plant.input_names)
         self.parts = segments_of(episodes, signals)
         # which samples of all episodes each of them holds
@@ -62,6 +63,15 @@ class SplitRecord:
         #: usual time between samples
         self.period = sample_interval(self.parts)
 
+    def later(self, late: Sequence[int]) -> SplitRecord:
+        """Return the record with its first inputs later by numbers of samples."""
+        if not any(late):
+            return self
+        dead_time = np.zeros(len(self.plant.input_names))
+        dead_time[:len(late)] = self.period * np.array(late)
+        return SplitRecord(self.plant, [_moved(one, dead_time) for one in self.episodes],
+                           self._seed, hidden=self._hidden)
+
     def segments(self, parts: Sequence[int], samples: int | None = None) -> Segments:
         """Return some segments on grids, cut into pieces of a largest number of samples."""
         return Segments.of(self._pieces([self.parts[i] for i in parts], samples), self.step)
@@ -81,8 +91,11 @@ class SplitRecord:
         With them the predicted states (M, n_x) of their first samples, in deviations.
         """
         rows = [int(piece.x[0, 0]) for piece in cut(self._numbered, samples)]
-        return (Segments.of(cut(self.episodes, samples), self.step),
-                self._run(predictor).foreseen[rows])
+        return self.pieces(samples), self._run(predictor).foreseen[rows]
+
+    def pieces(self, samples: int) -> Segments:
+        """Return the whole record on grids, cut into pieces of a largest number of samples."""
+        return Segments.of(cut(self.episodes, samples), self.step)
 
     def innovations(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None
                     ) -> Array:
@@ -139,6 +152,15 @@ class SplitRecord:
     @staticmethod
     def _pieces(episodes: list[Episode], samples: int | None) -> list[Episode]:
         return episodes if samples is None else cut(episodes, samples)
+
+
+def _moved(episode: Episode, dead_time: Array) -> Episode:
+    """Return an episode of the same length whose inputs act later, the first one before it."""
+    begin = episode.input_time[0] - np.max(dead_time)
+    late = replace(episode, input_time=np.append(begin, episode.input_time),
+                   u=np.vstack((episode.u[:1], episode.u))).delayed(dead_time)
+    assert late is not None
+    return late
 
 
 def _linear(drift: Drift, episodes: Sequence[Episode]) -> DriftModel:

@@ -50,7 +50,7 @@ class Shared:
         """Return the candidate of a network."""
         linear = self.linear
         found = candidate_of(network, linear.start, self.data[0], linear.record, linear.hidden)
-        return found and replace(found, offsets=linear.offsets)
+        return found and replace(found, offsets=linear.offsets, late=linear.late)
 
 
 def add_networks(choice: Choice, shared: Shared, items: Mapping[str, tuple[int, int]],
@@ -63,12 +63,19 @@ def add_networks(choice: Choice, shared: Shared, items: Mapping[str, tuple[int, 
             monitors[name] = stage(name)
         return monitors[name]() and False
 
-    for units in UNITS:
+    for units in dict.fromkeys(units for units, _ in items.values()):
         own = {name: item for name, item in items.items() if item[0] == units}
         with contextlib.closing(backend.run(_network, own, shared=shared, watch=watch)) as results:
             fitted = [found for _, found in results if found is not None]
         best = min(fitted, key=lambda one: one.cost, default=None)
         choice.gains(None if best is None else shared.candidate(best), f'network of {units} units')
+
+
+def best_units(choice: Choice) -> int | None:
+    """Return the hidden units of the best network; None where there is none."""
+    networks = [(one.score.cost, len(one.model.b1)) for one in choice.candidates
+                if isinstance(one.model, NetworkDrift)]
+    return min(networks)[1] if networks else None
 
 
 def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[NetworkDrift] | None:

@@ -24,7 +24,10 @@ from koopman_ros.learning.identification.output_error import (
 from koopman_ros.learning.identification.realisation import realised
 from koopman_ros.learning.identification.structure_candidates import (
     candidate_of,
+    Choice,
+    compared,
     fitted_by_simulation,
+    not_measured,
     StructureCandidate,
 )
 from koopman_ros.model import Box
@@ -44,6 +47,7 @@ class PolynomialSearch:
 
     :param offsets: whether the inputs of the record are constant disturbances, too.
     :param late: dead times by which its inputs are later, in samples.
+    :ivar late: those dead times.
     :ivar deviation: (n_y,) standard deviations of the innovations of the last filter.
     :ivar samples: longest piece that is simulated; 0 until a model shows the plant's memory.
     """
@@ -51,9 +55,27 @@ class PolynomialSearch:
     def __init__(self, record: SplitRecord, samples: int = 0, *, offsets: bool = False,
                  late: tuple[int, ...] = ()) -> None:
         self.record, self._plant, self.samples = record, record.plant, samples
-        self._offsets, self._late = offsets, late
+        self._offsets, self.late = offsets, late
         self.deviation = np.ones(len(self._plant.state_names))
         self.learn_B = self._plant.B is None
+
+    def rising(self, counts: Sequence[int], choice: Choice,
+               stage: Callable[[str], Callable[..., bool]]) -> list[StructureCandidate]:
+        """Add linear models with numbers of unmeasured states, until one errs no less."""
+        found: list[StructureCandidate] = []
+        for count in counts:
+            name = f'drift of degree 1 with {not_measured(count)}'
+            monitor = stage(name)
+            if found and monitor():
+                break
+            one = self.linear(count, monitor)
+            choice.gains(one, name)
+            if one is None:
+                continue
+            found.append(one)
+            if found[:-1] and not compared(one.errors, found[-2].errors)[0]:
+                break
+        return found
 
     def linear(self, hidden: int, monitor: Callable[..., bool]) -> StructureCandidate | None:
         """Return the linear model of an order; None where simulations diverge."""
@@ -98,7 +120,7 @@ class PolynomialSearch:
                 if self.samples == samples:
                     break
         found = candidate_of(refined, start, data, self.record, hidden)
-        return found and replace(found, offsets=self._offsets, late=self._late)
+        return found and replace(found, offsets=self._offsets, late=self.late)
 
     def extended(self, linear: StructureCandidate) -> _Polynomial:
         """Return a linear model with further inputs of the record, which do nothing yet."""

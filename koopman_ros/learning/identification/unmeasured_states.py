@@ -18,12 +18,7 @@ from koopman_ros.learning.identification.alternatives import in_coordinates_of
 from koopman_ros.learning.identification.base import IdentificationMethod
 from koopman_ros.learning.identification.characteristics import identify_with_characteristics
 from koopman_ros.learning.identification.data_split import SplitRecord
-from koopman_ros.learning.identification.dead_time import (
-    LinearModels,
-    LONGEST,
-    Sampled,
-    SHARE,
-)
+from koopman_ros.learning.identification.degree_choice import NEARLY
 from koopman_ros.learning.identification.drift import (
     Drift,
     DriftModel,
@@ -51,8 +46,10 @@ from koopman_ros.learning.identification.innovations_form import (
     SETTLING,
     standardised,
 )
+from koopman_ros.learning.identification.late_candidates import late_as_suits, late_linear
 from koopman_ros.learning.identification.network_candidates import (
     add_networks,
+    best_units,
     network_starts,
     Shared,
 )
@@ -109,7 +106,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     if plant.B is None and not plant.disturbance_names and (
             n_x * (1 + n_x) * (1 + n_u) <= MOST_COEFFICIENTS):
         varying = estimate(replace(plant, input_matrix_degree=1), plant.input_names, 1)
-        (own, held_out), (other, others) = map(free_run_errors, (varying, measured))
+        (own, held_out), (other, others) = map(_free_run_errors, (varying, measured))
         better, words = compared(own, other)
         better &= bool(np.mean(held_out ** 2) < np.mean(others ** 2))
         steps = measured.drift.form, f'{varying.drift.form}: {words}'
@@ -135,7 +132,7 @@ def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Epi
         _EXPLAINED * found.noise ** 2, slight ** 2 * spread)))
 
 
-def free_run_errors(found: Identified) -> tuple[Array, Array]:
+def _free_run_errors(found: Identified) -> tuple[Array, Array]:
     """Return the errors (N, n_x) of free runs of all segments, and of those held out, scaled."""
     rate, scale = found.drift.rate, found.drift.box.states.scale
     data = Segments.of([*found.fitted, *found.held_out], longest_step(found.fitted))
@@ -157,11 +154,13 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     turn, see :meth:`Refined.left_out`, and from starts that are fitted to its first samples,
     whichever err more. First linear models of rising order are simulated, from realisations of
     stable models of the outputs, otherwise from filters; the search ends with the order that
-    lowers the mean squared error by no more than two standard errors, over blocks of the record. A
-    constant disturbance of each of several episodes is kept by the same rule. Then polynomials of
-    higher degree and small networks are added to the linear drift of the best order. The smallest
-    model is taken that errs by no more than two standard errors above the least. At last the gain
-    of its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to
+    lowers the mean squared error by no more than two standard errors, over blocks of the record.
+    Dead times, with which the order is found again, and a constant disturbance of each of several
+    episodes are kept by the same rule. Then polynomials of higher degree and small networks are
+    added to the linear drift of the best order, and networks to that with a state less or more if
+    it errs about as little; other dead times are tried with the best of them. The smallest model
+    is taken that errs by no more than two standard errors above the least. At last the gain of
+    its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to
     1, because no record gives their names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
@@ -169,7 +168,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     :param measured: an estimate without such states, which competes; without it there is at least
         one.
     :param highest_degree: of polynomials f.
-    :param dead_times: whether a linear drift of the best order is tried with dead times, too.
+    :param dead_times: whether dead times are tried, too.
     :param seed: of the split, and of networks.
     :param budget: processor time in s, after which the best so far is taken and the rest left out.
     :param backend: where networks are fitted; this process by default.
@@ -184,7 +183,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     warnings = check_inputs(plant, episodes)
     least = 1 if measured is None else 0
     networks = network_starts(seed)
-    total = hidden + 1 - least + highest_degree + len(networks) + 5
+    total = hidden + 1 - least + highest_degree + len(networks) + 6
     end, choice = time.process_time() + budget, Choice(() if measured is None else measured.steps)
     begun = itertools.count()
 
@@ -200,38 +199,35 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             choice.steps.append(f'stopped after {budget:.0f} s: {text}')
         return monitor
 
-    first, linear, n_y = PolynomialSearch(record), None, len(plant.state_names)
-    for count in range(least, hidden + 1):
-        name = f'drift of degree 1 with {not_measured(count)}'
-        monitor = stage(name)
-        if linear is not None and monitor():
-            break
-        found = first.linear(count, monitor)
-        if choice.gains(found, name):
-            linear = found
-        elif found is not None:
-            break
-    if linear is None:
-        raise ValueError('no drift fits the episodes: record longer, with steps of the input')
-    search = first
-    tried = list[StructureCandidate]()
-    monitor = stage('dead time')
+    n_y, search = len(plant.state_names), PolynomialSearch(record)
     manipulated = [dead_times and name not in plant.disturbance_names
                    for name in plant.input_names]
-    for late in _dead_times(record, linear, manipulated, monitor) if any(manipulated) else ():
-        if monitor():
-            break
-        moved = PolynomialSearch(SplitRecord(
-            plant, [_moved(one, record.period * np.array(late)) for one in episodes], seed,
-            hidden=True), first.samples, late=late)
-        if (found := moved.linear(linear.hidden, monitor)) is not None:
-            tried.append(found)
-    choice.gains(min(tried, key=lambda one: one.score.cost, default=None))
+    rising = search.rising(range(least, hidden + 1), choice, stage)
+    if not rising:
+        raise ValueError('no drift fits the episodes: record longer, with steps of the input')
+    linear, first = smallest_adequate(rising), search
+    late = least_late = None
+    if any(manipulated):
+        late = late_linear(search, linear, manipulated, stage('dead time'))
+        # states may stand for a dead time that a nonlinear drift shows
+        least_late = late_linear(search, rising[0], manipulated, stage('dead time')) if (
+            rising[0] is not linear) else None
+    if least_late is not None and compared(least_late.errors, rising[0].errors)[0]:
+        choice.gains(least_late)
+    else:
+        least_late = None
+    if choice.gains(late):
+        # without the dead time some of the states may have stood for it
+        assert late is not None
+        search = PolynomialSearch(late.record, first.samples, late=late.late)
+        rising = [*search.rising(range(least, late.hidden), choice, stage), late]
+        linear = smallest_adequate(rising)
+    extended = record
     if plant.B is None and 1 < len(episodes) <= MOST_EPISODES:
         monitor = stage('constant offset of each episode')
+        extended = SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True)
         more = PolynomialSearch(
-            SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True), first.samples,
-            offsets=True)
+            extended.later(search.late), first.samples, offsets=True, late=search.late)
         if choice.gains(more.simulated(more.extended(linear), linear.hidden, monitor),
                         'constant offset of each episode'):
             search, linear = more, choice.candidates[-1]
@@ -243,25 +239,53 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     count = linear.hidden
     monitor = stage(f'filter with {not_measured(count)}')
     last = begin = search.from_filters(count, monitor)
-    explained = 0.0 if last is None else _EXPLAINED * float(np.mean(search.deviation ** 2))
-    for degree in usual_degrees(n_y + count)[1:highest_degree] if count or not measured else ():
-        if last is None or choice.explained(explained):
+    # the filter of a linear drift foresees less of a nonlinear plant than its noise allows
+    noise = np.full(n_y, np.inf) if measured is None else (
+        measured.noise / measured.drift.box.states.scale)
+
+    def explained() -> bool:
+        return begin is not None and choice.explained(
+            _EXPLAINED * float(np.mean(np.fmin(search.deviation, noise) ** 2)))
+
+    for degree in usual_degrees(n_y + count)[1:highest_degree] if (
+            count or search.late or not measured) else ():
+        if last is None or explained():
             break
         name = f'drift of degree {degree} with {not_measured(count)}'
         monitor = stage(name)
         if not monitor():
             last = search.filtered(raised(last), monitor)
             choice.gains(None if last is None else search.simulated(last, count, monitor), name)
-    if not choice.explained(explained):
+    if not explained():
         # in coordinates of a filter, whose hidden states have the range of those in the record
         base = None if begin is None else search.simulated(begin, count, monitor)
         linear = base or linear
-        data, starts = search.record.simulated(linear.start, search.samples)
-        shared = Shared(linear, (data, starts if base is None else base.starts),
-                        search.learn_B, (end - time.process_time()) / len(networks))
-        add_networks(choice, shared, networks,
-                      lambda text: stage(f'{text} with {not_measured(count)}'),
-                      backend or Serial())
+
+        def shared(one: StructureCandidate, begun: StructureCandidate | None = None) -> Shared:
+            data, starts = one.record.simulated(one.start, search.samples)
+            return Shared(one, (data, starts if begun is None else begun.starts), search.learn_B,
+                          max(0.0, end - time.process_time()) / len(networks))
+
+        def stage_with(count: int) -> Callable[[str], Callable[..., bool]]:
+            return lambda text: stage(f'{text} with {not_measured(count)}')
+
+        add_networks(choice, shared(linear, base), networks, stage_with(count),
+                     backend or Serial())
+        others = [] if linear.offsets else [
+            *([] if least_late is None else [least_late]), *_nearly_equal(linear, rising)]
+        for other in others:
+            if stage(f'networks with {not_measured(other.hidden)}')():
+                break
+            units = best_units(choice)
+            add_networks(choice, shared(other), {
+                name: item for name, item in networks.items() if item[0] == (units or item[0])},
+                stage_with(other.hidden), backend or Serial())
+        best = smallest_adequate(choice.candidates)
+        if any(manipulated) and not (
+                isinstance(best.model.drift, DriftModel) and best.model.drift.linear):
+            choice.gains(late_as_suits(
+                best, extended if best.offsets else record, manipulated, search.samples,
+                stage(f'dead time of the {best.model.drift.form}')))
     # with as many as are allowed, more may be better
     searched = ('input_matrix_degree', *['unmeasured_states'] * (linear.hidden < hidden))
     able = choice.candidates
@@ -275,48 +299,31 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                            searched=searched)
         try:
             predictor = _with_gain(best, stage('gain of the filter', np.inf))
+            result = best.record.identified(
+                predictor, best.label, [one.score for one in choice.candidates],
+                stage('linear model', np.inf))
             break
         except ValueError:
             # its filter diverges
             able = [one for one in able if one is not best]
             if not able:
                 raise
-    result = replace(
-        best.record.identified(predictor, best.label, [one.score for one in choice.candidates],
-                               stage('linear model', np.inf)),
-        alternatives=in_coordinates_of(predictor, equals(best, able), best.record))
+    result = replace(result, alternatives=in_coordinates_of(
+        predictor, equals(best, able), best.record))
     if best.offsets:
         result = without_episode_inputs(result, len(plant.input_names))
     return replace(
         result, warnings=warnings, searched=searched, steps=choice.ended(best),
         free_run=best.score.rmse,
-        dead_time=record.period * np.array(best.late or np.zeros(len(plant.input_names))))
+        dead_time=record.period * np.resize(best.late or 0, len(plant.input_names)))
 
 
-def _dead_times(record: SplitRecord, linear: StructureCandidate, manipulated: Sequence[bool],
-                monitor: Callable[..., bool]) -> list[tuple[int, ...]]:
-    """Return those, in samples, with which single outputs err least, and their neighbours."""
-    n_y, episodes = linear.errors.shape[1], record.episodes
-    longest = min(LONGEST, max(map(len, episodes)) // SHARE)
-    data = [Sampled.of(one, record.period, longest) for one in episodes
-            if len(one) > 2 * longest]
-    if not data:
-        return []
-    best = LinearModels(data, -(-len(linear.gain) // n_y), n_y).best(
-        tuple(longest * own for own in manipulated), monitor)
-    beside = [tuple(np.add(best, sign * row).tolist())
-              for row in np.eye(len(manipulated), dtype=int)[list(manipulated)]
-              for sign in (1, -1)]
-    return [late for late in (best, *beside) if any(late) and min(late) >= 0]
-
-
-def _moved(episode: Episode, dead_time: Array) -> Episode:
-    """Return an episode of the same length whose inputs act later, the first one before it."""
-    begin = episode.input_time[0] - np.max(dead_time)
-    late = replace(episode, input_time=np.append(begin, episode.input_time),
-                   u=np.vstack((episode.u[:1], episode.u))).delayed(dead_time)
-    assert late is not None
-    return late
+def _nearly_equal(linear: StructureCandidate, others: Sequence[StructureCandidate]
+                  ) -> list[StructureCandidate]:
+    """Return those with a state less or more that err about as little."""
+    return [one for one in others if abs(one.hidden - linear.hidden) == 1 and (
+        one.score.cost <= NEARLY * linear.score.cost
+        or not compared(linear.errors, one.errors)[0])]
 
 
 def _with_gain(best: StructureCandidate, monitor: Callable[..., bool]) -> Predictor[Drift]:
