@@ -78,8 +78,7 @@ from koopman_ros.model import Coordinates
 HIGHEST_DEGREE = 3
 MOST_UNMEASURED = 3  # states that are tried where their number is not given
 BUDGET = 600.0  # s of processor time of a search
-# Likewise of a linear drift, with whose states characteristics are found, and such rounds.
-_ROUGH_BUDGET, _ROUNDS = 2.0, 2
+_ROUGH_BUDGET, _ROUNDS = 2.0, 2  # of linear drifts with whose states characteristics are found
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 
@@ -144,8 +143,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
 
 def _with_characteristics(plant: PlantDescription, episodes: Sequence[Episode],
                           names: Collection[str], **options: Any) -> PlantDescription:
-    """Return the plant with characteristics that a linear drift with unmeasured states shows."""
-    # those of a drift without them are rough
+    """Return the plant with characteristics that linear drifts with unmeasured states show."""
     for _ in range(_ROUNDS):
         rough = identify_unmeasured(plant, episodes, MOST_UNMEASURED, highest_degree=1,
                                     budget=_ROUGH_BUDGET, **options)
