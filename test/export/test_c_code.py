@@ -17,8 +17,16 @@ from koopman_ros.export import c_code, ExportError
 from koopman_ros.export.command_line import main
 from koopman_ros.export.cortex_m4 import measured
 from koopman_ros.export.vectors import vectors
-from koopman_ros.model import LiftedModel, load, PolynomialObservables
+from koopman_ros.model import (
+    Coordinates,
+    LiftedModel,
+    linearised_model,
+    load,
+    PolynomialObservables,
+    Provenance,
+)
 from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.tuning import Tuning
 from studies.exported_loops import (
     bundled_loops,
     compared,
@@ -129,6 +137,14 @@ def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
     with pytest.raises(ExportError, match='acados'):
         c_code(Controller(controller.model, replace(
             controller.tuning, fallback_order=('mpc', 'sdre'))), 1.0)
+    states, inputs = (Coordinates.spanning(names, ('1',) * len(names), -np.ones(len(names)),
+                                           np.ones(len(names)))
+                      for names in (('level', 'commanded_valve'), ('valve',)))
+    moved = linearised_model(np.array([[-1.0, 1.0], [0.0, -2.0]]), np.array([[0.0], [2.0]]),
+                             states, inputs, 's', Provenance('tank'))
+    with pytest.raises(ExportError, match='as_state'):
+        c_code(Controller(moved, Tuning.for_model(moved, estimator='extended_kalman_filter')),
+               1.0)
     powers = PolynomialObservables(np.array([[1], [11]]))
     model = replace(controller.model, observables=powers, A=-np.eye(2))
     with pytest.raises(ExportError, match='degree 11'):

@@ -38,6 +38,10 @@ _FEW_STEPS, _MOST_STEPS = 10, 40  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
 
 
+class NotMonotoneError(ValueError):
+    """The effect of an input rises and falls."""
+
+
 def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Episode], *,
                                   given: Collection[str] = (), **options: Any) -> Identified:
     """
@@ -51,13 +55,13 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
 
     :param plant: see :func:`identify`, like the options. Where it knows B nothing is tried.
     :param given: inputs whose characteristic the plant has already.
-    :raises ValueError: for an input whose effect rises and falls.
+    :raises NotMonotoneError: for an input whose effect rises and falls.
     """
     found = identify(plant, episodes, **options)
     if plant.B is not None:
         return found
     for name in plant.input_names:
-        if name not in given and (one := _characteristic(found, name)) is not None:
+        if name not in given and (one := characteristic_of(found, name)) is not None:
             plant = replace(plant, characteristics={**plant.characteristics, name: one})
             found = identify(plant, episodes, **options)
     other = _not_affine(found)
@@ -67,8 +71,13 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
             f'characteristics do: if the model is rejected, {NonAffineDrift.remedy}'))
 
 
-def _characteristic(found: Identified, name: str) -> Characteristic | None:
-    """Return the characteristic of an input; None where the record does not need one."""
+def characteristic_of(found: Identified, name: str) -> Characteristic | None:
+    """
+    Return the characteristic of an input; None where the record does not need one.
+
+    :param found: a polynomial drift, with the estimates of states that are not measured.
+    :raises NotMonotoneError: for an input whose effect rises and falls.
+    """
     drift, inputs = found.drift, found.drift.box.inputs
     assert isinstance(drift, DriftModel)
     functions = _hats(found, (name,), _POINTS)
@@ -85,7 +94,7 @@ def _characteristic(found: Identified, name: str) -> Characteristic | None:
     g = effects @ np.linalg.svd(effects)[2][0]
     g /= g[-1] if abs(g[-1]) > _FALL * np.max(np.abs(g)) else np.max(np.abs(g))
     if np.max(np.maximum.accumulate(g) - g) > _FALL:
-        raise ValueError(
+        raise NotMonotoneError(
             f'the effect of {name} rises and falls between {u[0]:.6g} and {u[-1]:.6g} '
             f'{inputs.units[inputs.names.index(name)]}, so that no control law can invert it: '
             'record a range in which it only rises or only falls')

@@ -9,14 +9,20 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 import itertools
 import time
+from typing import Any
 
 import numpy as np
 
+from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.identification.alternatives import in_coordinates_of
 from koopman_ros.learning.identification.base import IdentificationMethod
-from koopman_ros.learning.identification.characteristics import identify_with_characteristics
+from koopman_ros.learning.identification.characteristics import (
+    characteristic_of,
+    identify_with_characteristics,
+    NotMonotoneError,
+)
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.degree_choice import NEARLY
 from koopman_ros.learning.identification.drift import (
@@ -69,6 +75,7 @@ from koopman_ros.model import Coordinates
 HIGHEST_DEGREE = 3
 MOST_UNMEASURED = 3  # states that are tried where their number is not given
 BUDGET = 300.0  # s of processor time of a search
+_ROUGH_BUDGET, _ROUNDS = 2.0, 2  # of linear drifts with whose states characteristics are found
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 
@@ -88,6 +95,8 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     more than noise and than 1 % of the motion, the estimate competes with those of
     :func:`identify_unmeasured`.
 
+    A characteristic that the measured states show is found again with the estimates of the others.
+
     :param given: inputs whose characteristic the plant has already.
     :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
     """
@@ -97,7 +106,13 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
             watch=lambda done, total, text: watch(before * total + done, 5 * total, text))
 
     end = time.process_time() + BUDGET
-    measured = estimate(plant, given, 0)
+    try:
+        measured = estimate(plant, given, 0)
+        sought = measured.drift.characteristics.keys() - set(given)
+    except NotMonotoneError:
+        # so it may seem where a state between input and measurement is not measured
+        measured = estimate(plant, plant.input_names, 0)
+        sought = set(plant.input_names) - set(given)
     plant = replace(plant, characteristics=measured.drift.box.inputs.characteristics)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes, 0.0):
@@ -114,10 +129,34 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
                            searched=('input_matrix_degree',))
     if _explains(measured, plant, episodes, _SLIGHT):
         return measured
+    if sought:
+        plant = _with_characteristics(plant, episodes, sought, seed=seed, dead_times=dead_times,
+                                      backend=backend)
     return identify_unmeasured(
         plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,
         backend=backend, budget=max(0.0, end - time.process_time()),
         watch=lambda done, total, text: watch(2 * total + 3 * done, 5 * total, text))
+
+
+def _with_characteristics(plant: PlantDescription, episodes: Sequence[Episode],
+                          names: Collection[str], **options: Any) -> PlantDescription:
+    """Return the plant with characteristics that linear drifts with unmeasured states show."""
+    for _ in range(_ROUNDS):
+        rough = identify_unmeasured(plant, episodes, MOST_UNMEASURED, highest_degree=1,
+                                    budget=_ROUGH_BUDGET, **options)
+        found = dict[str, Characteristic]()
+        for name in names if isinstance(rough.drift, DriftModel) else ():
+            try:
+                if (one := characteristic_of(rough, name)) is not None:
+                    found[name] = one
+            except NotMonotoneError:
+                # one that was found before is kept
+                if name not in plant.characteristics:
+                    raise
+        if not found:
+            break
+        plant = replace(plant, characteristics={**plant.characteristics, **found})
+    return plant
 
 
 def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Episode],
