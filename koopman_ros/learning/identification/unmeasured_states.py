@@ -121,7 +121,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     if plant.B is None and not plant.disturbance_names and (
             n_x * (1 + n_x) * (1 + n_u) <= MOST_COEFFICIENTS):
         varying = estimate(replace(plant, input_matrix_degree=1), plant.input_names, 1)
-        (own, held_out), (other, others) = map(_free_run_errors, (varying, measured))
+        (own, held_out), (other, others) = map(free_run_errors, (varying, measured))
         better, words = compared(own, other)
         better &= bool(np.mean(held_out ** 2) < np.mean(others ** 2))
         steps = measured.drift.form, f'{varying.drift.form}: {words}'
@@ -171,7 +171,7 @@ def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Epi
         _EXPLAINED * found.noise ** 2, slight ** 2 * spread)))
 
 
-def _free_run_errors(found: Identified) -> tuple[Array, Array]:
+def free_run_errors(found: Identified) -> tuple[Array, Array]:
     """Return the errors (N, n_x) of free runs of all segments, and of those held out, scaled."""
     rate, scale = found.drift.rate, found.drift.box.states.scale
     data = Segments.of([*found.fitted, *found.held_out], longest_step(found.fitted))
