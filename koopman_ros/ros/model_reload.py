@@ -37,11 +37,9 @@ class _Trial:
     def __init__(self, node: Node, name: str, signals: Signals, situation: ModelCheckContext,
                  present: LiftedModel) -> None:
         self.outcome = Future()
-        self.path = name
-        # the folder in which the process was started may be gone
-        with contextlib.suppress(OSError):
-            self.path = os.path.abspath(os.path.expanduser(name))
+        self.path = _absolute(name)
         self.reading = True
+        self.written: int | None = None
         self.thread = threading.Thread(
             target=self._run, args=(name, signals, situation, present), daemon=True)
         self._node = node
@@ -50,6 +48,7 @@ class _Trial:
              present: LiftedModel) -> None:
         outcome: LoadedModel | str
         try:
+            self.written = _written(self.path)
             outcome = load_suitable(
                 name, signals, force=situation.parameters.load_rejected_model)
             refuse_setpoints(outcome.model, situation)
@@ -74,14 +73,29 @@ class _Trial:
                 executor.wake()
 
 
+def _absolute(name: str) -> str:
+    # the folder in which the process was started may be gone
+    with contextlib.suppress(OSError):
+        return os.path.abspath(os.path.expanduser(name))
+    return name
+
+
+def _written(path: str) -> int | None:
+    """Return when a file was written, in ns; None for the name of a bundled model."""
+    with contextlib.suppress(OSError):
+        return os.stat(path).st_mtime_ns
+    return None
+
+
 class ModelReload:
     """
     Replace the model of a running controller, or keep the current one with a reason.
 
     Files are read and tried in a thread, so that no measurement waits for a disk. The service
     answers when that is done; a parameter must be answered at once, because only then `ros2 param
-    set` can print why it was rejected. A read from a disk that does not answer cannot be ended: no
-    file is read twice at once, and few files together.
+    set` can print why it was rejected. If that takes too long, the next attempt takes the result.
+    A read from a disk that does not answer cannot be ended: no file is read twice at once, and few
+    files together.
 
     :param reloaded: called in the executor when the service has activated another model.
     :param refused: called there when a model was refused.
@@ -95,6 +109,7 @@ class ModelReload:
         self._node, self._situation = node, situation
         self._on_reloaded, self._on_refused = reloaded, refused
         self._accepted: LoadedModel | None = None
+        self._late: _Trial | None = None  # too late for the last change of the parameter
         self._reading: list[_Trial] = []
         self._ended = False
 
@@ -114,12 +129,7 @@ class ModelReload:
             return response
         if name != self.in_force.name:
             outcome = f'{self.in_force.name} became the current model while {name} was read'
-        if isinstance(outcome, LoadedModel):
-            try:
-                # the operator may have asked for another one meanwhile
-                refuse_setpoints(outcome.model, self._situation())
-            except ModelFileError as error:
-                outcome = str(error)
+        outcome = self._checked_again(outcome)
         if isinstance(outcome, LoadedModel):
             self._swap(outcome)
             self._on_reloaded()
@@ -131,16 +141,26 @@ class ModelReload:
 
     def accept(self, parameters: ControllerParameters, changes: Collection[str]) -> str:
         """Return why changed parameters give no usable model, or keep the model to activate."""
-        self._accepted = None
+        # a change of other parameters makes the result of the last trial invalid
+        self._accepted, late, self._late = None, self._late, None
         if 'model' not in changes:
             return ''
-        trial = self._start(parameters.model, replace(
+        alone = set(changes) == {'model'}
+        if late is not None and not (alone and late.path == _absolute(parameters.model) and (
+                late.reading or late.written == _written(late.path))):
+            late = None
+        trial = late or self._start(parameters.model, replace(
             self._situation(), parameters=parameters))
         if not trial.outcome.done():
             trial.thread.join(_SHORT_WAIT)
-        outcome = trial.outcome.result() if trial.outcome.done() else (
-            f'{parameters.model} is still being read after {_SHORT_WAIT:g} s: try again, or copy '
-            'it to a local disk')
+        if trial.outcome.done():
+            outcome = trial.outcome.result()
+            if late is not None:
+                outcome = self._checked_again(outcome)
+        else:
+            self._late = trial if alone else None
+            outcome = (f'{parameters.model} is still being read after {_SHORT_WAIT:g} s: try '
+                       'again, or copy it to a local disk')
         if isinstance(outcome, LoadedModel):
             self._accepted = outcome
             return ''
@@ -188,8 +208,17 @@ class ModelReload:
             trial.thread.start()
         return trial
 
+    def _checked_again(self, outcome: LoadedModel | str) -> LoadedModel | str:
+        """Check the set-points, which may have changed while the file was read."""
+        if isinstance(outcome, LoadedModel):
+            try:
+                refuse_setpoints(outcome.model, self._situation())
+            except ModelFileError as error:
+                return str(error)
+        return outcome
+
     def _swap(self, loaded: LoadedModel) -> None:
-        self.in_force, self.refused = loaded, ''
+        self.in_force, self.refused, self._late = loaded, '', None
         self.reloads += 1
         self._node.get_logger().info(f'{loaded.about}; {loaded.comparison}')
 

@@ -324,6 +324,23 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) ->
     assert 'Traceback' not in ros.printed()
 
 
+def test_a_slow_trial_serves_the_next_attempt_unless_the_file_has_changed(
+        ros: Harness, tmp_path: Path) -> None:
+    bench, file = start_controller(ros, tmp_path, 'model_reload._SHORT_WAIT = 0.0')
+
+    def accepted(name: str) -> bool:
+        return ros.set_parameters('controller', model=name)[0].successful
+
+    bench.measure()
+    assert not accepted('reactor_nz3')
+    ros.wait_until(lambda: accepted('reactor_nz3'))
+    # the result for a file that has been replaced since is not used
+    assert not accepted(str(file))
+    put(model_path('reactor_linear').read_bytes(), file)
+    ros.wait_until(lambda: accepted(str(file)))
+    ros.wait_until(lambda: f'model {file}: linear' in ros.printed())
+
+
 def test_dead_disk_does_not_pile_up_readers(
         ros: Harness, tmp_path: Path) -> None:
     # impatient, or this would last

@@ -75,7 +75,7 @@ from koopman_ros.model import Coordinates
 HIGHEST_DEGREE = 3
 MOST_UNMEASURED = 3  # states that are tried where their number is not given
 BUDGET = 300.0  # s of processor time of a search
-_ROUGH_BUDGET, _ROUNDS = 2.0, 2  # of linear drifts with whose states characteristics are found
+_ROUNDS = 2  # of linear drifts with whose states characteristics are found
 _EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 
@@ -143,7 +143,7 @@ def _with_characteristics(plant: PlantDescription, episodes: Sequence[Episode],
     """Return the plant with characteristics that linear drifts with unmeasured states show."""
     for _ in range(_ROUNDS):
         rough = identify_unmeasured(plant, episodes, MOST_UNMEASURED, highest_degree=1,
-                                    budget=_ROUGH_BUDGET, **options)
+                                    networks=False, **options)
         found = dict[str, Characteristic]()
         for name in names if isinstance(rough.drift, DriftModel) else ():
             try:
@@ -183,9 +183,9 @@ def free_run_errors(found: Identified) -> tuple[Array, Array]:
 
 def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hidden: int, *,
                         measured: Identified | None = None, highest_degree: int = HIGHEST_DEGREE,
-                        dead_times: bool = True, seed: int = 0, budget: float = BUDGET,
-                        watch: Watch = lambda *_: False, backend: Backend | None = None
-                        ) -> Identified:
+                        networks: bool = True, dead_times: bool = True, seed: int = 0,
+                        budget: float = BUDGET, watch: Watch = lambda *_: False,
+                        backend: Backend | None = None) -> Identified:
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
@@ -207,6 +207,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     :param measured: an estimate without such states, which competes; without it there is at least
         one.
     :param highest_degree: of polynomials f.
+    :param networks: whether networks are tried, too.
     :param dead_times: whether dead times are tried, too.
     :param seed: of the split, and of networks.
     :param budget: processor time in s, after which the best so far is taken and the rest left out.
@@ -221,8 +222,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     record = SplitRecord(plant, episodes, seed, hidden=True)
     warnings = check_inputs(plant, episodes)
     least = 1 if measured is None else 0
-    networks = network_starts(seed)
-    total = hidden + 1 - least + highest_degree + len(networks) + 6
+    sizes = network_starts(seed) if networks else {}
+    total = hidden + 1 - least + highest_degree + len(sizes) + 6
     end, choice = time.process_time() + budget, Choice(() if measured is None else measured.steps)
     begun = itertools.count()
 
@@ -295,7 +296,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         if not monitor():
             last = search.filtered(raised(last), monitor)
             choice.gains(None if last is None else search.simulated(last, count, monitor), name)
-    if not explained():
+    if sizes and not explained():
         # in coordinates of a filter, whose hidden states have the range of those in the record
         base = None if begin is None else search.simulated(begin, count, monitor)
         linear = base or linear
@@ -303,12 +304,12 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         def shared(one: StructureCandidate, begun: StructureCandidate | None = None) -> Shared:
             data, starts = one.record.simulated(one.start, search.samples)
             return Shared(one, (data, starts if begun is None else begun.starts), search.learn_B,
-                          max(0.0, end - time.process_time()) / len(networks))
+                          max(0.0, end - time.process_time()) / len(sizes))
 
         def stage_with(count: int) -> Callable[[str], Callable[..., bool]]:
             return lambda text: stage(f'{text} with {not_measured(count)}')
 
-        add_networks(choice, shared(linear, base), networks, stage_with(count),
+        add_networks(choice, shared(linear, base), sizes, stage_with(count),
                      backend or Serial())
         others = [] if linear.offsets else [
             *([] if least_late is None else [least_late]), *_nearly_equal(linear, rising)]
@@ -317,7 +318,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                 break
             units = best_units(choice)
             add_networks(choice, shared(other), {
-                name: item for name, item in networks.items() if item[0] == (units or item[0])},
+                name: item for name, item in sizes.items() if item[0] == (units or item[0])},
                 stage_with(other.hidden), backend or Serial())
         best = smallest_adequate(choice.candidates)
         if any(manipulated) and not (
