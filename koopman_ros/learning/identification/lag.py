@@ -190,7 +190,8 @@ def with_lag(found: Identified, lag: Array, commanded: Collection[str] = ()) -> 
     """
     Return an estimate on episodes of :func:`lagged` with the commands as inputs.
 
-    The applied inputs follow the unmeasured states.
+    The applied inputs follow the unmeasured states. The linear drift has no characteristic of a
+    state.
 
     :param lag: (n_u,) in time units, 0 for none.
     :param commanded: inputs without a lag in the record whose command becomes a state; the input
@@ -214,7 +215,9 @@ def with_lag(found: Identified, lag: Array, commanded: Collection[str] = ()) -> 
 
     return replace(
         found, drift=of_commands(found.drift), fitted=fitted, held_out=held_out,
-        linear=of_commands(found.linear),
+        linear=of_commands(replace(found.linear, box=replace(
+            found.linear.box, inputs=replace(found.linear.box.inputs,
+                                             characteristics=commands.characteristics)))),
         alternatives=tuple(map(of_commands, found.alternatives)),
         noise=np.append(found.noise, zeros(count)), hidden=found.hidden + count,
         offsets=np.hstack((found.offsets, zeros((len(found.offsets), count)))) if (

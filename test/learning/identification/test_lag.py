@@ -112,6 +112,7 @@ def test_a_characteristic_behind_a_lag_is_one_of_the_applied_input(lag):
     expected = (np.interp(values, [-1.0, 0.0, 1.0], [-0.2, 0.0, 1.0]) - ends[0]) / np.diff(ends)
     effect = (one.effect(values) - one.values[0]) / np.ptp(one.values)
     np.testing.assert_allclose(effect, expected, atol=0.04)
+    assert found.linear.characteristics.keys() == drift.box.inputs.characteristics.keys()
     # behind a lag the command acts linearly
     assert bool(drift.box.inputs.characteristics) is not lag.any()
     xi, v = np.array([0.3, -0.4])[:len(drift.box.states)], np.array([0.55])
