@@ -33,6 +33,7 @@ from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
+from studies import exported_loops
 from studies.records.table import table_of as records_table
 from support.nodes import type_support
 
@@ -202,6 +203,13 @@ def test_table_of_noisy_data_has_the_figures_of_its_summary() -> None:
 def test_table_of_measured_records_is_that_of_its_summary() -> None:
     summary = json.loads((ROOT / 'docs/results/records.json').read_text())
     assert records_table(summary) in (ROOT / 'docs/results/records.md').read_text()
+
+
+def test_page_of_the_c_code_has_the_figures_of_its_summary() -> None:
+    summary = json.loads((ROOT / 'docs/results/exported_loops.json').read_text())
+    page = ' '.join((ROOT / 'docs/how-to/export.md').read_text().split())
+    assert exported_loops.sizes_text(summary) in page
+    assert exported_loops.agreement_text(summary) in page
 
 
 @each_page
