@@ -32,7 +32,7 @@ from koopman_ros.export import c_code, compiled
 from koopman_ros.export.c_code import CODES
 from koopman_ros.export.command_line import loop
 from koopman_ros.export.cortex_m4 import measured
-from koopman_ros.export.vectors import vectors
+from koopman_ros.export.vectors import vectors, with_laws
 from koopman_ros.model import (
     Coordinates,
     LiftedModel,
@@ -45,7 +45,7 @@ from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.tuning import DisturbanceLimits, InputLimits, SensorLimits, Tuning
 
 INTERVAL = 0.5  # s, of the random loops
-_MEASURED = 20  # calls on an emulated Cortex-M4F
+_MEASURED, _CALLS = 10, 200  # commands of a law on an emulated Cortex-M4F, of so many calls
 FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wconversion', '-Werror', '-O1')
 SANITIZERS = ('-fsanitize=address,undefined', '-fno-sanitize-recover')
 #: largest relative difference of a command that is not due to rounding
@@ -154,8 +154,7 @@ def _row(samples: int, named: tuple[str, int], _: Tell) -> dict[str, Any]:
            'differs': bool(seen.different) or (
                seen.error > TOLERANCE and not seen.rounding[1] <= 10.0 * seen.rounding[0])}
     if not name.startswith('random'):
-        calls = [','.join(call.row(found))
-                 for call, _ in vectors(found, _MEASURED, interval, seed)]
+        calls = with_laws(found, list(vectors(found, _CALLS, interval, seed)), _MEASURED)
         with tempfile.TemporaryDirectory() as place:
             compiled(c_code(found, interval), Path(place), 'gcc', FLAGS)
             cortex = measured(Path(place), calls)
@@ -175,7 +174,7 @@ def agreement_text(summary: Mapping[str, Any]) -> str:
 
 
 def sizes_text(summary: Mapping[str, Any]) -> str:
-    """Return what the code of the bundled models takes on a Cortex-M4F, from least to most."""
+    """Return memory and instructions of the bundled models on a Cortex-M4F, least to most."""
     rows = [row for row in summary['loops'].values() if 'code' in row]
 
     def least_to_most(name: str, unit: float) -> str:

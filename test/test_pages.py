@@ -33,7 +33,7 @@ from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
-from studies import late_reactor
+from studies import exported_loops, late_reactor
 from studies.records.table import table_of as records_table
 from support.nodes import type_support
 
@@ -211,6 +211,13 @@ def test_table_of_a_late_coolant_is_that_of_its_summary_and_keeps_its_bounds() -
         for found in shares.values():
             assert found['overshoot_kelvin'] < 0.3
             assert found['cost'] < 1.05 * summary['least_cost']
+
+
+def test_page_of_the_c_code_has_the_figures_of_its_summary() -> None:
+    summary = json.loads((ROOT / 'docs/results/exported_loops.json').read_text())
+    page = ' '.join((ROOT / 'docs/how-to/export.md').read_text().split())
+    assert exported_loops.sizes_text(summary) in page
+    assert exported_loops.agreement_text(summary) in page
 
 
 @each_page

@@ -17,13 +17,13 @@ from koopman_ros import __version__
 from koopman_ros.control import Controller
 from koopman_ros.export.c_code import c_code, ExportError, filled, signals, template
 from koopman_ros.export.cortex_m4 import measured
-from koopman_ros.export.vectors import columns, vectors
+from koopman_ros.export.vectors import columns, vectors, with_laws
 from koopman_ros.parameters.controller import built, OF_THE_MODEL, table_of
 from koopman_ros.parameters.model_checks import load_suitable, LoadedModel
 from koopman_ros.parameters.signal_topics import file_parameters
 
 _VECTORS = 200
-_MEASURED = 20  # of these calls, on an emulated Cortex-M4F
+_MEASURED = 10  # commands of a law, on an emulated Cortex-M4F
 _NOT_MEASURED = ('Code size, stack and instructions are not measured: install gcc-arm-none-eabi, '
                  'libnewlib-arm-none-eabi and qemu-system-arm, and export again.')
 
@@ -87,9 +87,9 @@ def write(loaded: LoadedModel, controller: Controller, sample_period: float, out
     """Write the files of a loop into a folder."""
     code = c_code(controller, sample_period)
     table, origin = io.StringIO(), loaded.model.provenance
+    rows = list(vectors(controller, _VECTORS, sample_period))
     csv.writer(table, lineterminator='\n').writerows([columns(controller), *(
-        [*call.row(controller), *answer]
-        for call, answer in vectors(controller, _VECTORS, sample_period))])
+        [*call.row(controller), *answer] for call, answer in rows)])
     facts = {
         'TITLE': f'Control loop of {origin.plant}', 'VERSION': __version__, 'MODEL': loaded.name,
         'DIGEST': loaded.digest, 'ACCEPTANCE': origin.acceptance,
@@ -100,6 +100,6 @@ def write(loaded: LoadedModel, controller: Controller, sample_period: float, out
     output.mkdir(parents=True, exist_ok=True)
     for name, text in code.items():
         (output / name).write_text(text)
-    found = measured(output, table.getvalue().splitlines()[1:_MEASURED + 1])
+    found = measured(output, with_laws(controller, rows, _MEASURED))
     facts['MEASURED'] = str(found or _NOT_MEASURED)
     (output / 'README.md').write_text(filled(template('README.md'), facts))

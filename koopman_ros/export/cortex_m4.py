@@ -16,8 +16,8 @@ _MACHINE = ('-M', 'mps2-an386', '-cpu', 'cortex-m4', '-nographic', '-monitor', '
             'none', '-icount', 'shift=0', '-semihosting-config', 'enable=on,target=native')
 
 
-class Measurement(NamedTuple):
-    """What the code takes, and its answers to some calls."""
+class CortexM4(NamedTuple):
+    """Memory and instructions of the code, and its answers to some calls."""
 
     code: int  #: bytes of code and constants, without the C library
     state: int  #: bytes of a ``koopman_state``
@@ -27,12 +27,12 @@ class Measurement(NamedTuple):
 
     def __str__(self) -> str:
         return (f'On a Cortex-M4F, with {" ".join(_FLAGS[1:3])}: {self.code / 1e3:.0f} kB of code '
-                f'and constants besides the C library, {self.state / 1e3:.1f} kB of state, '
+                f'and constants without the C library, {self.state / 1e3:.1f} kB of state, '
                 f'{self.stack / 1e3:.1f} kB of stack and up to {self.instructions / 1e6:.1f} '
                 'million instructions per step (QEMU, first test vectors).')
 
 
-def measured(folder: Path, calls: Sequence[str]) -> Measurement | None:
+def measured(folder: Path, calls: Sequence[str]) -> CortexM4 | None:
     """
     Compile an exported folder and run its example; None without a cross compiler or QEMU.
 
@@ -51,7 +51,7 @@ def measured(folder: Path, calls: Sequence[str]) -> Measurement | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     instructions, stack, state = map(int, ran.stderr.splitlines()[-1].split())
-    return Measurement(int(text) + int(data), state, stack, instructions, ran.stdout.splitlines())
+    return CortexM4(int(text) + int(data), state, stack, instructions, ran.stdout.splitlines())
 
 
 def _run(*command: object, calls: str = '') -> subprocess.CompletedProcess[str]:

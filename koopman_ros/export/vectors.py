@@ -3,7 +3,7 @@
 
 """Test vectors: a loop with faults, answered by the controller that is exported."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -136,6 +136,14 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
             np.where(fault == 'lost', np.nan, d))
         state, command, report = answered(controller, state, call, now_ns)
         yield call, answer_row(controller, command, report, state.command is not None)
+
+
+def with_laws(controller: Controller, rows: Sequence[tuple[Call, list[str]]], count: int
+              ) -> list[str]:
+    """Return the first calls, as rows of a table, up to the given number of answers by a law."""
+    laws = [int(answer[-3]) < len(controller.levels) for _, answer in rows]
+    last = int(np.searchsorted(np.cumsum(laws), count)) + 1
+    return [','.join(call.row(controller)) for call, _ in rows[:last]]
 
 
 def _moved(controller: Controller, x: Array, u: Array, w: Array, seconds: float) -> Array:

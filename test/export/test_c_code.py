@@ -16,7 +16,7 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.export import c_code, ExportError
 from koopman_ros.export.command_line import main
 from koopman_ros.export.cortex_m4 import measured
-from koopman_ros.export.vectors import vectors
+from koopman_ros.export.vectors import vectors, with_laws
 from koopman_ros.model import (
     Coordinates,
     LiftedModel,
@@ -75,13 +75,16 @@ def test_a_cortex_m4_gives_the_same_commands(tmp_path: Path) -> None:
     controller, interval = BUNDLED['reactor_nz4']
     for name, text in c_code(controller, interval).items():
         (tmp_path / name).write_text(text)
-    rows = list(vectors(controller, 20, interval))
-    found = measured(tmp_path, [','.join(call.row(controller)) for call, _ in rows])
+    rows = list(vectors(controller, 40, interval))
+    calls = with_laws(controller, rows, 10)
+    found = measured(tmp_path, calls)
     assert found is not None
-    error, different = disagreement(controller, [answer for _, answer in rows], found.answers)
+    error, different = disagreement(
+        controller, [answer for _, answer in rows[:len(calls)]], found.answers)
     assert error <= 1e-9
     assert not different
-    assert found.stack < 20480
+    assert found.stack < 16384
+    assert found.instructions > 100_000  # a law was among the calls
 
 
 def test_without_a_cross_compiler_nothing_is_measured(
