@@ -36,7 +36,7 @@ def parameters_of(names: Sequence[str]) -> dict[str, type[Any]]:
     found = dict(_PARAMETERS)
     for name in names:
         if name not in METHODS:
-            # only a class of one's own needs what the contract imports
+            # only a user's class needs the imports of the base class
             from koopman_ros.learning.identification import IdentificationMethod
             found[short_name(name)] = plugin_class(
                 name, 'identification method', METHODS, IdentificationMethod).Parameters

@@ -86,7 +86,7 @@ def _numbers(pattern: str, text: str) -> list[float]:
     ('pendulum', ('out/tutorials/pendulum_samples.png', 'out/tutorials/pendulum_loop.png')),
     ('tanks', ('results/two_tanks_record.png', 'results/two_tanks_loop.png')),
     ('beam', ('out/tutorials/buckled_beam.png',))])
-def test_pictures_are_where_they_were_asked_for_with_units(
+def test_pictures_are_written_to_the_given_folder_with_units(
         name: str, files: tuple[str, ...], request: pytest.FixtureRequest) -> None:
     run = request.getfixturevalue(name)
     for file in files:
@@ -96,7 +96,7 @@ def test_pictures_are_where_they_were_asked_for_with_units(
         assert re.search(r' \[(s|min|rad|rad/s|N|N m|m|V|mm|mm/s)\]$', label), label
 
 
-def test_classes_on_the_pendulum_are_told_apart_and_the_rule_is_as_stated(pendulum: Run) -> None:
+def test_classes_on_the_pendulum_differ_and_the_rule_is_as_stated(pendulum: Run) -> None:
     found, by_hand = pendulum.names['found'], pendulum.names['by_hand']
     rows = {one.name: one for one in found.contenders}
     assert list(rows) == ['linear', 'polynomial', 'neural drift', 'identity lift', 'free lift']
@@ -350,7 +350,7 @@ def test_page_quotes_the_tutorials() -> None:
     assert sorted(listed) == sorted(path.stem for path in TUTORIALS.glob('*.py'))
 
 
-def test_page_without_ros_prints_what_it_shows(
+def test_the_page_without_ros_shows_the_real_output(
         tanks: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (ROOT / 'docs' / 'tutorials' / 'without_ros.md').read_text()
     block, printed = (''.join(re.findall(rf'```{kind}\n(.*?)```', page, re.DOTALL))

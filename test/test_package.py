@@ -98,7 +98,7 @@ def _third_party(*folders: str) -> set[str]:
 # catkin_pkg's own
 @pytest.mark.filterwarnings('ignore::DeprecationWarning')
 @pytest.mark.parametrize('control_only', [False, True])
-def test_manifest_declares_what_is_imported(control_only: bool) -> None:
+def test_the_manifest_declares_all_imports(control_only: bool) -> None:
     keys = _keys()
     key_of = {module: key for kind in ('ros', 'apt', 'pip') for key, modules in keys[kind].items()
               for module in modules}
@@ -210,7 +210,7 @@ def test_no_class_name_has_two_meanings() -> None:
     assert sorted(name for name, count in Counter(found).items() if count > 1) == []
 
 
-def test_nothing_installed_imports_what_is_not_and_few_packages_torch() -> None:
+def test_installed_code_imports_only_installed_code_and_few_packages_import_torch() -> None:
     users, compiled = set(), set()
     for path in ROOT.glob('koopman_ros/**/*.py'):
         roots = {name.split('.')[0] for name in _imports(path)}

@@ -65,7 +65,7 @@ def test_commands_are_right_as_they_stand(page: Path, tmp_path: Path) -> None:
 
 
 @each_page
-def test_python_on_pages_compiles_and_finds_what_it_imports(page: Path) -> None:
+def test_python_on_pages_compiles_and_its_imports_exist(page: Path) -> None:
     for block in re.findall(r'^```python\n(.*?)^```', page.read_text(), re.DOTALL | re.MULTILINE):
         for node in ast.walk(ast.parse(textwrap.dedent(block))):
             if isinstance(node, ast.ImportFrom):
@@ -248,7 +248,7 @@ def test_pages_and_packages_are_listed_and_short() -> None:
     assert sum(len(page.read_text().split()) for page in ROOT.glob('docs/**/*.md')) < 20_000
 
 
-def test_continuous_integration_runs_what_the_pages_say() -> None:
+def test_continuous_integration_runs_documented_commands() -> None:
     commands = re.findall(r'^make .*$', (ROOT / '.ci' / 'run').read_text(), re.MULTILINE)
     pages = (ROOT / 'README.md').read_text() + (ROOT / 'CONTRIBUTING.md').read_text()
     assert len(commands) > 3
@@ -312,7 +312,7 @@ def test_interfaces_list_the_message_types() -> None:
     assert len(rows) > 4
 
 
-def test_interfaces_list_what_there_is_of_each_signal() -> None:
+def test_interfaces_list_the_parameters_of_each_signal() -> None:
     """Beside its places, with the unit of each."""
     rows = {row[0]: row[1:] for row in _rows('reference/interfaces.md') if 'unit]' in row[1]}
     for node, cells in rows.items():
@@ -330,7 +330,7 @@ def test_interfaces_list_what_there_is_of_each_signal() -> None:
     assert len(rows) == 3
 
 
-def test_operation_quotes_what_diagnostics_say() -> None:
+def test_the_page_of_faults_quotes_real_diagnostics() -> None:
     quotes = [quote for row in _rows('reference/faults.md') if len(row) == 4
               for quote in re.findall('`(.+?)`', row[2])]
     assert len(quotes) > 15

@@ -13,7 +13,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array, change_within
 from koopman_ros.tuning import InputLimits
 
-# In input units; what is left then is below the resolution of any actuator.
+# In input units; a smaller remainder is below the resolution of any actuator.
 _NEGLIGIBLE = 1e-9
 
 

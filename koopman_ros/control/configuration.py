@@ -39,7 +39,7 @@ class Configuration:
         expect(model=(self.model, LiftedModel), tuning=(self.tuning, Tuning))
         object.__setattr__(self, 'tuning', self.tuning.for_signals(
             self.model, self.measured.names))
-        # what cannot be built is refused now, and what was built is kept
+        # reject now if a part cannot be built, and keep the built parts
         assert self.order
 
     @cached_property

@@ -223,7 +223,7 @@ class Controller(ControlStep):
             with np.errstate(all='ignore'):
                 state = self.estimation.take_over(predecessor.estimation, state)
                 if not (same or every):
-                    # what is measured next is held until there is another request
+                    # the next measurement is held until there is another request
                     state = replace(state, setpoint=setpoints.Setpoint())
                 level = self.levels.get(state.law or '')
                 if (level is None or state.law_input is None or state.estimate is None

@@ -165,7 +165,7 @@ class StateEstimation:
 
         def travel(then: Standstill) -> Array:
             if before is None or outside > 0.0 or state.recovery is not None:
-                # what the model says of its motion is worth little; under the safe input even a
+                # the model hardly predicts its motion; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
             moved = self.predict(replace(state, estimate=replace(before, w=then.w)), time)
@@ -190,14 +190,14 @@ class StateEstimation:
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
             if not self.outputs.determine_state:
-                # the measurement has changed what it leaves open, too
+                # the measurement has changed the unmeasured states, too
                 x = self.position(predicted, y)
                 outside = self.model.distance(x)
             if fresh:
                 history = History()
         elif (verdict.fault.code is StatusCode.FROZEN and predicted is not None
                 and last is not None):
-            # what the observer made of a sensor that does not move is no disturbance
+            # the estimate from a frozen sensor is no disturbance
             predicted, history = replace(predicted, w=last.standstill.w), History()
         now = replace(state, accepted=verdict.accepted, time_ns=time.now_ns, estimate=predicted,
                       history=history)
@@ -257,7 +257,7 @@ class StateEstimation:
         started, forward = estimator.restart(None, xi, u), self.feed_forward(state)
         if forward is None or u is None:
             return started
-        # measured disturbances are a part of what keeps it there
+        # measured disturbances are part of the holding input
         return estimator.transferred(started, estimator.model.drift(started.x) - forward)
 
     def _factor(self, quality: tuple[int, ...] | None) -> Array | None:
@@ -355,7 +355,7 @@ class StateEstimation:
                 estimate, predecessor.level(state.supervisor), self.level(state.supervisor)))
         x = old.states.to_physical(estimate.x)
         if old.states.names != new.states.names:
-            # of what is not measured the new model has a view of its own
+            # the new model has its own estimate of the unmeasured states
             x = self.position(None, predecessor.outputs.of(x))
             return replace(state, accepted=None, recovery=None, estimate=self._started(
                 state, new.states.to_deviation(x), self.acting(state, now_ns)))
@@ -375,5 +375,5 @@ class StateEstimation:
         forward = self.feed_forward(state)
         moved = estimator.transferred(moved, np.zeros_like(moved.w) if forward is None
                                       else -forward)
-        # what it holds of the disturbance is in the old model's units, and distances from its data
+        # its disturbance is in the old model's units, and distances refer to its data
         return replace(state, estimate=moved, accepted=None, recovery=None)

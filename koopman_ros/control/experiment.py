@@ -17,7 +17,7 @@ from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
 from koopman_ros.estimation.sensor_checks import out_of_range
 
 _FOLLOWS_WITHIN = 1e-3  # of an input's range
-_COMES_NEARER = 1e-5  # likewise, less than any rate limit allows between two commands
+_COMES_NEARER = 1e-5  # as well, less than any rate limit allows between two commands
 
 
 class ExperimentPhase(Enum):

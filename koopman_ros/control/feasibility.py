@@ -20,7 +20,7 @@ from koopman_ros.model import Coordinates
 _HALVINGS = 24  # to 1e-7 of the way
 _MOST_MOVES = 10
 _SINGULAR = 1e9  # condition from which on a model has no steady state for each input
-# What rounding may add to an input, in scaled deviations, and to a state, in half-ranges.
+# Rounding errors of an input, in scaled deviations, and of a state, in half-ranges.
 _SLACK = 1e-6
 # With fewer inputs than controlled states a set-point counts as held if a steady state is within
 # this distance, in half-ranges of the training box: operators enter rounded values.

@@ -14,11 +14,11 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.model import LiftedModel
 
 # The input is ahead of the plant by this share of the way from the safe input to the nominal
-# one; a sensor that stands still out there brings it no further.
+# one; a frozen sensor moves it no further.
 _LEAD = 0.25
-# Moved is what changes its distance from the middle of the training box by this share of it.
+# A state has moved if its distance from the middle of the training box changes by this share.
 _MOVED = 0.03
-# At rest is what has not moved for so many times as a better level is waited for.
+# A state is at rest if it has not moved for so many times the recovery time.
 _REST = 3.0
 # A model is followed in steps of this share of its box and of the time in which its rate changes,
 # until less than a share of the box is left of its way.
@@ -100,7 +100,7 @@ def rest_under(model: LiftedModel, u: Array, known: float) -> RestState:
         with np.errstate(all='ignore'):
             return _followed(model, u, known)
     except np.linalg.LinAlgError:
-        # a model that gives no numbers: what it is to do in the loop fails likewise
+        # a model that gives no finite numbers also fails in the loop
         return RestState(np.full(model.n_x, np.nan), np.nan)
 
 

@@ -87,7 +87,7 @@ def at_its_time(setpoint: Setpoint, effective_ns: int, now_ns: int | None) -> Ar
 def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
     """Whether a stamp is a schedule: later than the last measurement, by at most an hour."""
     if now_ns is None:
-        # nobody knows yet; the first measurement decides
+        # not known yet; the first measurement decides
         return effective_ns > 0
     return now_ns < effective_ns <= now_ns + HORIZON_NANOSECONDS
 

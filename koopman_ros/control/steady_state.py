@@ -15,11 +15,11 @@ from koopman_ros.model import LiftedModel
 _MOST_STEPS = 30
 # A step is no longer than this, in scaled deviations: Newton's method far out overshoots.
 _LONGEST_STEP = 0.5
-# Solved is what is left of the rate when it is worth so little of a deviation.
+# The equation is solved if the remaining rate corresponds to so small a deviation.
 _RESOLUTION = 1e-9
 # With inputs to spare the nearest solution is found when a step is no longer than this.
 _STILL = 1e-6
-_SLACK = 1e-6  # of what rounding may add to an input, in scaled deviations
+_SLACK = 1e-6  # rounding error of an input, in scaled deviations
 # Weight of the states against the inputs where the nearest steady state is wanted.
 _REACH = 1e3
 
@@ -95,7 +95,7 @@ def partial_target(model: LiftedModel, controlled: NDArray[np.intp], setpoint: A
         worst = int(np.argmax(excess))
         if not excess[worst] > 0.0:
             return _target(model, found, w)
-        # the others are to make up for what this one lacks
+        # the other inputs compensate for the saturated one
         free[n + worst] = False
         y = found.copy()
         y[n + worst] = min(max(y[n + worst], lower[worst]), upper[worst])

@@ -11,7 +11,7 @@ from functools import cached_property
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 
-# What follows when no law can act, in this order.
+# The levels after the laws, in this order.
 HOLD = 'hold'
 SAFE = 'safe'
 MANUAL = 'manual'  # in manual mode; no level of the supervisor

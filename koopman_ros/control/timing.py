@@ -56,7 +56,7 @@ def time_of_measurement(state: State, time_ns: int, countable: float | None
     since_ns = state.commanded_ns
     ahead_of_stamps = since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS
     if ahead_of_stamps:
-        # what was commanded in silence was timed by a clock that these stamps do not follow
+        # commands during the silence were timed by a clock that these stamps do not follow
         since_ns = state.time_ns
     elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
     # neither a gap nor a burst is the spacing of the samples, nor the first of them

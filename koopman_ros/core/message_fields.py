@@ -48,7 +48,7 @@ _TYPES = {'K': ('sensor_msgs/msg/Temperature', ''), 'Pa': ('sensor_msgs/msg/Flui
           **dict.fromkeys(('N m', 'N'), (JOINT_STATE, 'effort[{name}]'))}
 _QUANTITIES = {'K': 'temperature', 'Pa': 'pressure'}
 
-# What topics and parameters may be named after.
+# Valid names of topics and parameters.
 SIGNAL_NAME = re.compile(r'[A-Za-z]\w*', re.ASCII)
 # where the names of the elements of a message's arrays are
 _NAMES = ('name', 'joint_names')

@@ -17,7 +17,7 @@ __all__ = ['RiccatiSolution', 'RiccatiStatus', 'differences', 'over_interval',
            'runge_kutta_step', 'solve_riccati', 'spectral_radius', 'transition']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
-# root of the rounding error: modes within that of the axis cannot be told from undamped ones.
+# root of the rounding error: modes within that of the axis look undamped.
 _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
 # Nor modes of a sampled plant within the rounding of its transition, where samples as far apart as
 # a period leave nothing else.
@@ -125,7 +125,7 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n = len(A)
     D, W = over_interval(A, B, Q, R, interval)
-    # what the cross term makes of input and weight
+    # input and weight without the cross term
     both = np.concatenate((D[:n, n:], W[:n, n:])).T
     by_R = both.T.dot(_solved(W[n:, n:], both))
     rest, G, Q_rest = D[:n, :n] - by_R[:n, n:], by_R[:n, :n], W[:n, :n] - by_R[n:, n:]

@@ -35,12 +35,12 @@ class Conversion:
     def __call__(self, value: Numbers) -> Numbers:
         """Convert a value, or an array of them."""
         if self.factor == 1.0 and self.offset == 0.0:
-            # -0.0 stays what it is
+            # -0.0 is kept
             return value
         return value * self.factor + self.offset
 
 
-# What each node needs at its start, without the registry.
+# Units that each node needs at its start, without the registry.
 _AT_HAND = {('K', 'degC'): Conversion(offset=-ZERO_CELSIUS),
             ('degC', 'K'): Conversion(offset=ZERO_CELSIUS)}
 # Likewise: units that there are.

@@ -16,7 +16,7 @@ from koopman_ros.parameters.signal_topics import Signals
 from koopman_ros.testing import HarnessError, reserved_output
 
 _ROWS = 20  # in the table of a run
-_IN_MINUTES = 300.0  # s; so long a run is told in minutes
+_IN_MINUTES = 300.0  # s; a longer run is shown in minutes
 
 
 def read_options(args: list[str] | None, description: str | None, output: str, speed: float,

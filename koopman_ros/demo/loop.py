@@ -284,7 +284,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
             **shared, **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
             'sample_period': scenario.sample_period, 'start_time': _START_TIME,
-            # controller, trainer and operator: nobody misses the first measurement
+            # controller, trainer and operator: none misses the first measurement
             'lockstep_subscribers': 3 if panel is None else 4,
         })
         # the others hear its last measurement
@@ -308,6 +308,6 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
 
     with running_loop(scenario, logs, {'output': bag}, on_row) as operator:
         operator.run_until(scenario.duration)
-        # what the operator has heard may still be on its way to the trainer, where it is lost
+        # messages the operator received may still be on their way to the trainer, and are lost
         # with its sender
         operator.harness.wait_for_status('trainer: recording', recorded)

@@ -39,7 +39,7 @@ _SHOWN = 6000.0  # s of plant time, about as long as it all takes
 _TEST_SEED = 7
 _TRAINING_TIMEOUT = 300.0  # s
 _EXPERIMENT_TIMEOUT = 600.0  # s
-# What the fouled reactor bears; see the bounds of the experiment.
+# Limits of the fouled reactor; see the bounds of the experiment.
 _EXPERIMENT = {
     'experiment_signal': MANUAL, 'experiment_length': 60.0 * _EXPERIMENT_MINUTES,
     'experiment_max_hold_time': 180.0, 'experiment_seed': 1,

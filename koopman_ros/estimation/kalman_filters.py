@@ -40,7 +40,7 @@ _MAX_STEPS = 40
 _WANDERED, _A_DAY = 3.0, 86400.0
 # The singular values of a matrix count as 0 below this share of the largest.
 _RANK = 1e-9
-_NO_VARIANCE = 1e-14  # likewise of a covariance
+_NO_VARIANCE = 1e-14  # the same for a covariance
 
 
 def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
@@ -114,7 +114,7 @@ class ExtendedKalmanFilter(Estimator):
         directions = self._directions()
         #: (n_x, n_x) by which the covariance of the disturbance grows in a second
         self._intensity = directions @ directions.T
-        #: (n_x, n_x) projection on what disturbances can be
+        #: (n_x, n_x) projection on possible disturbances
         self._onto_directions = directions @ np.linalg.pinv(directions)
 
     def _directions(self) -> Array:
@@ -197,7 +197,7 @@ class ExtendedKalmanFilter(Estimator):
         model = self.model
         n = model.n_x
         forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
-        # x and its derivatives by what x and w were
+        # x and its derivatives by the previous x and w
         whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
 
         def rate(whole: Array) -> Array:

@@ -121,7 +121,7 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
         return None
     costs, no_gain = ended
     if (hopeless := ~np.isfinite(costs).any(axis=0)).any():
-        # what the limits hide
+        # unlimited inputs, hidden by the limits
         endless = np.full(m, np.inf)
         some = starts[hopeless], targets[hopeless], inputs[hopeless]
         free = given.within(InputLimits(-endless, endless, endless))

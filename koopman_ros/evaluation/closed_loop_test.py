@@ -56,10 +56,10 @@ _NEAREST = 0.1
 _ATTEMPTS = 4
 _NEWTON_STEPS = 30
 _LONGEST_STEP = 0.5
-# Share of the box to which ranges are told.
+# Share of the box to which ranges are stated.
 _ROUNDED = 1e-3
 _LARGEST_GAIN = 1e6  # of a law, in scaled coordinates
-_RESOLUTION = 1e-9  # what is left of a step, in scaled deviations
+_RESOLUTION = 1e-9  # remainder of a step, in scaled deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class ClosedLoopTest:
 
     def _ranges(self, x: Array) -> str:
         step = _ROUNDED * (self.states.upper - self.states.lower)
-        # what is nearly 0 is 0, not 1e-17; and not -0
+        # round 1e-17 and -0 to 0
         low, high = (step * np.round(end / step) + 0.0 for end in (x.min(axis=0), x.max(axis=0)))
         return ', '.join(
             f'{name} {a:.4g}{f" to {b:.4g}" if b > a else ""} {unit}'.rstrip()

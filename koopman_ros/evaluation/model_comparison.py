@@ -21,13 +21,13 @@ from koopman_ros.estimation import Estimate, held_means, with_commands
 from koopman_ros.estimation.disturbance_observer import simulated
 from koopman_ros.model import LiftedModel
 
-# A row for each hundredth of what is remembered: ten in a time constant by default.
+# A row for each hundredth of the remembered time: ten in a time constant by default.
 _ROWS = 100
-# Windows are a fifth of what is remembered, half of one in the next, and no shorter than this.
+# Windows are a fifth of the remembered time, overlap by half, and are no shorter than this.
 _WINDOWS = 5
 _LEAST_STEPS = 8
 _GAP = 3.0  # so many usual steps without a row end a window
-# An error is as good as none below this share of what a signal moved, and of its training box.
+# An error below this share of a signal's movement, and of its training box, counts as none.
 _SHARE_OF_MOTION, _SHARE_OF_BOX = 0.1, 5e-4
 
 

@@ -182,7 +182,7 @@ class _ReplayRun:
         target = None if outcome.report is None else outcome.report.target
         active = None if target is None else target.setpoint
         other = None
-        # it may refuse a request: it goes by the set-point that was tracked
+        # it may reject a request: then the tracked set-point counts
         if self._other is not None and not isinstance(event, SetpointRequest):
             if active is not None and isinstance(event, Measurement):
                 self._other_state = replace(

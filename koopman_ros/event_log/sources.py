@@ -25,7 +25,7 @@ def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = Fa
     `recover` is that of :func:`read_messages`. Raises BagReadError for a bag that cannot be read,
     or holds none.
     """
-    # first, for what it says of a bag that is none
+    # first, for its error if the file is no bag
     messages = read_messages(path, (topic,), recover=recover)
     content = summary(path)
     if not content.counts.get(topic):

@@ -51,7 +51,7 @@ from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.model import Coordinates, LiftedModel, PolynomialObservables
 from koopman_ros.model_classes import BEST, LINEAR
 
-# An error is more than noise when it is this unlikely, and this large beside the range.
+# An error is more than noise if it is this unlikely, and this large relative to the range.
 _SIGMAS = 5.0
 _NOTICEABLE = 1e-3
 # White errors have none; those of a fitted start stay far below.

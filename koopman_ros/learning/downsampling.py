@@ -17,7 +17,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import averaged, cut, Episode
 from koopman_ros.model import Box
 
-CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
+CELLS = 10  # along each of two signals, to count the visited share of their ranges
 SEGMENT = 240  # samples of a segment, or means of samples
 # Groups of samples that are tried, a power of two each, and the group by which noise is known.
 _GROUPS = tuple(2 ** power for power in range(3, 13))

@@ -21,7 +21,7 @@ from koopman_ros.learning.task import FIRST, TrainingTask
 EXPECTED = (ValueError, TypeError, KeyError, OSError, MemoryError, WorkerLost, SchedulerLost,
             ImportError)
 
-# Called with the plant, the share of its retraining that is done in [0, 1] and what is done now,
+# Called with the plant, the completed share of its retraining in [0, 1] and the current step,
 # and with empty texts now and then while others work; True asks all to stop.
 OnPlant = Callable[[str, float, str], bool]
 
@@ -108,7 +108,7 @@ def _rounds(backend: Backend, waiting: dict[str, TrainingTask], on_progress: OnP
 
 
 def _retrained(_: None, task: TrainingTask, tell: Tell) -> TrainingOutcome:
-    # serially, as the plants are what runs side by side
+    # serially, because the plants run in parallel
     return TrainingOutcome(*reported(retrain(
         replace(task, executor=''), lambda share, text: tell((share, text)))))
 

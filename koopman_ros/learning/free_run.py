@@ -32,7 +32,7 @@ AnyModel: TypeAlias = LiftedModel | Trained | ClassComparison | Drift | Identifi
 
 FREE_RUN = 'free_run'  #: metric of a model: error of its free run of its record, by state
 
-_GUESSES = (0.6, -0.6)  # starts of unmeasured states that are tried beside 0, in half-ranges
+_GUESSES = (0.6, -0.6)  # starts of unmeasured states that are tried besides 0, in half-ranges
 _EVALUATIONS = 30  # of the search from each of them
 _LOST = 1e3  # error of a start that diverges, in half-ranges
 # The first samples of another day err by more than so many times the usual error. A steady state

@@ -79,7 +79,7 @@ _COMMAND_LAG = 1.0
 # % of the motion: errors on another day scatter by more than smaller differences say.
 _LESS_FIT = 1.0
 
-# Called with the share done in [0, 1] and what is done now; True asks to stop.
+# Called with the completed share in [0, 1] and the current step; True asks to stop.
 OnProgress = Callable[[float, str], bool]
 
 

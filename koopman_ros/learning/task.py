@@ -139,7 +139,7 @@ def resolve_signals(task: TrainingTask, current: LiftedModel | None
         plant = current.plant if not partly else replace(
             _unknown(replace(task, states=tuple(states), inputs=tuple(inputs))),
             name=current.plant.name, time_unit=current.plant.time_unit)
-    # what lags is the actuator, as far as its applied input was recorded: that is calculated
+    # the actuator lags; its applied input is calculated
     inputs = [replace(one, measured=None) if task.lag.get(one.name) else one for one in inputs]
     return replace(plant, B=_known_gain(task, plant),
                    input_matrix_degree=task.input_matrix_degree,

@@ -336,7 +336,7 @@ class ControllerNode(ManagedNode):
             self.get_logger().info(change)
         model = self._loop.controller.model
         if model.states.names != before.model.states.names:
-            # what is estimated is something else; what was last said is of another model
+            # the estimate changed its meaning; the last message is about another model
             self._signals = signals_of(model, self._signals.controlled, self._signals.states)
             self._report = replace(self._report, estimate=None, target=None)
         self._check_safe_input()

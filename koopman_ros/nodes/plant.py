@@ -35,9 +35,9 @@ from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscri
 from koopman_ros.ros.simulated_plant import Analyser, SimulatedPlant
 from koopman_ros.ros.time_conversion import stamp_message
 
-_POLL_PERIOD = 0.01  # s; for what no message announces
+_POLL_PERIOD = 0.01  # s; for conditions that no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
-_SILENCE = 3.0  # s without a command, and five periods, after which somebody should know
+_SILENCE = 3.0  # s without a command, and five periods, after which the status warns
 
 
 class RunPhase(Enum):
@@ -255,7 +255,7 @@ class PlantNode(ManagedNode):
             return
         lockstep = self._settings.lockstep
         if lockstep and received.stamped and received.stamp_ns != self._plant.process.time_ns:
-            # it answers no measurement that is open: late, or from somebody else
+            # it answers no open measurement: late, or from another node
             self._foreign += 1
             return
         self._received |= received.values

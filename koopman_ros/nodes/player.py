@@ -25,9 +25,9 @@ from koopman_ros.ros.process import run
 from koopman_ros.ros.setpoint_table import SetpointTable
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
-_POLL_PERIOD_NS = 10_000_000  # for what no message announces
+_POLL_PERIOD_NS = 10_000_000  # for conditions that no message announces
 _PROGRESS_PERIOD = 3.0  # s
-_LAST_PATIENCE = Duration(seconds=5.0)  # for what was sent last to be received
+_LAST_PATIENCE = Duration(seconds=5.0)  # for the last messages to be received
 _BURST = 100  # messages without an answer that are sent in one go, before signals are heard again
 
 

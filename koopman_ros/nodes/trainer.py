@@ -89,7 +89,7 @@ class TrainerNode(ManagedNode):
     def _on_parameters(self, parameters: TrainerParameters) -> None:
         self._settings = parameters
         assert self._recording and self._experiment and self._training
-        # a running recording keeps what it was started with, but for the room on the disk
+        # a running recording keeps its parameters, except the free disk space
         self._recording.settings = parameters
         # a running experiment keeps all
         self._experiment.settings = parameters

@@ -123,7 +123,7 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
 def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Return the parameter dataclasses of known plug-ins, and of those that values name."""
     found: dict[str, type[Any]] = {}
-    # what is no plug-in, the check of the parameters refuses
+    # the check of the parameters rejects anything that is no plug-in
     for name in dict.fromkeys((*LAWS, *given.get('fallback_order', ()))):
         with contextlib.suppress(ValueError):
             found[short_name(name)] = plugin_class(name, 'law', LAWS, Law).Parameters

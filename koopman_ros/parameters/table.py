@@ -145,7 +145,7 @@ class ParameterTable(Generic[T]):
         self._defaults = defaults
         declared, self._make = self._layout(kind)
         self._paths: dict[str, _Path] = {row.name: path for row, path in declared}
-        # a file begins with what is not of a signal or a plug-in
+        # a file begins with the parameters of no signal or plug-in
         self.rows: dict[str, Specification] = {row.name: row for row, _ in sorted(
             declared, key=lambda one: (one[0].name.count('.'), self._first(one[0].name)))}
 
@@ -255,7 +255,7 @@ class ParameterTable(Generic[T]):
             self.build(snapshot)
         except (ValueError, ArithmeticError) as error:
             return ' '.join(str(error).split()) or type(error).__name__
-        except Exception as error:  # of a class of one's own, somewhere in what is built
+        except Exception as error:  # of a user's class, anywhere in the object that is built
             return contained(error)
         return ''
 

@@ -354,7 +354,7 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
                            safe_value=inputs.center)}
     methods: dict[str, type[Any]] = {}
     for names in ((), given.get('identification_methods', ())):
-        # what is no method, the check of the parameters refuses
+        # the check of the parameters rejects anything that is no method
         with contextlib.suppress(ValueError):
             methods |= parameters_of(tuple(filter(None, names)))
     return ParameterTable(

@@ -82,7 +82,7 @@ class Process:
                      for value in (self.actuator.dead_time, self.actuator.lag))
         if not dead.any():
             return self.u
-        # what acts a dead time later depends on no later command
+        # inputs that act a dead time later depend on no later command
         end_ns = [self.time_ns + round(seconds * NANOSECONDS) for seconds in dead.tolist()]
         u, goal, since_ns = self.u.copy(), np.array(self.followed), [self.time_ns] * len(dead)
         ends = ((end, i, np.nan) for i, end in enumerate(end_ns))

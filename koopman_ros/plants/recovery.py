@@ -56,7 +56,7 @@ def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike
     step = _STEP / fastest
     found = np.zeros(len(x), dtype=bool)
     number, state = np.arange(len(x)), np.asarray(x, dtype=np.float64)
-    # what escapes may overflow before it is left out
+    # a diverging run may overflow before it is left out
     with np.errstate(all='ignore'):
         for _ in range(int(_TIME_CONSTANTS / (np.min(-closed.real) * step))):
             inside = np.all((state >= lower) & (state <= upper), axis=1)

@@ -17,7 +17,7 @@ from koopman_ros.core.datasets import DriftSamples, Episode
 from koopman_ros.plants.system import ControlAffineSystem
 
 LOOSEST_RTOL = 1e-9
-# What scipy still keeps; it takes tighter tolerances for this one, with a warning.
+# Smallest tolerance that scipy accepts without a warning.
 TIGHTEST_RTOL = 100.0 * float(np.finfo(np.float64).eps)
 # A stiff runaway would otherwise take tiny steps for ever; a reactor needs about ten a minute.
 _MAX_STEPS_PER_HOLD = 20_000

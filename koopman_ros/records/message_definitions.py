@@ -91,7 +91,7 @@ def _read(package: str, file_name: str, type_name: str) -> str:
     for folder in searched:
         file = folder / file_name
         if file.is_file():
-            # Bytes, so that line ends stay what they are in the installed file.
+            # Bytes, to keep the line ends of the installed file.
             return file.read_bytes().decode('utf-8')
     places = ', '.join(map(str, searched))
     raise MessageDefinitionError(

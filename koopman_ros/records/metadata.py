@@ -22,7 +22,7 @@ METADATA_FILE = 'metadata.yaml'
 METADATA_KEY = 'rosbag2_bagfile_information'
 
 _VERSION = 9
-# What rosbag2 writes as the start of a bag without messages [ns].
+# Start that rosbag2 writes for a bag without messages [ns].
 _NO_START_NS = 2**63 - 1
 
 

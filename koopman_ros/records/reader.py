@@ -20,7 +20,7 @@ from koopman_ros.records.decoding import BagMessage, decoded_messages
 from koopman_ros.records.mcap_file import BagReadError, opened, stored_messages, summary_section
 from koopman_ros.records.metadata import parse_offered_qos
 
-# A recorder that falls behind writes what waits topic by topic; longer than this it never waits.
+# A late recorder writes its queue topic by topic; no message waits longer than this.
 _BEHIND_NS = 5_000_000_000
 
 

@@ -17,7 +17,7 @@ from koopman_ros.records.mcap_file import BagReadError, reason
 from koopman_ros.records.reader import BagSummary, read_messages, summary
 
 _MOST_NS = 2**63
-# Fewer samples do not tell what is usual.
+# Fewer samples do not show the usual interval.
 _ENOUGH = 50
 # A change is no motion when it is larger than so many times all but the largest changes, ...
 _TIMES_USUAL = 10.0

@@ -23,7 +23,7 @@ from koopman_ros.records import metadata
 from koopman_ros.records.message_definitions import MessageDefinition
 
 _SEQUENCE_MODULUS = 2**32
-# A message in a chunk beside its data: opcode, length, channel, sequence, two times.
+# A message in a chunk without its data: opcode, length, channel, sequence, two times.
 _MESSAGE_HEAD_BYTES = 31
 # Chunks end by flush() and then go to the operating system at once: mcap's own limit would leave
 # the end of a chunk in a buffer.
@@ -148,7 +148,7 @@ class BagWriter:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        # After an exception, too: the record up to it is what one wants to look at.
+        # After an exception, too: the record up to it explains the failure.
         self.close()
 
     def _is_full(self, log_time_ns: int) -> bool:

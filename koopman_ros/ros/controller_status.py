@@ -318,7 +318,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
     transfer = np.zeros(len(signals.inputs)) if report.command.transfer is None else (
         report.command.transfer)
     inputs = {base_name(name, unit): unit for name, unit in signals.inputs.items()}
-    # a bias of what is not measured is no sensor's
+    # an unmeasured state has no sensor bias
     bias = None if estimate is None or signals.estimated else (
         now.controller.equivalent_bias(state))
     controlled = {name: signals.states[name] for name in signals.controlled}

@@ -116,7 +116,7 @@ class DiagnosticTask:
 
     def publish_if_changed(self) -> None:
         """Publish at once each task whose level or sentence differs from the last."""
-        # a late change in a part that was taken down has nobody to report to
+        # a part that was shut down reports no late change
         if self not in self._diagnostics.tasks:
             return
         last = self._last

@@ -80,7 +80,7 @@ class ExperimentRun:
         self._on_setpoints = settings.experiment_signal == SETPOINT
         self._units = {name: (signals.states if self._on_setpoints else signals.inputs)[name]
                        for name in places}
-        # what is known of the controller
+        # status of the controller
         self._tracked: dict[str, float] = {}  # set-points, by name
         self._automatic = False
         # set-points stand in with which the bounds can be tried before those of now are known
@@ -255,7 +255,7 @@ class ExperimentRun:
             return
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         if self.progress.time_ns != newest_ns:
-            # a stamp that stands still or lags is no news
+            # a stamp that does not advance is no new measurement
             self._received_at = time.monotonic()
         self._command(self.progress.command, stamp_ns)
         if was_running and not self.running:
@@ -332,7 +332,7 @@ class ExperimentRun:
                 self.started.set_result(why)
         elif why is not None and why.code is StatusCode.SILENCE:
             was_running = self.running
-            # the way back goes by the wall clock
+            # the return is timed by the wall clock
             self.progress = advance(
                 self.plan, end(self.progress, ExperimentPhase.ABORTED, why), None,
                 self.progress.time_ns + round(_TICK * NANOSECONDS))

@@ -24,7 +24,7 @@ from koopman_ros.ros.node import LoopNode
 # parameter file, a RuntimeError whose class is private to the extension.
 START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
 _FAREWELL = 0.5  # s
-# What rcl says of a text that is empty once the shell has taken its quotes.
+# Error of rcl for a text that is empty after the shell removed its quotes.
 _EMPTY_TEXT = re.compile(r"parameter override rule: '-p ([^' ]+:=)'")
 
 
@@ -43,7 +43,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         LoopNode.__init__(self, name, **options)
         LifecycleNodeMixin.__init__(self)
         self._failure: Exception | None = None
-        self._alone = False  # whether nobody is told of a failure but by an exception
+        self._alone = False  # whether only an exception reports a failure
         # reports in each state
         assert self.diagnostics
         self._kept = self._entities()

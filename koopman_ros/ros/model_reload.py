@@ -59,7 +59,7 @@ class _Trial:
         except BaseException as error:
             # whatever a file may hold, or a law of one's own raises: the loop goes on as it is
             outcome = f'{name} cannot be used ({contained(error)}): train the model again'
-        # before whoever waits for it can ask for the same file again
+        # before the caller can request the same file again
         self.reading = False
         self.end(outcome)
 
@@ -125,7 +125,7 @@ class ModelReload:
         outcome: LoadedModel | str = await trial.outcome
         patience.cancel()
         if self._ended:
-            # nobody is there who would hear the answer
+            # the caller has gone
             return response
         if name != self.in_force.name:
             outcome = f'{self.in_force.name} became the current model while {name} was read'

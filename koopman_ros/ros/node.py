@@ -95,7 +95,7 @@ class LoopNode(HostedNode):
     def describe_parameter(self, name: str) -> msg.ParameterDescriptor:
         """Return the descriptor of a parameter with its range."""
         # the one that rclpy keeps has none: rclpy would refuse by it before the table does, in
-        # words without the unit, and let pass what exceeds it by a rounding
+        # words without the unit, and accept values beyond it by a rounding
         descriptor = copy.copy(super().describe_parameter(name))
         limits = self._ranges.get(name)
         if isinstance(limits, msg.IntegerRange):

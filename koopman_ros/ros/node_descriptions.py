@@ -34,7 +34,7 @@ from koopman_ros.ros import topics
 
 POLICY_FILE = 'sros2_policy.xml'
 
-# what rclpy gives every node
+# topics and services that rclpy gives every node
 STANDARD_TOPICS = ('/rosout', '/parameter_events')
 STANDARD_SERVICES = (
     '~/describe_parameters', '~/get_parameter_types', '~/get_parameters', '~/list_parameters',

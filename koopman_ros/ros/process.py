@@ -128,13 +128,13 @@ def take_down(name: str, node: LoopNode | None, executor: Executor | None,
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()
-    # whoever called may go on
+    # the caller may continue
     disarm()
 
 
 def init(args: list[str] | None) -> None:
     """Begin with ROS; signals stay with us."""
-    # rcl logs what it also raises, which would say it twice
+    # rcl logs the errors that it also raises: report them once
     set_logger_level('rcl', LoggingSeverity.FATAL)
     # rclpy's own handlers end the context in the middle of a callback: what the callback then
     # publishes or asks fails, and an interrupt inside the extension comes out as another error

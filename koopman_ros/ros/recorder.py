@@ -48,7 +48,7 @@ class _Taken(NamedTuple):
 
 
 class _OutsideTheExecutor(CallbackGroup):
-    # the executor builds its wait set anew for each message, which costs many times what it
+    # the executor rebuilds its wait set for each message, which costs many times as much as
     # costs to record one
 
     def can_execute(self, entity: object) -> bool:
@@ -156,7 +156,7 @@ class Recorder:
 
     def close(self) -> None:
         """Complete the bag with all that was sent; the subscriptions end with it."""
-        # what others have heard already may still be on its way to us
+        # messages that others have received may still be on their way
         time.sleep(_LINGER)
         try:
             self._end(list(self._subscriptions))
@@ -205,7 +205,7 @@ class Recorder:
                     continue
                 taken = taken._replace(received_ns=self._now_ns, sent_ns=self._now_ns)
             if not self.counts[taken.topic]:
-                # with what its publishers offer now
+                # with the QoS that its publishers offer now
                 self._writer.add_topic(
                     taken.topic, message_definition(topics.type_name(self._types[taken.topic])),
                     [_offered(info.qos_profile) for info in

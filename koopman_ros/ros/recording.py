@@ -24,7 +24,7 @@ from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages
 _LOOK_PERIOD = 0.2  # s, for new publishers
-_FLUSH_PERIOD = 0.5  # s; what a killed process may lose
+_FLUSH_PERIOD = 0.5  # s; the longest time that a killed process loses
 _MEGABYTE = 1_000_000
 
 
@@ -99,7 +99,7 @@ class Recording:
         except (OSError, LookupError) as error:
             said = f'{self._path} is not complete: {error}'
             self._node.get_logger().error(said)
-            # what went wrong first tells more
+            # the first error tells more
             self._problem = self._problem or said
         return recorder
 

@@ -82,7 +82,7 @@ def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., 
         message, info = arrived if len(arrived) == 2 else arrived[0]
         take(message, info)
 
-    # by its signature rclpy decides what it hands over
+    # rclpy chooses the arguments by the callback's signature
     hear.__signature__ = inspect.signature(  # type: ignore[attr-defined]
         lambda message, info: None)
     return hear

@@ -14,8 +14,8 @@ from koopman_ros.core.units import NANOSECONDS
 # Stamps further from the node's clock than this come from another clock.
 _SAME_CLOCK = 3600.0  # s
 _JITTER = 1.0  # s by which messages of one clock may come early or late
-PAUSED = 10.0  # s by the steady clock after which a clock that stands still is reported
-_CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
+PAUSED = 10.0  # s by the steady clock after which a stopped clock is reported
+_CLOCK_PATIENCE = 1.0  # s from the start until the time should be published
 
 
 class Timing:
@@ -41,7 +41,7 @@ class Timing:
         self._counted = -math.inf  # s by the steady clock, when it counted some last
         self.age = math.nan  # s, of the last measurement at its arrival
         self.answer_seconds = math.nan  # from its arrival to its command
-        self.busy = False  # whether what has arrived since then waits for the node itself
+        self.busy = False  # whether messages since then wait for the node itself
 
     def now(self) -> tuple[float, int, int]:
         """Return the time by the steady clock in s, on /clock, or 0, and the node's, in ns."""

@@ -51,7 +51,7 @@ TYPES = {CONTROLLER_INTERNALS: JointState, PREDICTED_TRAJECTORY: JointTrajectory
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.
 LOOP_QOS = QoSProfile(depth=1000)
-# A late joiner learns what is tracked, and which inputs act.
+# Late joiners receive the tracked set-point and the applied inputs.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -224,7 +224,7 @@ class EndpointMonitor:
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:
-    # what a profile leaves to the default else passes for a difference
+    # otherwise defaults of a profile would count as differences
     filled = copy.copy(profile)
     for name in ('deadline', 'liveliness_lease_duration'):
         if not getattr(filled, name).nanoseconds:

@@ -90,7 +90,7 @@ def end_in_time(name: str) -> Callable[[], None]:
     def leave() -> None:
         over.set()
         signal.set_wakeup_fd(-1)
-        # ends the thread, which takes back what it has armed before others are
+        # ends the thread, which disarms its timer before others are armed
         os.close(writer)
         thread.join(1.0)
 

@@ -233,7 +233,7 @@ def _reservation(name: str) -> Iterator[bool]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
         mine = True
         try:
-            # an abstract name: whoever's process holds it, it goes when the process ends
+            # an abstract name, which disappears with the process that holds it
             held.bind(f'\0koopman_ros_{name}')
         except OSError:
             mine = False

@@ -114,7 +114,8 @@ def test_all_solvers_have_one_objective(monkeypatch: pytest.MonkeyPatch) -> None
         np.testing.assert_allclose(found.full(), true.full(), rtol=1e-9, atol=1e-11)
 
 
-def test_models_of_other_classes_are_learned_beside_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_benchmark_also_trains_models_of_other_classes(
+        monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, 'LEARNERS', {
         label: LEARNERS[label] for label in ('linear', 'SINDy-5')})
     told: dict[str, Any] = {}

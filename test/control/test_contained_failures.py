@@ -292,7 +292,7 @@ def test_an_estimator_that_fails_leads_to_a_hold_and_the_safe_input(plugin, meth
         assert levels <= {'hold', 'safe', 'sdre'}
 
 
-def test_the_loop_goes_on_when_an_estimator_works_again(monkeypatch):
+def test_the_loop_recovers_when_an_estimator_works_again(monkeypatch):
     run = Checked(tuned('two_tanks'))
     center = run.controller.model.states.center
     for k in range(5):

@@ -63,7 +63,7 @@ def test_at_its_setpoint_the_loop_rests():
     assert (state.time_ns, state.command) == (NOW, command)
 
 
-def test_a_start_elsewhere_holds_what_it_finds():
+def test_a_start_away_from_the_nominal_point_holds_the_measured_state():
     _, command, report = controller().step(State(), np.array([SETPOINT]), NOW)
     np.testing.assert_array_equal(report.target.setpoint, [SETPOINT])
     np.testing.assert_allclose(command, [COOLANT], rtol=0, atol=1e-3)
@@ -79,7 +79,7 @@ def test_the_input_of_a_law_is_remembered_within_the_range():
     np.testing.assert_array_equal([command, state.law_input], [[298.0]] * 2)
 
 
-def test_what_a_step_returns_and_takes_cannot_be_changed_afterwards():
+def test_arguments_and_results_of_a_step_are_read_only():
     loop, asked = controller(), np.array([312.0])
     state = loop.request_setpoint(started(loop), asked)[0]
     asked[0] = 999.0
@@ -203,7 +203,7 @@ def test_a_setpoint_is_acted_on_from_the_estimate_while_nothing_is_measured():
     assert commands[-1] == commands[-2] < commands[0] - 0.5
 
 
-def test_a_hold_for_want_of_measurements_refuses_what_it_cannot_track():
+def test_a_hold_without_measurements_rejects_setpoints():
     loop = controller()
     state = measured(loop, started(loop), START, 1)[0]
     for cause in (StatusCode.NO_MEASUREMENT, StatusCode.STAMPS_STAND, StatusCode.TWO_SOURCES):
@@ -236,7 +236,7 @@ def test_a_manual_command_moves_at_the_rate_limit_without_measurements():
 
 # Set-points.
 
-def test_a_full_schedule_refuses_more_but_not_what_holds_at_once():
+def test_a_full_schedule_rejects_later_setpoints_but_not_immediate_ones():
     loop = controller()
     state = started(loop, *((316.0, NOW + (n + 1) * SECOND) for n in range(1000)))
     full, refused = loop.request_setpoint(state, np.array([317.0]), NOW + 2000 * SECOND)
@@ -289,7 +289,7 @@ def test_manual_commands_are_followed_within_the_limits_whatever_the_sensor_does
 
 @pytest.mark.parametrize(('automatic', 'value', 'code'), [
     (False, math.nan, StatusCode.MANUAL_NOT_FINITE), (True, 299.0, StatusCode.NOT_IN_MANUAL_MODE)])
-def test_a_refused_manual_command_says_why(automatic, value, code):
+def test_a_rejected_manual_command_has_a_reason(automatic, value, code):
     loop = controller()
     state = started(loop) if automatic else manual(loop, 290.0)
     assert loop.request_manual_input(state, np.array([value]))[1].code is code

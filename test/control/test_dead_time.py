@@ -83,7 +83,7 @@ def test_a_dead_time_twice_as_long_as_known_leaves_the_loop_stable():
     assert abs(run.states[-1, 0] - SETPOINT) < 0.1
 
 
-def test_a_takeover_a_record_and_the_next_level_keep_what_is_under_way():
+def test_a_takeover_a_record_and_a_fallback_keep_the_inputs_under_way():
     loop, plant, state = late_reactor(20.0)
     whole = step(loop, plant, state, 60.0)
     # of a hand-over to a controller with the same settings nothing is seen
@@ -212,7 +212,7 @@ class Linear:
 
 
 @pytest.mark.parametrize('dead_time', [(0.7, 0.7), (2.2, 0.7), (0.0, 1.5)])
-def test_each_input_is_what_the_law_gives_for_the_state_when_it_acts(dead_time):
+def test_each_input_is_computed_for_the_state_at_which_it_acts(dead_time):
     """Where the model is right, as if there were no dead time."""
     loop = two_inputs(dead_time)
     goal = np.array([2.0, -1.0])
@@ -229,7 +229,7 @@ def test_each_input_is_what_the_law_gives_for_the_state_when_it_acts(dead_time):
     np.testing.assert_allclose(run.states[-1], goal, atol=5e-3)
 
 
-def test_a_plan_knows_what_is_under_way():
+def test_a_plan_uses_the_inputs_under_way():
     """With different dead times it costs less than the law that acts on predicted states."""
     dead_time, goal, costs = (0.2, 3.3), np.array([2.0, -1.0]), []
     for law in ('sdre', 'mpc'):

@@ -247,7 +247,7 @@ def test_contradicting_limits_are_refused(change: dict[str, Any], words: str) ->
     ([295.0, 296.0, 297.0, 298.0, 299.0, 300.0], [292.0] * 6, 5),
     ([290.0 + 1e-5 * k for k in range(6)], [292.0] * 6, 5),  # settles by itself
 ])
-def test_controller_that_comes_nearer_follows(
+def test_a_controller_that_approaches_the_setpoint_follows_it(
         heard: list[float], asked: list[float], deviations: int, span: float) -> None:
     monitor, unit = TrackingMonitor(span), span / 18.0
     for now, (command, wanted) in enumerate(zip(heard, asked, strict=True)):

@@ -47,7 +47,7 @@ def step(loop, lag, duration, *events, plant=REACTOR, period=1.0):
 @pytest.mark.parametrize(('lag', 'duration', 'least'), [
     # K^2 min of the step, found by `optimum`
     (18.0, 120.0, 44.01), (60.0, 180.0, 77.30)])
-def test_a_law_that_knows_the_lag_costs_hardly_more_than_the_optimum(lag, duration, least):
+def test_a_law_with_the_lag_in_its_model_is_nearly_optimal(lag, duration, least):
     task = Task(_with_input_lag(REACTOR, np.array([lag / 60.0]), lambda u: u), np.zeros(2),
                 np.array([SETPOINT, COOLANT]), np.array([COOLANT]), np.array([1.0, 0.0]),
                 np.ones(1), 1.0 / 60.0, 0)

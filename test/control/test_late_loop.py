@@ -123,7 +123,7 @@ def test_each_sample_has_a_command_within_limits(happened, dead_time):
 
 
 @pytest.mark.parametrize('dead_time', [31.5, 45.0, 58.5])
-def test_the_loop_comes_to_rest_whatever_was_on_its_way(dead_time):
+def test_the_loop_settles_after_any_sequence_of_events(dead_time):
     """A restart, a reload with another dead time and a change of mode, each in a step."""
     loop = Loop(dead_time)
     loop.happen('run', 3, 293.15)

@@ -304,7 +304,7 @@ def sampled_loop(law, seconds, R, interval):
 
 
 @pytest.mark.parametrize('law', [recentred, averaged])
-def test_a_law_that_knows_the_interval_costs_hardly_more_than_the_least(law):
+def test_a_sampled_law_is_nearly_optimal_at_long_intervals(law):
     task, states, inputs = sampled_loop(law, 15.0, 0.1, interval=0.25)
     least = optimum(task).cost
     assert least * (1.0 - 1e-6) < cost_along(task, states, inputs) < 1.002 * least

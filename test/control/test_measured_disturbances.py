@@ -78,7 +78,7 @@ def test_an_unmeasured_step_moves_it_further():
         Controller(PLAIN, USUAL), lambda *_: math.nan)[0].commands)
 
 
-def test_the_feed_at_the_start_is_part_of_what_holds_the_plant():
+def test_the_holding_input_includes_the_initial_feed():
     found, error = run(controller(), before=NOMINAL + 4.0)
     assert np.abs(error).max() < 0.1 * UNMEASURED_PEAK
     assert abs(found.reports[0].estimate.disturbance[0]) < 1e-3
@@ -108,7 +108,7 @@ def test_a_lost_sensor_holds_the_last_value_and_the_loop_runs_on(measure, code, 
     assert [one.code for one in found.loop.state.disturbances.faults] == [code]
 
 
-def test_a_sensor_that_comes_back_brings_no_bump():
+def test_the_return_of_a_sensor_causes_no_bump():
     """After the observer has compensated the step, its measurement is nothing new."""
     back = 150  # s
     found, error = run(controller(), lambda kelvin, seconds: (

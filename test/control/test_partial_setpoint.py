@@ -180,7 +180,7 @@ def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
     (1.4, 3.5, -0.02, 3.6, 1.3),
     # neither what is tracked nor the nominal level can be held now; what the command leads to can
     (1.4, 3.5, -0.1, 4.4, 0.5)])
-def test_a_refusal_names_the_nearest_level_and_what_the_pump_would_need(
+def test_a_rejection_names_the_nearest_level_and_the_required_pump_input(
         value, upper, w, needed, nearest):
     controller = loop(SERIES, 'h2', lower=2.5, upper=upper)
     state = disturbed(controller, [1.0, 1.0], [w, 0.0])
@@ -244,7 +244,7 @@ def test_the_nearest_of_two_levels_is_that_of_least_squares():
 
 # Several signals.
 
-def test_one_signal_of_two_is_asked_for():
+def test_a_setpoint_for_one_of_two_signals_keeps_the_other():
     controller = loop(THREE, 'h2', 'h3')
     state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
     state, refused = asked(controller, 1.3, state, signals=('h3',))
@@ -403,7 +403,7 @@ def test_the_lower_two_of_four_tanks_under_a_model_that_is_not_the_plant():
     np.testing.assert_array_equal(run.setpoints[30], [wanted[0], x[1]])
 
 
-def test_a_continuous_loop_goes_to_the_steady_state_of_its_setpoint():
+def test_a_continuous_loop_settles_at_the_steady_state_of_its_setpoint():
     weights = Weights(np.eye(2), np.eye(1))
     centers = SERIES.states.center, SERIES.inputs.center
 

@@ -58,7 +58,7 @@ def run(one, setpoint=10.0, seconds=200.0, u=0.0, events=()):
         *events], duration=seconds)
 
 
-def test_a_lag_follows_as_the_equation_of_the_law_says():
+def test_a_lagged_plant_follows_the_equation_of_the_pi_law():
     loop = run(controller(), seconds=300.0)
     assert set(loop.levels) == {'pi'}
     # x, u and the last error, sampled once a second
@@ -107,7 +107,7 @@ def test_it_takes_no_memory_of_another_law():
     np.testing.assert_array_equal(foreign, fresh)
 
 
-def test_without_a_gain_the_next_level_acts_and_says_why():
+def test_without_a_gain_the_next_level_acts_with_a_reason():
     loop = run(controller(gain=0.0, laws=('pi',)), seconds=5.0)
     assert set(loop.levels) == {'hold'}
     assert loop.reports[-1].reason.cause.code is StatusCode.NO_PI_GAIN

@@ -129,7 +129,7 @@ def test_only_the_operator_clears_a_latched_safe_input():
     assert levels(loop.run(2)) == ['sdre']
 
 
-def test_reasons_tell_what_is_waited_for():
+def test_reasons_name_the_awaited_condition():
     recovering = walk([BEST, LINEAR, *[BEST] * 12])
     assert say(recovering[5].reason) == f'{say(FAR)} (cleared; waiting for recovery_time)'
     assert recovering[-1].reason is None
@@ -198,7 +198,7 @@ def test_a_disturbance_that_drives_the_reactor_out_is_overcome():
     assert settled(samples, START, 1e-3) < 600
 
 
-def test_without_a_law_the_command_is_held_then_safe_and_the_loop_comes_back():
+def test_without_a_law_the_command_is_held_then_safe_until_recovery():
     loop = Reactor(controller())
     loop.run(30)
     held = loop.samples[-1].command
@@ -239,7 +239,7 @@ def rested(plant, model=None, noise=0.0):
     return loop
 
 
-def test_after_a_dead_sensor_the_loop_comes_back_by_itself():
+def test_the_loop_recovers_after_a_dead_sensor():
     loop = Reactor(controller())
     loop.run(5)
     silent = loop.run(260, lambda _: None)[-1]
@@ -252,7 +252,7 @@ def test_after_a_dead_sensor_the_loop_comes_back_by_itself():
     (CHANGED['C_A +10 %'], None, 0.0, 0.2), (CHANGED['T_i +5 K'], None, 0.0, 0.2),
     (CHANGED['UA +20 %'], None, 0.1, 0.3), (REACTOR, narrow(), 0.0, 0.2)],
     ids=['C_A +10 %', 'T_i +5 K', 'UA +20 %, noisy sensor', 'lift of narrow data'])
-def test_a_loop_comes_back_from_where_the_safe_input_rests(plant, model, noise, tolerance):
+def test_a_loop_recovers_from_the_rest_state_of_the_safe_input(plant, model, noise, tolerance):
     loop = rested(plant, model, noise)
     samples = loop.run(450 if model else 320)
     assert samples[-1].report.level == 'sdre'
@@ -262,7 +262,7 @@ def test_a_loop_comes_back_from_where_the_safe_input_rests(plant, model, noise, 
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.1])
-def test_a_sensor_that_stands_still_brings_the_coolant_no_further_than_the_lead(noise):
+def test_a_frozen_sensor_moves_the_coolant_no_further_than_the_lead(noise):
     plant = changed_reactor(heat_transfer=0.6)
     loop = rested(plant)
     rng = np.random.default_rng(1)
@@ -294,7 +294,7 @@ def test_where_laws_fail_the_safe_coolant_is_not_left():
     assert {s.command for s in samples} == {SAFE}
 
 
-def test_a_hot_reactor_that_stands_still_keeps_the_safe_coolant():
+def test_a_hot_reactor_at_rest_keeps_the_safe_coolant():
     boundary = float(brentq(lambda T: REACTOR.derivative(np.array([T]), np.array([SAFE]))[0],
                             335.0, 380.0))
     loop = Reactor(controller(), kelvin=boundary - 1e-6, coolant=SAFE)
@@ -340,7 +340,7 @@ def test_the_input_is_ahead_of_the_plant_by_the_lead():
     assert half.moved(2.2, 34 * SECOND, 10.0) == SafeStateRecovery(2.2, 2.2, 34 * SECOND)
 
 
-def test_what_comes_back_by_itself_is_waited_for():
+def test_recovery_waits_for_a_plant_that_returns_unaided():
     way = SafeStateRecovery(2.0, 2.0, 0)
     for second in range(1, 60):
         way = way.moved(2.0 - 0.02 * second, second * SECOND, 10.0)
@@ -351,14 +351,14 @@ def test_what_comes_back_by_itself_is_waited_for():
 
 @pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4'])
 @pytest.mark.parametrize('coolant', [SAFE, 282.0, 292.0])
-def test_a_model_tells_where_the_safe_input_rests(name, coolant):
+def test_a_model_gives_the_rest_state_of_the_safe_input(name, coolant):
     rest = rest_under(shipped(name), np.array([coolant]), 0.25)
     assert rest.x[0] == pytest.approx(rest_of(REACTOR, coolant), abs=0.05)
     assert rest.outside == pytest.approx(max(0.0, (305.0 - rest.x[0]) / 11.0))
     assert rest.holding is None
 
 
-def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range():
+def test_a_lift_of_narrow_data_reports_a_safe_coolant_outside_its_range():
     for name in ('reactor_nz3', 'reactor_nz4', 'reactor_linear'):
         assert rests_outside(controller(name)) == ''
     narrowed = controller(narrow())

@@ -39,7 +39,7 @@ def loads(path: Path, model: LiftedModel) -> bool:
 @settings(max_examples=60, deadline=None, derandomize=True,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(states=ENDS, inputs=ENDS, names=strategies.tuples(NAMES, NAMES))
-def test_a_model_loads_where_nothing_is_said_against_it(
+def test_a_model_loads_exactly_if_it_is_usable(
         tmp_path: Path, states: list[int], inputs: list[int], names: tuple[str, str]) -> None:
     model = replace(SHIPPED, states=moved(SHIPPED.states, states, names[0]),
                     inputs=moved(SHIPPED.inputs, inputs, names[1]))

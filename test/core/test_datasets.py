@@ -48,7 +48,7 @@ def test_inputs_that_were_measured_are_linear_between():
 
 
 @pytest.mark.parametrize('linear', [(), (True, False)])
-def test_part_keeps_what_acted(linear):
+def test_a_part_of_an_episode_keeps_the_applied_inputs(linear):
     episode = replace(irregular(), linear=linear)
     part = episode.part(7, 21)
     assert np.array_equal(part.time, episode.time[7:21])
@@ -95,7 +95,7 @@ def test_cut_leaves_no_interval_out():
     ({'input_time': [0.0, 0.0]}, 'input_time must increase'),
     ({'input_time': [0.1, 0.2]}, 'the input at the first measurement is unknown'),
 ])
-def test_refuses_what_is_no_episode(changes, words):
+def test_invalid_arrays_are_no_episode(changes, words):
     good = {'time': [0.0, 1.0, 2.0], 'x': np.zeros((3, 1)), 'input_time': [0.0, 1.0],
             'u': np.zeros((2, 1))}
     with pytest.raises(ValueError, match=words):
@@ -152,7 +152,7 @@ def test_times_that_do_not_rise(value):
         replace(bent_samples(), **mixed, time=np.array([1.0, 5.0, 0.0, 6.0]))
 
 
-def test_take_keeps_what_belongs_together():
+def test_take_keeps_whole_episodes():
     part = timed().take(np.array([3, 1]))
     assert len(part) == 10
     np.testing.assert_array_equal(part.episode, np.repeat([1, 3], 5))
@@ -162,7 +162,7 @@ def test_take_keeps_what_belongs_together():
     assert bent_samples().take(np.array([0])).time is None
 
 
-def test_the_digest_tells_samples_apart():
+def test_different_samples_have_different_digests():
     everything = bent_samples()
     assert everything.digest() == bent_samples().digest()
     assert len(everything.digest()) == 64
@@ -240,7 +240,7 @@ def test_lists_are_taken_for_arrays():
     bent_samples(), BENT, irregular(), Simulation(
         *(np.zeros((400, n)) for n in (1, 2, 2, 1, 1, 2)), (None,) * 400, '', None)],
     ids=lambda value: type(value).__name__)
-def test_what_holds_many_numbers_is_described_on_one_line(described):
+def test_the_repr_of_large_objects_is_one_line(described):
     text = repr(described)
     assert text.startswith(f'{type(described).__name__}(')
     assert '\n' not in text

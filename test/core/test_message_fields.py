@@ -31,7 +31,7 @@ def test_number_is_found_by_path():
 
 
 @pytest.mark.parametrize('field', ['position[leg]', 'effort[arm]', 'position[7]', 'name[0]'])
-def test_what_is_not_there_is_named(field):
+def test_a_missing_field_is_named(field):
     with pytest.raises(LookupError, match=field.replace('[', r'\[')):
         MessageField('joints', 'sensor_msgs/msg/JointState', field, 'rad').get(joints())
 
@@ -42,7 +42,7 @@ def test_field_that_is_no_path_is_refused(field):
         MessageField('t', 'std_msgs/msg/Float64', field, '1')
 
 
-def test_arrays_and_names_grow_with_what_is_written():
+def test_arrays_and_names_grow_as_values_are_written():
     message = SimpleNamespace(name=[], effort=[])
     for name, value in (('left', 1.0), ('right', 2.0), ('left', 3.0)):
         MessageField('motors', 'sensor_msgs/msg/JointState', f'effort[{name}]', 'N m').put(message,
@@ -62,12 +62,12 @@ def test_arrays_and_names_grow_with_what_is_written():
     ('m', {'type': 'sensor_msgs/msg/Range'}, ('sensor_msgs/msg/Range', 'range', 'm')),
     ('K', {'type': 'std_msgs/msg/Float64', 'unit': 'K'}, ('std_msgs/msg/Float64', 'data', 'K')),
 ])
-def test_rest_of_a_place_follows_from_what_is_said(unit, given, expected):
+def test_missing_parts_of_a_message_field_get_defaults(unit, given, expected):
     found = place('s', 's', unit, given)
     assert (found.topic, (found.type, found.field, found.unit)) == ('s', expected)
 
 
-def test_commands_are_named_after_what_is_commanded():
+def test_commands_are_named_after_the_commanded_signal():
     assert base_name('coolant_temperature', 'K') == 'coolant'
     assert base_name('flow', 'm^3/s') == 'flow'
 
@@ -80,7 +80,7 @@ def test_signals_have_names_of_topics_and_units_that_there_are():
     assert named_units(['level [m]', 'flow [L/min]']) == {'level': 'm', 'flow': 'L/min'}
 
 
-def test_bounds_of_an_experiment_are_asked_for_by_name():
+def test_missing_bounds_of_an_experiment_are_named():
     given = {'system': '', 'states_measured': ('level [m]', 'oven [K]'),
              'inputs_commanded': ('flow [L/min]',), 'controlled': ('level',)}
     table, signals = trainer_table(None, given), trainer_signals(None, given)
@@ -99,7 +99,7 @@ def test_bounds_of_an_experiment_are_asked_for_by_name():
         table.snapshot(given).experiment(signals, np.array([1.0]))
 
 
-def test_trainer_that_knows_no_signals_says_how_to_name_them():
+def test_a_trainer_without_signals_explains_how_to_name_them():
     with pytest.raises(ConfigurationError, match="'oven' are unknown"):
         trainer_table(None, {'system': 'oven'})
 

@@ -21,7 +21,7 @@ def test_a_table_in_markdown():
         plots.table(head, [('bias',)])
 
 
-def test_a_page_names_versions_and_machine_and_leaves_out_what_is_empty(tmp_path):
+def test_a_page_names_versions_and_machine_and_leaves_out_empty_parts(tmp_path):
     path = plots.write_page(tmp_path / 'new' / 'report.md', 'Title', [
         'First.', '', plots.bullets([]), plots.bullets(['one', 'two']),
         plots.Picture('a.png', 'Seen. In detail.')], ('numpy', 'not-installed'))
@@ -34,7 +34,7 @@ def test_a_page_names_versions_and_machine_and_leaves_out_what_is_empty(tmp_path
     assert sections == ['First.', '- one\n- two', '![Seen](a.png)', '*Seen. In detail.*\n']
 
 
-def test_figures_hold_null_for_what_json_does_not_know(tmp_path):
+def test_figures_hold_null_for_numbers_without_json_form(tmp_path):
     path = plots.write_figures(tmp_path / 'new' / 'summary.json', {
         'a': math.inf, 'b': [1, math.nan, {'c': (np.float64(-math.inf), True, None)}], 'd': 'NaN'})
     # what cannot be written leaves the old ones

@@ -132,7 +132,7 @@ BEYOND = {
 
 @pytest.mark.parametrize('h', [0.0, 0.3])
 @pytest.mark.parametrize('case', BEYOND)
-def test_what_has_no_stabilising_solution(case, h):
+def test_problems_without_a_stabilising_solution_are_recognised(case, h):
     A, b, Q = BEYOND[case]
     solution = solve_riccati(A, np.array(b)[:, None], Q, np.eye(1), interval=h)
     assert solution.status is RiccatiStatus.NOT_STABILISABLE
@@ -149,7 +149,7 @@ def test_what_has_no_stabilising_solution(case, h):
 
 
 @pytest.mark.parametrize('h', [0.0, 0.3])
-def test_what_is_not_finite_or_weighs_nothing_is_not_solved(h):
+def test_riccati_problems_with_bad_numbers_are_not_solved(h):
     for place, name in enumerate('ABQR'):
         for value in (np.nan, np.inf, -np.inf):
             problem = [-np.eye(2), np.eye(2), np.eye(2), np.eye(2)]
@@ -176,7 +176,7 @@ def test_nothing_escapes_at_any_magnitude(h):
     assert solved > 10
 
 
-def test_no_input_costs_what_it_costs_and_no_weight_of_it_has_no_solution():
+def test_riccati_without_an_input_gives_its_cost_and_without_an_input_weight_none():
     solution = solve_riccati(-np.eye(2), np.zeros((2, 1)), np.eye(2), np.eye(1))
     assert solution.status is RiccatiStatus.SOLVED
     np.testing.assert_allclose(solution.P, 0.5 * np.eye(2), rtol=1e-14)
@@ -202,7 +202,7 @@ def test_sampled_random_pairs_against_scipy(h):
         assert np.max(np.abs(np.linalg.eigvals(phi - gamma @ solution.K))) < 1.0
 
 
-def test_what_the_sampled_regulator_costs_is_its_solution_and_least():
+def test_the_cost_of_the_sampled_regulator_is_its_solution_and_minimal():
     """Summed over 100 intervals of 10 Runge-Kutta steps each, for several gains at once."""
     A, B, Q, R = random_problem(3, 1, seed=4)
     h, start = 0.4, np.array([1.0, -0.5, 0.3])

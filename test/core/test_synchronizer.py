@@ -49,13 +49,13 @@ def test_stamps_may_be_apart_by_the_tolerance(apart, found):
     assert taken(assembler, (100, 'level', 1.0), (100 + apart, 'flow', 2.0)) == found
 
 
-def test_part_goes_to_the_nearest_of_the_samples_that_wait_for_it():
+def test_a_part_joins_the_nearest_incomplete_sample():
     assembler = SampleSynchronizer(('level', 'flow', 'heat'), tolerance_ns=10)
     assert not taken(assembler, (100, 'level', 1.0), (115, 'level', 2.0), (109, 'flow', 3.0))
     assert taken(assembler, (116, 'heat', 4.0)) == [(116, [2.0, 3.0, 4.0])]
 
 
-def test_what_comes_after_its_sample_is_late():
+def test_a_message_after_its_sample_is_late():
     assembler = SampleSynchronizer(NAMES, tolerance_ns=10)
     assert taken(assembler, (100, 'level', 1.0), (100, 'flow', 2.0)) == [(100, [1.0, 2.0])]
     assert not taken(assembler, (100, 'level', 9.0), (90, 'flow', 9.0), (110, 'flow', 9.0))
@@ -63,7 +63,7 @@ def test_what_comes_after_its_sample_is_late():
     assert assembler.awaited == ''
 
 
-def test_what_does_not_come_before_a_later_sample_is_missing():
+def test_a_message_not_received_before_a_later_sample_is_missing():
     assembler = SampleSynchronizer(NAMES)
     assert taken(assembler, (1, 'level', 1.0), (2, 'level', 2.0), (3, 'flow', 3.0)) == []
     assert assembler.awaited == 'flow'
@@ -74,7 +74,7 @@ def test_what_does_not_come_before_a_later_sample_is_missing():
     assert counts(assembler) == ({'flow': 1}, {'flow': 2}, {})
 
 
-def test_of_a_part_that_comes_twice_the_later_one_counts():
+def test_the_later_of_two_messages_with_one_stamp_counts():
     assembler = SampleSynchronizer(NAMES)
     assert taken(assembler, (1, 'level', 1.0), (1, 'level', 2.0), (1, 'flow', 3.0)) == [
         (1, [2.0, 3.0])]
@@ -96,7 +96,7 @@ def test_time_that_is_set_back_begins_afresh():
     assert counts(assembler) == ({'level': 1, 'flow': 1}, {}, {})
 
 
-def test_what_waits_is_bounded():
+def test_the_queue_is_bounded():
     assembler = SampleSynchronizer(NAMES)
     assert not taken(assembler, *((stamp, 'level', 1.0) for stamp in range(1000)))
     assert len(assembler._open) == 100

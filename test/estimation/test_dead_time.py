@@ -34,7 +34,7 @@ def test_each_input_acts_after_its_own_dead_time(begin, end, pieces):
 
 @pytest.mark.parametrize(('dead', 'kept'), [((0.0,), 1), ((0.4,), 2), ((2.0, 0.0), 3),
                                             ((2.1, 0.0), 4), ((60.0,), 6)])
-def test_what_acts_no_more_is_forgotten(dead, kept):
+def test_inputs_past_the_dead_time_are_dropped(dead, kept):
     dead_ns = tuple(round(seconds * SECOND) for seconds in dead)
     found = commanded(dead_ns)
     assert len(found.times_ns) == len(found.values) == kept
@@ -45,7 +45,7 @@ def test_what_acts_no_more_is_forgotten(dead, kept):
                                       whole.acting(round(time * SECOND), dead_ns))
 
 
-def test_the_first_input_was_applied_before_and_the_last_is_what_was_measured():
+def test_the_first_input_precedes_the_record_and_the_last_is_measured():
     found = AppliedInputs().corrected(np.array([7.0])).followed_by(
         10 * SECOND, np.array([1.0]), (4 * SECOND,))
     assert [found.acting(round(time * SECOND), (4 * SECOND,))[0] for time in (

@@ -138,7 +138,7 @@ CHANGED_HERE = [*CHANGED][::2]
     # a biased measurement of the coolant brings no offset
     (CHANGED['UA −20 %'], {'input_sensor': lambda u, _: u - 1.5})],
     ids=[*CHANGED_HERE, 'lag and delay', 'told less'])
-def test_what_is_not_the_model_is_brought_to_its_setpoint(plant, others):
+def test_the_law_controls_a_plant_that_differs_from_its_model(plant, others):
     loop = asked(controller(), plant, **others)
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
@@ -155,7 +155,7 @@ def test_two_state_reactor_under_the_lift_of_the_one_state_one():
     assert settled(loop.run(420), setpoint, 1e-3) <= 224 + 130
 
 
-def test_a_biased_sensor_is_shown_for_what_it_is():
+def test_the_panel_shows_a_sensor_bias():
     loop = Reactor(controller(), sensor=lambda y, _: y + 2.0)
     loop.run(1)
     loop.ask(START)
@@ -244,7 +244,7 @@ def test_a_jump_that_stays_is_accepted_when_the_plant_could_have_got_there(by, s
     assert settled(samples, START, 1e-3) < 280
 
 
-def test_only_what_was_taken_for_a_jump_before_has_moved():
+def test_only_measurements_taken_for_jumps_differ():
     limits = SensorLimits(*(np.array([x]) for x in (-100.0, 100.0, 1.0, 1.0)))
     outputs, last, seen = Outputs(('level',), ('m',), np.eye(1)), None, []
     for second, y in ((0, 0.0), (5, 4.0), (6, 14.0), (17, 14.1)):

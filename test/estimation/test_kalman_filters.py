@@ -132,7 +132,7 @@ def test_the_covariance_follows_the_nonlinear_flow(kind):
 
 
 @pytest.mark.parametrize(('factor', 'consistent'), [(1.0, True), (2.0, False), (0.5, False)])
-def test_squares_of_innovations_tell_whether_the_noise_is_what_was_said(factor, consistent):
+def test_squared_innovations_match_the_stated_noise(factor, consistent):
     model, rng = oscillator(), np.random.default_rng(3)
     one = kalman(ExtendedKalmanFilter, model, first(model, 1), noise=0.1 * factor)
     F = expm(np.vstack((np.hstack((model.A, model.B)), np.zeros((1, 3)))) * 5.0 / 60.0)
@@ -218,7 +218,7 @@ def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known
 
 
 @pytest.mark.parametrize('wrong', [-0.2, 0.1])
-def test_a_wrong_first_guess_of_what_is_not_measured_is_survived(wrong):
+def test_a_wrong_initial_estimate_of_an_unmeasured_state_is_corrected(wrong):
     x0, u0 = held(350.0)
     x0 = np.array([x0[0] + wrong, x0[1]])
     loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
@@ -243,7 +243,7 @@ def test_a_sensor_that_is_lost_for_five_seconds_is_bridged_by_the_model():
     assert deviations[11] > 1.5 * deviations[6]
 
 
-def test_what_is_known_goes_over_to_a_model_in_other_units():
+def test_a_state_transfers_to_a_model_in_other_units():
     states = TRUTH.states
     twice = replace(TRUTH, states=replace(states, scale=2.0 * states.scale),
                     A=TRUTH.A, B=0.5 * TRUTH.B)
@@ -259,7 +259,7 @@ def test_what_is_known_goes_over_to_a_model_in_other_units():
     assert abs(float(loop.commands[100, 0] - loop.commands[99, 0])) <= 1.0
 
 
-def test_a_model_with_other_hidden_states_begins_from_what_is_measured():
+def test_a_model_with_other_hidden_states_starts_from_the_measurement():
     # the same plant, its concentration in other words
     names = ('conversion', 'temperature')
     other = replace(TRUTH, states=Coordinates(
@@ -427,7 +427,7 @@ def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_
             assert repeated == command
 
 
-def test_another_order_of_levels_goes_on_with_the_rate_that_was_estimated():
+def test_another_fallback_order_keeps_the_estimated_rate():
     """From a PI law to levels of which the last has another model than the first."""
     model, plant = shipped('two_state'), two_state_reactor()
 

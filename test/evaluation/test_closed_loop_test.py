@@ -191,7 +191,7 @@ def held_cost(a, gain, h):
     return (quad(lambda t: x(t) ** 2, 0.0, h)[0] + h * gain ** 2) / (1.0 - x(h) ** 2)
 
 
-def test_a_costly_law_is_refused_by_what_it_costs():
+def test_a_costly_law_is_rejected_by_its_cost():
     endless = InputLimits(np.full(1, -np.inf), np.full(1, np.inf), np.full(1, np.inf))
     model, h = scalar(), 0.4  # longer than half of 1 / sqrt(2)
     found = evaluate_closed_loops(model, linear_rate(1.0), law=Constant, limits=endless,
@@ -207,7 +207,7 @@ def test_a_costly_law_is_refused_by_what_it_costs():
     assert '(16 at over 1.05 times the cost with a perfect model)' in str(found)
 
 
-def test_what_no_law_can_do_within_the_limits_is_judged_without_them():
+def test_setpoints_out_of_reach_within_limits_are_judged_without_limits():
     """With |u| <= 0.5 nothing brings dx/dt = x + u back from |x| > 0.5."""
     tight = InputLimits(np.full(1, -0.5), np.full(1, 0.5), np.full(1, np.inf))
     found = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=64)
@@ -251,7 +251,7 @@ def too_steady_on_its_plant():
     return evaluate_closed_loops(too_steady(), linear_rate(1.0))
 
 
-def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
+def test_a_loss_that_a_perfect_model_shares_does_not_count():
     found = evaluate_closed_loops(*cubic(0.0, 6.0, 0.0, 8.0), loops=64)
     assert np.mean(found.poor) > 0.01
     assert np.all(found.excess[found.poor] <= 1.001)
@@ -265,7 +265,7 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
     assert np.all(blamed.excess[blamed.failed] > 1.05)
 
 
-def test_what_a_better_model_would_save_is_held_against_a_model():
+def test_a_cost_that_a_better_model_would_save_counts_against_a_model():
     """A linear model passes beside linear laws, but another would save much."""
     model, rate = cubic(0.5, 0.5, 0.0, 8.0)
     assert evaluate_closed_loops(model, rate, loops=64).failed.sum() == 0
@@ -281,7 +281,7 @@ def test_what_a_better_model_would_save_is_held_against_a_model():
     assert 'at over 1.05 times the cost with a perfect model' in str(found)
 
 
-def test_what_is_slow_and_cheap_has_not_failed():
+def test_a_slow_but_cheap_loop_has_not_failed():
     """Between two stable rests the law takes longer than a linear one, and costs less."""
     found = evaluate_closed_loops(*cubic(2.0, 0.0, -2.0, 3.0), loops=64)
     assert (found.arrived, found.poor.sum()) == (found.loops, 0)
@@ -365,7 +365,7 @@ def test_the_map_shows_each_loop_once(tmp_path):
         np.sum(~found.failed), np.sum(found.failed)]
 
 
-def test_ranges_are_told_to_what_tells():
+def test_ranges_are_passed_to_methods_that_accept_them():
     found = ClosedLoopTest(TWO, np.array([[2.0004, 300.0]]), np.array([[-1e-17, 310.012]]),
                            np.array([np.inf]), np.array([False]), np.array([np.inf]), 0)
     assert found.region == 'from a 2 m, b 300 K to set-points a 0 m, b 310 K'

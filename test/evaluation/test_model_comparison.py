@@ -105,7 +105,7 @@ def test_errors_are_those_of_the_best_start_and_disturbance():
             (model(B=1.1 * B), True), (model(A=1.2 * A), True), (model(B=-B), False),
             (model(B=0.0 * B), False), (model(B=5.0 * B), False), (model(A=-A), False),
             (model(A=20.0 * A), False), (model(B=1e300 * B), False)))])
-def test_models_are_told_apart_where_something_moves(other, accepted, noise):
+def test_models_are_compared_only_by_moving_signals(other, accepted, noise):
     u = random_steps(301, 1)
     x = two_lags(u) + noise * np.random.default_rng(2).normal(size=(301, 2))
     found = compare(model(), other, recent(x + 3.0, u + 3.0, 200.0).windows(200.0))
@@ -117,7 +117,7 @@ def test_models_are_told_apart_where_something_moves(other, accepted, noise):
 @pytest.mark.parametrize(('other', 'accepted'), [
     (model(), True), (model(B=1.1 * B), True), (model(A=1.2 * A), True),
     (model(B=-B), False), (model(B=5.0 * B), False)])
-def test_models_are_told_apart_by_one_output_of_two(other, accepted):
+def test_models_are_compared_by_each_of_two_outputs(other, accepted):
     u = random_steps(301, 1)
     y = two_lags(u)[:, :1] + 0.01 * np.random.default_rng(2).normal(size=(301, 1))
     # what moves the output is the state that is not measured
@@ -129,7 +129,7 @@ def test_models_are_told_apart_by_one_output_of_two(other, accepted):
 
 
 @pytest.mark.parametrize(('known', 'accepted'), [(4.5, True), (5.0, True), (0.0, False)])
-def test_models_are_told_apart_by_their_dead_time(known, accepted):
+def test_models_are_compared_with_their_dead_time(known, accepted):
     u = random_steps(301, 1)
     late = two_lags(np.concatenate((np.tile(u[:1], (5, 1)), u[:-5])))
     present, candidate = (replace(model(), dead_time=np.array([dead])) for dead in (5.0, known))
@@ -140,7 +140,7 @@ def test_models_are_told_apart_by_their_dead_time(known, accepted):
 
 @pytest.mark.parametrize('outputs', [None, Outputs(('x1',), ('1',), np.array([[1.0, 0.0]]))])
 @pytest.mark.parametrize(('factor', 'accepted'), [(1.02, True), (0.0, False), (-1.0, False)])
-def test_models_are_told_apart_by_their_measured_disturbances(factor, accepted, outputs):
+def test_models_are_compared_with_their_measured_disturbances(factor, accepted, outputs):
     def disturbed(factor):
         d = Coordinates(('d',), ('1',), *np.array([[5.0], [2.0], [3.0], [7.0]]))
         return replace(model(), disturbances=d, E=factor * E)
@@ -157,7 +157,7 @@ def test_models_are_told_apart_by_their_measured_disturbances(factor, accepted, 
     assert bool((ratio < 2.0).all()) is accepted
 
 
-def test_steady_noise_tells_nothing():
+def test_steady_noise_decides_nothing():
     noise = 0.1 * np.random.default_rng(3).normal(size=(300, 2))
     held = np.full((300, 1), 3.0)
     for x in (3.0 + noise, np.full((300, 2), 3.0)):
@@ -169,7 +169,7 @@ def test_steady_noise_tells_nothing():
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.1])
-def test_reactor_under_control_tells_lifts_from_models_of_another(noise):
+def test_closed_loop_data_of_the_reactor_distinguish_models(noise):
     lift = shipped('reactor_nz4')
     run = simulate(
         controller(lift, observer_bandwidth=0.1),
@@ -231,7 +231,7 @@ def test_too_little_is_no_window():
     assert cut(samples(MeasurementBuffer(), range(100, 1000, 100))).places.shape == (1, 8)
 
 
-def test_clock_that_goes_back_or_an_unknown_input_begins_anew():
+def test_a_clock_set_back_or_an_unknown_input_begins_a_new_episode():
     assert cut(samples(samples(MeasurementBuffer(), range(50, 90)),
                        range(1, 10))).x.ravel().tolist() == list(
         range(1, 10))

@@ -53,7 +53,7 @@ def test_optimum_of_a_linear_plant_that_is_unstable_is_that_of_its_riccati_equat
     assert optimum(shifted).cost == pytest.approx(best.cost, rel=1e-8)
 
 
-def test_linear_law_of_a_linear_plant_costs_what_its_riccati_equation_says_when_sampled_fast():
+def test_the_linear_law_has_the_cost_of_its_riccati_solution_when_sampled_fast():
     P = solve_continuous_are(A, B, np.diag(TASK.Q), np.diag(TASK.R))
     fast = replace(TASK, period=0.01, samples=3000, substeps=1)
     assert linear_law(fast).cost == pytest.approx(TASK.x0 @ P @ TASK.x0, rel=1e-3)

@@ -113,7 +113,7 @@ def test_each_law_brings_each_plant_to_its_setpoint(case, law):
 
 
 @each_case
-def test_rows_are_what_the_plant_did(case):
+def test_rows_reproduce_the_run_of_the_plant(case):
     found = run(case, samples=5)
     n_x, n_u = case.model.n_x, case.model.n_u
     np.testing.assert_array_equal(found.times, case.seconds * np.arange(6.0))
@@ -155,7 +155,7 @@ def test_outputs_in_other_units_give_the_same_loop(case):
     np.testing.assert_allclose(found.commands, usual.commands, rtol=1e-9, atol=1e-9)
 
 
-def test_a_plant_with_more_states_than_the_model_needs_to_know_what_is_measured():
+def test_a_plant_with_more_states_than_the_model_needs_the_measured_names():
     plant = two_state_reactor()
     there = Process(plant, 0, plant.nominal_state, plant.nominal_input)
     case = CASES['reactor_nz4']
@@ -240,7 +240,7 @@ def test_the_operator_moves_the_input_of_a_loop(case):
     np.testing.assert_allclose(found.commands[5:], [case.held + by] * 6, rtol=1e-12)
 
 
-def test_what_is_refused_ends_the_simulation_with_the_reason():
+def test_a_rejected_request_ends_the_simulation_with_its_reason():
     with pytest.raises(ValueError, match='set-point 200 K is outside the trained range 305 K to'):
         run(CASES['reactor_nz4'], at(1.0, SetpointRequest(0, np.array([200.0]))))
 
@@ -260,7 +260,7 @@ def test_an_actuator_is_late_and_reaches_less(case):
 
 # The end.
 
-def test_it_ends_where_it_is_told_and_where_the_plant_cannot_go_on():
+def test_a_simulation_ends_at_its_time_and_where_the_plant_cannot_continue():
     case = CASES['reactor_nz4']
     found = run(case, stop=lambda x, u, report: bool(x[0] < START - 5.0))
     assert np.flatnonzero(found.states[:, 0] < START - 5.0).tolist() == [len(found.times) - 1]
@@ -419,7 +419,7 @@ SHAFT = linear_model()
     ({'weights': Weights(np.eye(1), np.eye(1))}, r'incompatible Q: expected \(2, 2\), got \(1,'),
     ({'weights': Weights(np.eye(2), np.eye(2))}, r'incompatible R: expected \(1, 1\), got \(2,'),
 ])
-def test_a_loop_of_what_does_not_fit(change, message):
+def test_a_loop_of_mismatched_arguments_is_an_error(change, message):
     usual = {'x0': STATES.center, 'x_ref': STATES.center, 'weights': WEIGHTS, 'duration': 1.0}
     with pytest.raises(ValueError, match=message):
         run_closed_loop(SHAFT, rate, **{**usual, **change})

@@ -139,7 +139,7 @@ def test_a_reason_is_written_with_those_behind_it() -> None:
         ('safe', ['held_too_long', 'measurement_not_finite'])]
 
 
-def test_lost_records_are_named_and_the_next_snapshot_goes_on() -> None:
+def test_lost_records_are_reported_and_replay_continues_at_the_next_snapshot() -> None:
     texts = day().texts
     # the first snapshot behind it is that of the 30th measurement
     found = replayed([*texts[:20], *texts[22:]])
@@ -181,13 +181,13 @@ def test_same_model_under_the_same_parameters_commands_the_same() -> None:
     assert all(identical(found))
 
 
-def test_model_that_refuses_the_set_point_goes_by_what_was_tracked() -> None:
+def test_a_model_that_rejects_the_setpoint_tracks_the_previous_one() -> None:
     found = replayed(day().texts, Alternative(*MODELS['reactor_linear']))
     assert all(sample.alternative is not None for sample in found.samples)
     assert not all(identical(found, 'alternative'))
 
 
-def test_own_model_is_found_where_it_lies_now(tmp_path: Path) -> None:
+def test_a_model_file_is_found_after_its_folder_moved(tmp_path: Path) -> None:
     path = tmp_path / 'own.safetensors'
     own = MODELS['reactor_nz4'][0]
     save(replace(own, provenance=replace(own.provenance, plant='another')), path)
@@ -299,6 +299,6 @@ def test_only_known_data_is_made(text: dict, error: type[Exception]) -> None:
 
 
 @pytest.mark.parametrize('value', [Plain(), {1, 2}, b'bytes', lambda: None])
-def test_what_is_no_data_is_refused(value: object) -> None:
+def test_invalid_data_are_rejected(value: object) -> None:
     with pytest.raises(TypeError, match='cannot be written to a record'):
         records.encoded(value)

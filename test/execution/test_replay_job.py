@@ -12,7 +12,7 @@ from koopman_ros.execution.job import ReplayJob
 from support.nodes import TIMEOUT
 
 
-def test_it_gives_way_and_says_what_is_wrong(tmp_path: Path) -> None:
+def test_the_experiment_ends_with_its_reason(tmp_path: Path) -> None:
     job = ReplayJob(['--ros-args', '-p', 'bags:=[none.mcap]', '-p', f'output:={tmp_path}/out'])
     try:
         assert os.getpriority(os.PRIO_PROCESS, job.process.pid) >= 10

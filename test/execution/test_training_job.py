@@ -119,7 +119,7 @@ def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) ->
     assert job.poll().text == 'cancelled; nothing was written'
 
 
-def test_figures_of_signals_are_told_one_by_one() -> None:
+def test_figures_are_reported_for_each_signal() -> None:
     assert training.scalars({
         'accepted': True, 'reasons': ['no'], 'noise': {'low': 0.5, 'high': None},
         'input_gain': {'low': {'pump': 2.0}}}) == {

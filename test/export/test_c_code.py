@@ -125,7 +125,7 @@ def test_the_program_writes_an_example_that_repeats_its_test_vectors(
     ('{fallback_order: [sdre, pi]}', [], 'law pi'),
     ('{fallback_order: [linear]}', [], 'does not contain sdre'),
     ('{}', ['--sample_period', '0'], 'above 0 s')])
-def test_the_program_refuses_what_it_cannot_export(
+def test_the_export_command_rejects_unsupported_loops(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], parameters: str, options: list[str],
         words: str) -> None:
     (tmp_path / 'loop.yaml').write_text(f'controller: {{ros__parameters: {parameters}}}')
@@ -157,7 +157,7 @@ def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
 @pytest.mark.parametrize(('model', 'given', 'words'), [
     ('reactor_nz4', {'safe_latch': True}, 'safe_latch'),
     ('reactor_nz4', {'temperature.report_on_change': 10.0}, 'report_on_change')])
-def test_what_a_loop_in_c_does_not_know_is_refused(
+def test_the_export_rejects_unsupported_features(
         model: str, given: dict[str, Any], words: str) -> None:
     learned = load(model_path(model))
     with pytest.raises(ExportError, match=words):

@@ -52,7 +52,7 @@ class Given:
         return start(data, n_z, parent, seed, monitor) if start else result
 
 
-def test_the_best_start_wins_and_is_what_the_next_round_extends():
+def test_the_next_round_extends_the_best_start():
     recorded, everything = Recorded(RECIPE), unforced_samples()
     trained = train(UNFORCED, everything, recorded, starts=4, seed=3)
     assert len({seed for n_z in (2, 3) for seed, _, _ in recorded.found[n_z]}) == 8
@@ -86,7 +86,7 @@ def test_a_start_without_a_result_is_no_candidate(change, words):
         train(UNFORCED, unforced_samples(), Given(given), starts=2)
 
 
-def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
+def test_a_linear_plant_gets_a_lift_only_on_request():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     with pytest.raises(TrainingFailed, match='n_z = 2 does not predict the motion better'):
@@ -111,7 +111,7 @@ def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
 @pytest.mark.parametrize(('recipe', 'remedies'), [
     (RECIPE, 'a smaller n_z, more'), (
         replace(SMALL, identity=False), 'identity coordinates, a smaller n_z, more')])
-def test_a_lift_whose_law_goes_nowhere_is_no_controller(recipe, remedies):
+def test_a_lift_whose_law_reaches_no_setpoint_is_rejected(recipe, remedies):
     """The drift x + 0.3 x^2 runs away, and the input does nothing to it."""
     samples = bent_samples()
     x = samples.x - 3.0

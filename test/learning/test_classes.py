@@ -210,7 +210,7 @@ def test_of_a_linear_drift_the_linear_model_alone_is_learned(bag, tmp_path):
 
 
 @pytest.mark.usefixtures('quick')
-def test_one_class_has_no_lines_beside_others(bag, tmp_path):
+def test_a_report_of_one_class_has_no_comparison(bag, tmp_path):
     retrained = retrain(task(bag, tmp_path, 'polynomial'))
     assert class_lines(retrained.summary()) == {}
     # exact, but no better than the linear model
@@ -218,7 +218,7 @@ def test_one_class_has_no_lines_beside_others(bag, tmp_path):
 
 
 @pytest.mark.usefixtures('quick')
-def test_it_is_retrained_where_the_task_says(bag, tmp_path):
+def test_the_plant_is_retrained_at_the_paths_of_the_task(bag, tmp_path):
     """The same lift comes of it, and what fails writes nothing."""
     models = []
     for scheduler in ('', 'process'):

@@ -131,7 +131,7 @@ def visited(episodes: list[Episode], like: Selection) -> set[tuple[int, ...]]:
     return set(map(tuple, cells_of(values, like.lower, like.upper).tolist()))
 
 
-def test_every_cell_is_visited_by_what_is_chosen() -> None:
+def test_the_selection_covers_every_cell() -> None:
     whole = long_rest()
     found = select([whole])
     chosen = found.episodes()
@@ -145,7 +145,7 @@ def test_every_cell_is_visited_by_what_is_chosen() -> None:
     assert len(tenths) >= 8
 
 
-def test_the_seed_decides_what_is_chosen() -> None:
+def test_the_seed_determines_the_selection() -> None:
     parts = [long_rest(20_000), long_rest(30_000)]
     starts = [[one.time[0] for one in select(parts, seed=seed).episodes()] for seed in (0, 0, 1)]
     assert starts[0] == starts[1] != starts[2]

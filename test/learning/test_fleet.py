@@ -72,7 +72,7 @@ def test_a_request_to_end_leaves_the_rest_alone(tasks, tmp_path):
     assert not list(tmp_path.glob('*.safetensors'))
 
 
-def test_what_is_refused_before_it_begins(tasks):
+def test_invalid_arguments_are_rejected_before_the_start(tasks):
     twice = {'a': tasks['first'], 'b': tasks['first']}
     with pytest.raises(ValueError, match='a and b would both write'):
         next(retrain_fleet(twice))

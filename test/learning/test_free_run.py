@@ -84,7 +84,7 @@ def test_errors_of_a_wrong_model_count_after_the_start(tmp_path):
     assert (tmp_path / 'run.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_model_that_diverges_says_so(tmp_path):
+def test_a_diverging_model_is_reported(tmp_path):
     run = simulate(lifted(slope=30.0 * np.eye(2)), read(table(), 'position [m]', 'force [N]'),
                    init=2)
     assert run.diverged

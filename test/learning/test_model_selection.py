@@ -101,7 +101,7 @@ def test_a_polynomial_drift_is_found_and_taken(bent):
     ({'alone': True}, 'choose must be one of .*, got None'),
     ({'choose': 'lift'}, "choose must be one of linear, .*, identity lift, got 'lift'"),
     ({'starts': 0}, 'starts must be at least 1, got 0')])
-def test_what_cannot_be_compared(asked, words):
+def test_incomparable_models_are_an_error(asked, words):
     with pytest.raises(ValueError, match=words):
         compare(BENT, bent_samples(), RECIPES, **asked)
 

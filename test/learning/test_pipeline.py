@@ -162,7 +162,7 @@ def test_report(accepted):
 
 
 @pytest.mark.usefixtures('learned')
-def test_models_of_alternative_drifts_are_kept_beside_the_model(
+def test_models_of_alternative_drifts_are_kept_next_to_the_model(
         bag, accepted, tmp_path, monkeypatch):
     """That of a training before goes."""
     drift = accepted[0].found.drift
@@ -279,7 +279,7 @@ def test_a_task_survives_json():
     ({'model': '', 'input_gain': {'temperature': {'steam': 1.0}}}, ValueError,
      'names steam acting on temperature: the lift has the st'),
 ])
-def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, error, words):
+def test_a_mismatch_is_an_immediate_error(bag, tmp_path, monkeypatch, values, error, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'file').touch()
     save(random_lift(), tmp_path / 'two.safetensors')

@@ -151,7 +151,7 @@ def lagging():
 
 
 @pytest.mark.parametrize('measured', [True, False])
-def test_measured_input_tells_what_the_command_hides(lagging, measured):
+def test_a_measured_input_replaces_the_command(lagging, measured):
     system, rows = lagging
     x = rows[:, :1] + NOISE * np.random.default_rng(1).standard_normal((len(rows), 1))
     minutes = np.arange(len(rows)) / 60.0

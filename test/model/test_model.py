@@ -54,7 +54,7 @@ def test_rates_of_z_are_brought_to_the_nearest_rate_of_the_state(n_x, identity):
             np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-13)
 
 
-def test_a_lift_that_stands_still_moves_no_state():
+def test_a_lift_at_rest_moves_no_state():
     model = random_lift(1, identity=False)
     np.testing.assert_array_equal(
         model.onto_states(np.zeros((model.n_z, 1))) @ np.ones(model.n_z), [0.0])
@@ -442,7 +442,7 @@ def test_box_scales_by_half_the_range_from_the_nominal_point():
     ({'u': np.full((180, 1), 0.5)}, '0.5 m/s: excite the plant'),
     ({'x': np.full((180, 1), 3.0)}, '3.0 m: excite the plant'),
     ({'u': np.zeros((180, 2))}, 'values of 2 signals for 1 names: flow')])
-def test_what_never_moves_or_is_of_another_size_has_no_box(changes, message):
+def test_constant_or_mismatched_signals_have_no_box(changes, message):
     samples = bent_samples()
     with pytest.raises(ValueError, match=message):
         Box.of(BENT, changes.get('x', samples.x), changes.get('u', samples.u))

@@ -149,7 +149,7 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
     assert 'controller: still busy 0.2 s after a signal' in bench.process.output()
 
 
-def test_watchdog_acts_only_without_a_beat_and_tells_its_errors() -> None:
+def test_the_watchdog_acts_only_without_a_heartbeat_and_reports_its_errors() -> None:
     acted: list[float] = []
 
     def act(busy: float) -> None:

@@ -102,7 +102,7 @@ def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
     assert seconds(commands[0]) == 1.0
 
 
-def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
+def test_a_setpoint_of_a_volatile_publisher_is_received_and_the_active_one_latched(
         bench: Bench) -> None:
     """`ros2 topic pub` publishes reliable and volatile."""
     late = bench.ros.listen(Temperature, reactor.ACTIVE_SETPOINT, topics.LATCHED_QOS)
@@ -133,7 +133,7 @@ def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
     assert bench.active == pytest.approx(45.0)
 
 
-def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
+def test_manual_mode_sends_the_command_of_the_operator(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
     at, held = bench.settle(STEADY, 2.0)
     manual.publish(temperature(20.0))
@@ -212,7 +212,7 @@ def test_two_thermometers_of_one_clock_hold_the_coolant_while_both_measure(
         ros.statuses[-1].level != DiagnosticStatus.ERROR), next(times) + 100.0)
 
 
-def test_what_the_operator_requests_is_done_without_measurements(bench: Bench) -> None:
+def test_operator_requests_act_without_measurements(bench: Bench) -> None:
     ros = bench.ros
     ros.set_parameters('controller', **{
         'coolant_temperature.rate_limit': 4.0, 'temperature.setpoint_ramp': 4.0})
@@ -242,7 +242,7 @@ def measure_on(bench: Bench, count: int, first: float) -> float:
     return first + count - 1
 
 
-def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
+def test_a_setpoint_beyond_the_input_limits_is_reported(bench: Bench) -> None:
     bench.ros.set_parameters('controller', **{
         'observer_bandwidth': 0.1, 'coolant_temperature.max_disturbance': 100.0})
     for k in range(60):
@@ -256,7 +256,7 @@ def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
     assert float(needed[1]) > 32.0
 
 
-def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
+def test_the_status_has_mode_law_reason_and_figures(bench: Bench) -> None:
     bench.ros.set_parameters('controller', observer_bandwidth=0.1)
     # whole seconds of the clock of the node, so that ages are known
     last = measure_on(bench, 20, float(int(time.time()) - 40))
@@ -332,7 +332,7 @@ def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
     assert 0.0 < found['gain'] < 1000.0
 
 
-def test_a_plan_is_told_with_the_limits_that_are_active(bench: Bench) -> None:
+def test_a_plan_reports_its_active_limits(bench: Bench) -> None:
     plans = bench.ros.listen(JointTrajectory, topics.PREDICTED_TRAJECTORY)
     limits = bench.ros.listen(JointState, topics.ACTIVE_CONSTRAINTS)
     bench.ros.meet('controller')
@@ -361,7 +361,7 @@ def test_a_plan_is_told_with_the_limits_that_are_active(bench: Bench) -> None:
     assert seconds(plans[-1]) == 4.0
 
 
-def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
+def test_a_safe_coolant_outside_the_training_range_is_reported(
         bench: Bench, tmp_path: Path) -> None:
     bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
     model = load(model_path('reactor_nz4'))
@@ -381,7 +381,7 @@ def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
         'controller', model='reactor_nz4')).successful
 
 
-def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
+def test_two_controllers_report_each_other_while_both_run(ros: Harness) -> None:
     """Beside a best-effort thermometer, and a coolant that is promised and never told."""
     ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')

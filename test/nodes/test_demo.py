@@ -72,7 +72,7 @@ def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_le
     assert all(one.recorded == one.replayed for one in replayed.samples)
 
 
-def test_a_late_loop_costs_what_its_optimum_costs_and_less_than_pi_control(
+def test_a_loop_with_dead_time_reaches_the_optimal_cost_and_beats_pi_control(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, number in (('STEPS', ((20.0, 333.15), (300.0, 321.15))), ('FEED_TIME', 600.0),
                          ('_DURATION', 900.0)):
@@ -88,7 +88,7 @@ def test_a_late_loop_costs_what_its_optimum_costs_and_less_than_pi_control(
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_demo_says_in_one_line_why_it_cannot_run(
+def test_a_demo_that_cannot_run_gives_the_reason_in_one_line(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'taken').write_text('a file, not a folder')
     for options, words in ((['--output', str(tmp_path / 'taken')], str(tmp_path / 'taken')),
@@ -144,7 +144,7 @@ def test_demo_interrupted_while_it_loads_ends_without_a_word(
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
-def test_demo_interrupted_in_its_loop_keeps_what_it_recorded(tmp_path: Path) -> None:
+def test_an_interrupted_demo_keeps_its_recording(tmp_path: Path) -> None:
     """Beside another run, so that it writes to demo-2."""
     wanted = tmp_path / 'demo'
     with reserved_output(wanted) as taken, subprocess.Popen(

@@ -126,7 +126,7 @@ def shared_bench(shared_ros: Harness) -> Bench:
     return Bench(shared_ros)
 
 
-def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
+def test_an_obstacle_prevents_the_start_of_an_experiment(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     for celsius, words in (
             (60.0, 'the temperature 60.00 degC is outside the bounds of the experiment, 31.85 '

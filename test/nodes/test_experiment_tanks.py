@@ -36,7 +36,7 @@ def numbers(messages: list[Any]) -> np.ndarray:
     return np.array([message.position[0] for message in messages])
 
 
-def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: Path) -> None:
+def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_path: Path) -> None:
     before = 1.1 * TANKS.nominal_state
     low, high = 0.85 * TANKS.nominal_state, 1.2 * TANKS.nominal_state
     measured = [ros.listen(JointState, name) for name in LEVELS]
@@ -120,7 +120,8 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
     assert 'switch it to manual mode' in status.message
 
 
-def test_setpoints_that_nobody_tracks_refuse_the_start(ros: Harness, tmp_path: Path) -> None:
+def test_an_experiment_of_setpoints_without_a_controller_is_rejected(
+        ros: Harness, tmp_path: Path) -> None:
     ros.start('trainer', {
         **TRAINER, 'model': linear(tmp_path), 'experiment_signal': 'setpoint',
         'experiment_timeout': 1.0, **{f'{name}.setpoint_{end}': bound for name in LEVELS

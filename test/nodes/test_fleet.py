@@ -29,7 +29,7 @@ def arguments(folder: Path, bags: dict[str, list[str]], **everywhere: object) ->
             str(folder / 'loops.txt'))
 
 
-def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
+def test_each_plant_has_its_own_progress(ros: Harness, tmp_path: Path) -> None:
     bag = str(write_bag(tmp_path / 'run.mcap', linear_run(400)))
     program = ros.start('trainer', arguments=arguments(
         tmp_path, {'a': [bag], 'lost': [str(tmp_path / 'none.mcap')], 'bare': ['']}))

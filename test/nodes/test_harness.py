@@ -29,7 +29,7 @@ SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
     ('echo a reason; exit 3', False, 'failing ended early, with code 3: a reason'),
     ('exit 0', True, 'failing ended early'),
     ('exit 0', False, 'not within 1 s: the impossible; see ')])
-def test_end_that_nobody_asked_for_is_told(
+def test_an_unrequested_end_of_a_process_is_reported(
         tmp_path: Path, program: str, lasting: bool, words: str) -> None:
     """One without an error counts where processes are to last."""
     ros = Harness(tmp_path, lasting=lasting, timeout=1.0)
@@ -68,7 +68,7 @@ STUBBORN = {
 
 
 @pytest.mark.parametrize('name', STUBBORN)
-def test_process_ends_in_order_or_is_aborted_and_says_where_it_is(
+def test_a_process_that_does_not_end_is_aborted_with_its_stack(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     act, code, words = STUBBORN[name]
     if code < 0:

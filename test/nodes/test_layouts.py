@@ -48,7 +48,7 @@ def published(topic: str, field: str, name: str = '') -> str:
     return name.split(' [')[0] or topic
 
 
-def test_plotjuggler_shows_what_is_published_and_subscribes_to_it() -> None:
+def test_the_plotjuggler_layout_subscribes_to_published_topics() -> None:
     layout = ElementTree.parse(config_directory() / 'plotjuggler.xml').getroot()
     shown = []
     for curve in layout.iter('curve'):
@@ -70,7 +70,7 @@ def test_a_kalman_filter_leaves_the_places_of_the_others() -> None:
     assert NAMES[topics.CONTROLLER_INTERNALS][:len(plain)] == list(plain)
 
 
-def test_foxglove_shows_what_is_published() -> None:
+def test_the_foxglove_layout_shows_published_topics() -> None:
     layout = json.loads((config_directory() / 'foxglove_layout.json').read_text())
     shown = []
     for panel in layout['configById'].values():

@@ -212,7 +212,7 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert 'Traceback' not in process.output()
 
 
-def test_controller_goes_on_from_the_last_command(ros: Harness) -> None:
+def test_a_restarted_controller_continues_from_the_last_command(ros: Harness) -> None:
     """After an activation, by the records, too; an input that was measured long ago is none."""
     loop = Loop(ros)
     applied = ros.node.create_publisher(

@@ -140,7 +140,7 @@ class Failing:
     (controller, {'model': 'reactor_nz4', 'system': ''},
      ("parse parameter override rule: '-p system:='", '-p "system:=\'\'"')),
 ])
-def test_start_with_what_is_wrong_says_so(
+def test_a_start_with_wrong_arguments_gives_the_reason(
         program: ModuleType, given: dict[str, str], words: tuple[str, ...], tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'bad_oven.py').write_text(BAD)
@@ -153,7 +153,7 @@ def test_start_with_what_is_wrong_says_so(
     assert 'Traceback' not in said
 
 
-def test_page_names_the_files_and_quotes_what_is_said() -> None:
+def test_the_page_names_the_files_and_quotes_the_output() -> None:
     sources = {path.suffix: [p.read_text() for p in OVEN.glob(f'*{path.suffix}')]
                for path in OVEN.iterdir() if path.suffix}
     on_ros = PAGE

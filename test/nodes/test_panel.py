@@ -225,7 +225,7 @@ class Panel:
         rclpy.shutdown()
 
 
-def test_what_was_before_is_read_and_what_is_asked_for_reaches_the_loop_and_is_written_down(
+def test_the_panel_shows_earlier_data_and_its_requests_are_executed_and_audited(
         ros: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     controller = ros.start('controller')
     ros.start('trainer', {'output': tmp_path / 'bag'})
@@ -325,7 +325,7 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
 # The loop without it.
 
 
-def test_the_loop_goes_on_while_the_panel_is_flooded_stands_still_and_is_killed(
+def test_the_loop_continues_while_the_panel_is_flooded_stopped_and_killed(
         ros: Harness) -> None:
     process = ros.start('panel', {'port': 0})
     ros.start('controller')

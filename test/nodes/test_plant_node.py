@@ -226,7 +226,7 @@ def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> 
     assert not ros.trigger('plant/reset').success
 
 
-def test_stands_still_where_the_stamps_end(ros: Harness) -> None:
+def test_replay_stops_at_the_last_stamp(ros: Harness) -> None:
     bench = Bench(ros, start_time=LAST_STAMP_SECONDS - 7.0)
     status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert 'smaller start_time' in status.message
@@ -251,7 +251,8 @@ def test_time_is_written_with_all_digits() -> None:
         '0', '1700000000.250000001', '-0.5']
 
 
-def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Bench) -> None:
+def test_the_applied_coolant_is_published_before_each_measurement_and_latched(
+        bench: Bench) -> None:
     sent: dict[str, list[tuple[float, int, float]]] = {'coolant': [], 'measured': []}
     for name, topic in (
             ('coolant', reactor.COOLANT_TEMPERATURE), ('measured', reactor.TEMPERATURE)):
@@ -339,7 +340,7 @@ def test_runaway_stops_the_plant_and_reset_recovers_it(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
-def test_reactor_changes_while_it_runs_but_for_what_is_fixed_at_start(bench: Bench) -> None:
+def test_constants_of_the_reactor_change_while_it_runs_except_fixed_ones(bench: Bench) -> None:
     steady = bench.wait_for_more(1)[0].temperature
     bench.set(**{'constants.concentration': 850.0})
     bench.wait_for(lambda celsius: celsius < steady - 0.5)
@@ -349,7 +350,7 @@ def test_reactor_changes_while_it_runs_but_for_what_is_fixed_at_start(bench: Ben
     assert bench.ros.get_parameters('plant', 'constants.concentration', 'speed') == [850.0, 100.0]
 
 
-def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
+def test_other_publishers_are_named_while_they_exist(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
     intruder = Node('intruder', context=bench.ros.node.context, namespace='/elsewhere')
     for topic in (reactor.COOLANT_SETPOINT, reactor.TEMPERATURE):
@@ -366,7 +367,7 @@ def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
     assert status.message == 'running'
 
 
-def test_time_of_an_inactive_plant_stands_still(
+def test_the_time_of_an_inactive_plant_does_not_advance(
         shared_ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(plant_module, 'time', SimpleNamespace(

@@ -290,7 +290,7 @@ def test_setpoints_of_a_csv_are_due_in_the_time_of_a_simulation(
      'no command for the measurement at 1.000 s within 0.1 s: check that the controller'),
     ({'bag': 'damaged.mcap', 'rate': 1000.0, 'wait_for_subscribers': 0}, 'is damaged'),
 ])
-def test_what_cannot_be_played_is_refused_in_one_line(
+def test_a_bag_that_cannot_be_played_is_rejected_in_one_line(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
         parameters: dict[str, Any], words: str) -> None:
     monkeypatch.chdir(tmp_path)

@@ -279,7 +279,7 @@ def test_messages_are_logged_by_the_time_of_the_node(ros: Harness, tmp_path: Pat
         (50 + k if k < 30 else k - 29) * SECOND for k in range(40)]
 
 
-def test_clock_is_recorded_beside_unstamped_messages_logged_by_the_wall_clock(
+def test_the_clock_is_recorded_with_unstamped_messages_logged_by_wall_time(
         ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     process = ros.start('trainer', {'output': bag, **UNSTAMPED})

@@ -196,7 +196,7 @@ def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
     assert ros.get_parameters('controller', 'model', 'max_gain') == ['reactor_linear', 500.0]
 
 
-def test_model_that_predicts_what_was_measured_much_worse_is_refused(
+def test_a_model_that_predicts_recent_measurements_much_worse_is_rejected(
         ros: Harness, tmp_path: Path) -> None:
     """It takes over neither by parameter nor by service, unless the operator insists."""
     file = tmp_path / 'model.safetensors'
@@ -279,7 +279,7 @@ def disk(file: Path) -> Path:
     return Path(f'{file}.disk')
 
 
-def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) -> None:
+def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) -> None:
     bench, file = start_controller(ros, tmp_path)
     dead = file.with_name('dead.safetensors')
     for path in (file, dead):

@@ -282,7 +282,7 @@ def test_run_without_its_start_and_with_a_lost_record_is_reproduced_from_the_sna
     assert 'Records 8 to 8 of run a are missing' in (tmp_path / 'report.md').read_text()
 
 
-def test_report_tells_where_the_new_model_and_the_new_tuning_differ(
+def test_a_replay_reports_differences_of_a_new_model_and_a_new_tuning(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_run(tmp_path / 'run.mcap')
     for new, tuning in (
@@ -326,7 +326,7 @@ def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
          'coolant_temperature.min = 40 must be a double, e.g. 1.0'))),
     (('-p', 'output:=/dev/null/out'), 'Not a directory'),
 ])
-def test_what_cannot_be_replayed_is_refused_in_one_line(
+def test_a_bag_that_cannot_be_replayed_is_rejected_in_one_line(
         tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: tuple[str, ...],
         words: str) -> None:
     bag = write_run(tmp_path / 'run.mcap')
@@ -343,7 +343,7 @@ def test_controller_in_a_namespace_is_replayed_by_its_own_records(tmp_path: Path
     assert figures['recorded_model']['identical'] == figures['measurements'] == 20
 
 
-def test_missing_matplotlib_is_told_in_one_line(
+def test_missing_matplotlib_is_reported_in_one_line(
         monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.delitem(sys.modules, 'koopman_ros.event_log.figure', raising=False)
     monkeypatch.setitem(sys.modules, 'matplotlib', None)

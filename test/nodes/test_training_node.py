@@ -96,7 +96,7 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(ros: Harness, tmp_path: Pat
     assert 'Traceback' not in process.output()
 
 
-def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
+def test_training_runs_while_the_loop_runs(ros: Harness, tmp_path: Path) -> None:
     # no quicker: what is recorded while the machine is busy is what there is to train from
     ros.start('plant', {
         'lockstep': True, 'speed': 80.0, 'lockstep_subscribers': 2,

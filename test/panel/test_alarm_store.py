@@ -55,7 +55,7 @@ def test_states_shelving_and_the_list_of_the_day_are_loaded(file: Path) -> None:
     assert len(happened) == 7
 
 
-def test_what_is_there_again_is_no_news_and_what_is_not_returns(file: Path) -> None:
+def test_a_returning_condition_raises_no_second_alarm(file: Path) -> None:
     alarms = loaded(file)
     # nodes take a while until they are heard
     alarms.advance(AGAIN + 8.0)
@@ -96,7 +96,7 @@ def test_it_is_written_every_few_seconds_where_something_changed(tmp_path: Path)
     (lambda text: '{"version": 1, "alarms": [' + '[' * 100_000, 'recursion'),
     (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": ' + '9' * 400), 'too large'),
 ])
-def test_a_damaged_file_is_moved_aside_and_said(
+def test_a_damaged_file_is_moved_aside_and_reported(
         file: Path, change: Callable[[str], str], words: str) -> None:
     text = change(file.read_text())
     file.write_bytes(text.encode(errors='surrogateescape'))

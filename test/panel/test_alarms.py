@@ -117,7 +117,7 @@ def test_a_text_changes_at_once_and_stays_after_the_return() -> None:
     assert alarms.standing[0].text == '71 degC'
 
 
-def test_the_most_urgent_comes_first_and_of_these_the_newest() -> None:
+def test_alarms_are_sorted_by_priority_then_age() -> None:
     alarms = Alarms(delay_on=0.0)
     for offset, (key, priority) in enumerate(
             [('old', HIGH), ('low', LOW), ('new', HIGH), ('seen', HIGH), ('middle', MEDIUM)]):
@@ -126,7 +126,7 @@ def test_the_most_urgent_comes_first_and_of_these_the_newest() -> None:
     assert [alarm.key for alarm in alarms.standing] == ['new', 'old', 'middle', 'low', 'seen']
 
 
-def test_a_shelved_alarm_comes_back_by_itself() -> None:
+def test_a_shelved_alarm_returns_when_its_time_is_over() -> None:
     alarms = _raised()
     alarms.shelve('x', 60.0, 'Ada', NOW + 2.0)
     assert alarms.shelved[0].shelved_until == NOW + 62.0

@@ -528,7 +528,7 @@ USABLE = """controls => controls.filter(own => own.checkVisibility() && !own.dis
     && own.innerText !== 'Export YAML').map(own => own.outerHTML)"""
 
 
-def test_a_viewer_on_a_phone_sees_what_the_operator_does_and_cannot_act(site: Site) -> None:
+def test_a_viewer_on_a_phone_sees_operator_actions_and_cannot_act(site: Site) -> None:
     phone = site.browser.context(*PHONE)
     with contextlib.closing(phone), site.page() as desk:
         page = phone.new_page()

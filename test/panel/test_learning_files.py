@@ -102,7 +102,7 @@ def test_pipes_folders_and_large_files_are_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(('model', 'name'), [
     ('/a/new.safetensors', '/a/new'), ('/a/new.rejected.safetensors', '/a/new'),
     ('reactor_nz4', None), ('', None)])
-def test_a_report_is_beside_its_model(model: str, name: str | None) -> None:
+def test_a_report_is_written_next_to_its_model(model: str, name: str | None) -> None:
     assert report_base(model) == (None if name is None else Path(name))
 
 

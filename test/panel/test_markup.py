@@ -79,7 +79,7 @@ def test_hostile_texts_of_all_sources_stay_texts(
     assert CODE not in client.head_html + client.body_html
 
 
-def test_what_charts_show_at_the_cursor_is_drawn_not_markup(client: Client) -> None:
+def test_chart_tooltips_escape_markup(client: Client) -> None:
     trend_page(PageLayout(HostileSource(), Visitor('anna', lambda: True), '/trends'))
     (chart,) = (own for own in client.elements.values() if isinstance(own, ui.echart))
     assert chart.options['tooltip']['renderMode'] == 'richText'

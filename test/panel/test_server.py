@@ -284,7 +284,7 @@ def half_open(site: Site, count: int, stack: contextlib.ExitStack, said: bytes) 
     b'', b'GET / HTTP/1.1\r\nX: ',
     b'POST /login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100\r\nContent-Type: '
     b'application/x-www-form-urlencoded\r\n\r\nname='])
-def test_requests_that_never_end_keep_nobody_out(site: Site, said: bytes) -> None:
+def test_unfinished_requests_do_not_block_others(site: Site, said: bytes) -> None:
     anna = site.cookie('anna')
     before = len(os.listdir('/proc/self/fd'))
     with contextlib.ExitStack() as stack:

@@ -52,7 +52,7 @@ def test_wrong_log_ins_wait(throttle: Throttle, clock: Clock) -> None:
     assert passed <= 40, 'in an hour'
 
 
-def test_a_stranger_keeps_out_nobody_at_another_address(throttle: Throttle, clock: Clock) -> None:
+def test_failed_logins_do_not_lock_out_other_addresses(throttle: Throttle, clock: Clock) -> None:
     for number in range(200):
         attempts(throttle, 10, f'10.0.1.{number}')
     assert attempts(throttle, 1) == 1

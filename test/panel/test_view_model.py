@@ -139,7 +139,7 @@ def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
     assert bare.snapshot(NOW).inputs[0].unit == '°C'
 
 
-def test_a_plan_lies_ahead_until_nothing_is_planned() -> None:
+def test_a_plan_is_shown_until_it_is_empty() -> None:
     own = view(temperature='degF')
     own.take_plan(['temperature [degC]', 'coolant_temperature [degC]'], 100.0, [0.0, 1.0, 3.0],
                   [[50.0, 20.0], [45.0, 21.0], [40.0, 21.0]])
@@ -269,7 +269,7 @@ def test_a_manual_command_is_shown_within_the_limits_until_the_mode_changes() ->
     assert own.snapshot(NOW).inputs[0].manual == pytest.approx(20.0)
 
 
-def test_a_snapshot_stays_what_it_was() -> None:
+def test_a_snapshot_does_not_change() -> None:
     own = view()
     measure(own, 50.0, 1.0)
     before = own.snapshot(NOW)

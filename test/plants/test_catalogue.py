@@ -102,7 +102,7 @@ def test_a_nominal_state_is_given_only_where_it_is_wanted():
     (Plain, {'rate': 1.0}, 'constant of Plain'),
     (returns_nothing, {}, 'returns_nothing returned a NoneType, must be a ControlAffineSystem'),
 ])
-def test_what_cannot_be_built_is_named(plant, values, message):
+def test_an_error_of_a_plant_names_the_constant(plant, values, message):
     with pytest.raises(ValueError, match=message):
         build(plant, values)
 

@@ -49,7 +49,7 @@ def test_quadruple_tank_of_the_other_setting_is_of_nonminimum_phase():
 
 
 @pytest.mark.parametrize('name', ['two_tanks', 'quadruple_tank'])
-def test_tanks_run_empty_and_lose_what_flows_out(name):
+def test_tanks_run_empty_and_conserve_volume(name):
     system = plant(name)
     run = simulate(system, system.nominal_state, np.zeros((60, 2)), 10.0)
     np.testing.assert_allclose(run.x[-1], 0.0, atol=1e-8)
@@ -87,7 +87,7 @@ def test_the_heated_line_conserves_energy_and_matter_at_rest():
             3e3 * (jacket - celsius) + 5.8e4 * reacted, rel=1e-9)
 
 
-def test_a_pendulum_without_friction_keeps_its_energy_and_with_it_comes_to_hang():
+def test_a_pendulum_without_friction_keeps_its_energy_and_with_friction_stops():
     free = plant('pendulum', friction=0.0)
     run = simulate(free, [1.0, 0.5], np.zeros((100, 1)), 0.05)
     energy = 0.5 * 0.25 * run.x[:, 1] ** 2 + 0.5 * 9.81 * np.cos(run.x[:, 0])

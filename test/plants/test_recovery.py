@@ -28,7 +28,7 @@ UNSTABLE = linear([[1.0]], [[1.0]])
 BOX = {'input_lower': -1.0, 'input_upper': 1.0, 'state_lower': -2.0, 'state_upper': 2.0}
 
 
-def test_an_unstable_mode_comes_back_as_far_as_the_input_outweighs_it():
+def test_an_unstable_mode_is_recoverable_within_the_authority_of_the_input():
     """Of x' = x + u, |u| <= 1, these are |x| < 1."""
     x = np.linspace(-1.99, 1.99, 200)[:, None]
     np.testing.assert_array_equal(recoverable(UNSTABLE, x, **BOX), np.abs(x[:, 0]) < 1.0)
@@ -66,6 +66,6 @@ def test_episodes_stay_where_the_input_outweighs_the_plant():
     (UNSTABLE, {'input_lower': 0.0}, 'must lie on both sides of the nominal input'),
     (UNSTABLE, {'state_lower': -np.inf}, 'state_lower'),
     (linear([[1.0]], [[0.0]]), {}, 'no state feedback stabilises')])
-def test_ranges_and_plants_from_which_nothing_comes_back(system, change, message):
+def test_ranges_and_plants_without_recoverable_states_are_errors(system, change, message):
     with pytest.raises(ValueError, match=message):
         recoverable(system, np.zeros((1, 1)), **{**BOX, **change})

@@ -102,7 +102,7 @@ OUT_OF_BOUNDS = IntegrationFailure.OUT_OF_BOUNDS
     (scalar_example(), [1e200], [], 1.0, {}, 'is not finite',
      IntegrationFailure.NON_FINITE),
 ])
-def test_what_cannot_go_on_ends_in_an_error_that_names_state_and_time(
+def test_a_failing_simulation_names_state_and_time(
         system, x, u, duration, bounds, message, failure):
     evaluations = []
 

@@ -120,7 +120,7 @@ def test_units_scale_and_words():
     ({'drift': lambda x: x ** 2, 'drift_jacobian': lambda x: -2.0 * x[..., None] * np.eye(2)},
      'row [01], column [01]'),
 ])
-def test_construction_names_what_does_not_fit(changes, message):
+def test_an_error_of_construction_names_the_mismatch(changes, message):
     with pytest.raises(ValueError, match=message):
         replace(two_state_example(), **changes)
 
@@ -148,7 +148,7 @@ def test_a_kink_at_the_nominal_state_is_accepted():
     ([1.0, 2.0], [1.0, 2.0], r'incompatible u: expected \(\.\.\., 1\), got \(2,\)'),
     ([1.0, 2.0], 1.0, r'incompatible u: expected \(\.\.\., 1\), got \(\)'),
 ])
-def test_derivative_names_what_does_not_fit(x, u, message):
+def test_an_error_of_the_derivative_names_the_mismatch(x, u, message):
     with pytest.raises(ValueError, match=message):
         two_state_example().derivative(x, u)
 
@@ -207,7 +207,7 @@ def test_state_that_no_input_holds(system, state, message):
     assert isinstance(caught.value, EquilibriumError) is ('no input' in message)
 
 
-def test_training_is_told_everything_of_a_plant_but_its_drift():
+def test_the_description_of_a_plant_has_everything_but_its_drift():
     system = plant_class('two_tanks')().system()
     known = describe(system)
     # which it has of a B that is to be learned

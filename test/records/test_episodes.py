@@ -176,7 +176,7 @@ def test_commands_without_a_stamp_act_when_received(write: Callable[..., Path], 
     assert (account.used, account.dropped) == (29, {'before the first input': 1})
 
 
-def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
+def test_a_repeated_finding_is_reported_once(write: Callable[..., Path]) -> None:
     set_back = [part for k in range(500) for part in (
         Sent(MEASURED, 10.0 + 0.01 * k, 50.0, float(k)), Sent(COMMAND, 5.0, 20.0, float(k)),
         Sent(MEASURED, 5.0, 50.0, k + 0.5))]
@@ -215,7 +215,7 @@ def test_each_of_several_bags_is_read_once(write: Callable[..., Path], tmp_path:
     assert noted(account, 'link.mcap', 'twice')
 
 
-def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
+def test_damage_in_a_closed_bag_is_reported(write: Callable[..., Path]) -> None:
     bag = write(loop(30))
     content = bytearray(bag.read_bytes())
     # within the second of three chunks of ten measurements with their answers
@@ -245,7 +245,7 @@ def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -
         records.read_series(bag, replace(INPUT.command, topic='/valve_2'))
 
 
-def test_episodes_come_in_the_units_asked_for(write: Callable[..., Path]) -> None:
+def test_episodes_are_converted_to_the_requested_units(write: Callable[..., Path]) -> None:
     (episode,), _ = records.loop_episodes(
         [write(loop(15))], [replace(STATE, unit='kPa')], [replace(INPUT, unit='mbar')])
     assert episode.x[0, 0] == pytest.approx(0.001)

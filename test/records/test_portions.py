@@ -53,7 +53,7 @@ def whole(path: Path, signal: records.RecordedInput, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize('signal', [
     pytest.param(COMMANDED, id='commanded'), pytest.param(MEASURED, id='measured'),
     pytest.param(replace(COMMANDED, delay=7.0), id='dead time')])
-def test_portions_hold_what_the_whole_holds(
+def test_portions_together_equal_the_whole_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal: records.RecordedInput
 ) -> None:
     path = record(tmp_path / 'long.mcap', 9000)

@@ -36,7 +36,7 @@ def run(*words: str) -> tuple[int, str]:
     return code, said.getvalue()
 
 
-def test_a_set_point_is_published_and_heard(harness: Harness) -> None:
+def test_a_setpoint_is_published_and_received(harness: Harness) -> None:
     assert run('pub', '/setpoint', '{temperature: 45}', '--timeout', '60') == (0, '')
     harness.wait_until(lambda: yaml.safe_load(run(
         'echo', '/active_setpoint', '--count', '1', '--timeout', '60')[1].removesuffix(
@@ -71,7 +71,7 @@ def test_parameters_are_listed_read_and_set() -> None:
     (('param', '/controller', 'none', '--timeout', '60'), 'has no parameter none'),
 ])
 @pytest.mark.usefixtures('harness')
-def test_what_cannot_be_done_has_a_reason(words: tuple[str, ...], said: str) -> None:
+def test_a_failed_command_has_a_reason(words: tuple[str, ...], said: str) -> None:
     code, shown = run(*words)
     assert code == 1
     assert said in shown

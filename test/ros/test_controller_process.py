@@ -135,7 +135,7 @@ def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros
     assert all(math.isfinite(message.temperature) for message in bench.commands)
 
 
-def test_simulated_time_that_nobody_publishes_is_told_and_silence_in_it_ends_at_the_safe_coolant(
+def test_missing_simulated_time_is_reported_and_its_silence_leads_to_the_safe_coolant(
         ros: Harness) -> None:
     """The clock goes fifty times faster than the wall's."""
     bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},

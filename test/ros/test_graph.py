@@ -112,7 +112,8 @@ def test_there_is_a_policy_for_each_plant_that_is_shipped() -> None:
         policy('nowhere')
 
 
-def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> None:
+def test_the_trainer_uses_exactly_its_granted_topics_and_services(
+        ros: Harness, tmp_path: Path) -> None:
     seen: Seen = {}
     # what is not measured is recorded where it is published
     ros.node.create_publisher(JointState, reactor.CONCENTRATION, topics.LOOP_QOS)
@@ -133,14 +134,14 @@ def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> No
     check(ros, 'trainer', seen)
 
 
-def test_the_panel_does_what_it_is_granted(ros: Harness) -> None:
+def test_the_panel_uses_exactly_its_granted_topics_and_services(ros: Harness) -> None:
     ros.start('panel', {'port': 0, 'use_sim_time': True})
     # it publishes there only while it asks for something
     check(ros, 'panel', {'publishes': {
         f'/{reactor.SETPOINT}', f'/{reactor.MANUAL_COOLANT_SETPOINT}'}})
 
 
-def test_the_replay_does_what_it_is_granted(ros: Harness, monkeypatch: pytest.MonkeyPatch
+def test_the_replay_uses_exactly_its_granted_topics_and_services(ros: Harness, monkeypatch: pytest.MonkeyPatch
                                             ) -> None:
     """It is gone before others have found it, so that it is asked itself, at its end."""
     seen: list[Seen] = []

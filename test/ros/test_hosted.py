@@ -14,7 +14,7 @@ from koopman_ros.ros.process import answer
 
 
 @pytest.mark.parametrize('error', [KeyError('a'), SystemExit(3), GeneratorExit()], ids=repr)
-def test_error_of_a_callback_goes_to_the_hosting(error: BaseException) -> None:
+def test_an_error_of_a_callback_is_passed_to_the_host(error: BaseException) -> None:
     failed: list[BaseException] = []
 
     def act(value: int) -> int:

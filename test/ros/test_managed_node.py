@@ -111,7 +111,7 @@ def test_node_that_cannot_leave_all_well_acts_no_more_all_the_same(
     assert node.refusal == 'failing is not active: activate it first'
 
 
-def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harness) -> None:
+def test_pending_callbacks_are_rejected_or_dropped_at_shutdown(shared_ros: Harness) -> None:
     """Under the executor of the loop's nodes, which takes what is queued in one go."""
     ros, heard = shared_ros, list[Any]()
 

@@ -104,7 +104,7 @@ class Odd:
 ODD = ParameterTable(Odd, lambda odd: 'count must be odd' if odd.count % 2 == 0 else '')
 
 
-def test_cross_check_comes_after_the_ranges() -> None:
+def test_ranges_are_checked_before_combinations() -> None:
     assert ODD.check(Odd()) == ''
     assert ODD.check(Odd(count=2)) == 'count must be odd'
     assert ODD.check(Odd(count=2, tiny=2.0)) == 'tiny = 2.0 m must be in [0, 1] m'
@@ -128,7 +128,7 @@ BUILT = ParameterTable(Odd, build=_reciprocal)
      'whole = -4.0 is not usable: float division by zero'),
     (Odd(), Odd(whole=-1.0), 'whole = -1.0 is not usable: whole and count are no pair'),
 ])
-def test_what_cannot_be_built_is_refused_with_the_error_and_what_was_changed(
+def test_a_value_that_fails_to_build_is_rejected_with_error_and_parameter(
         before: Odd, now: Odd, reason: str) -> None:
     assert BUILT.check(now, before) == (reason and f'{reason}; choose another value')
 
@@ -184,7 +184,7 @@ def test_names_of_other_nodes_are_ignored_with_one_warning(
     ('trainer', ('max_bag_size:=1.0e+308',),
      'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
 ])
-def test_start_with_what_cannot_be_used_is_refused(
+def test_a_start_with_unusable_parameters_is_rejected(
         ros: Harness, node: str, given: tuple[str, ...], words: str) -> None:
     arguments = [part for argument in given for part in ('-p', argument)]
     with pytest.raises(ConfigurationError) as refusal:
@@ -274,7 +274,7 @@ def read(ros: Harness, file: Path, names: Collection[str]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize('name', ['odd', 'several', *TABLES])
-def test_rcl_reads_back_what_the_table_writes(ros: Harness, tmp_path: Path, name: str) -> None:
+def test_rcl_reads_the_parameter_file_of_a_table(ros: Harness, tmp_path: Path, name: str) -> None:
     table = {**TABLES, 'odd': ODD, 'several': SEVERAL}[name]
     file = tmp_path / 'written.yaml'
     file.write_text(table.yaml())
@@ -384,7 +384,7 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
             PlantTable({**named, 'disturbances_measured': (given,)})
 
 
-def test_a_characteristic_comes_into_the_task_in_the_unit_of_the_model() -> None:
+def test_a_characteristic_is_converted_to_the_unit_of_the_model() -> None:
     table = trainer_table(load(model_path(reactor.MODEL)))
     signals = trainer_signals(load(model_path(reactor.MODEL)), {})
     assert table.snapshot({}).training(signals)['characteristics'] == {}
@@ -426,7 +426,7 @@ def test_times_follow_from_the_modes_of_the_plant(name: str) -> None:
 # The shipped files.
 
 
-def test_shipped_files_are_what_one_command_writes(tmp_path: Path) -> None:
+def test_shipped_parameter_files_are_up_to_date(tmp_path: Path) -> None:
     assert main(['--output', str(tmp_path)]) == 0
     written = {path.name: path.read_text() for path in tmp_path.iterdir()}
     assert set(written) == {*(f'{node}.yaml' for node in TABLES), POLICY_FILE}

@@ -188,7 +188,7 @@ def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
     assert (found.level is Severity.WARN) is warned
 
 
-def test_a_late_input_of_the_time_before_the_start_is_said_to_be_assumed() -> None:
+def test_the_inputs_assumed_before_the_start_are_reported() -> None:
     model = load(model_path('reactor_nz4'))
     own = built(table_of(model, {'system': 'reactor'}).snapshot({
         'coolant_temperature.dead_time': 2.5}), model)

@@ -51,7 +51,7 @@ def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:
     # which an early rclpy lacks
     ('controller', signal.SIGTERM, ('torch', 'rclpy.experimental')),
     ('trainer', signal.SIGINT, ('torch',))])
-def test_signal_ends_a_node_on_loopback_cleanly_that_loads_only_what_it_needs(
+def test_a_signal_ends_a_node_cleanly_and_it_imports_no_unneeded_package(
         ros: Harness, tmp_path: Path, name: str, number: int, unneeded: tuple[str, ...]) -> None:
     # the plant is in the middle of a callback whenever the signal comes
     parameters = {'plant': {'speed': 0.0}, 'controller': {},
@@ -210,7 +210,7 @@ def test_help_for_a_system(name: str, given: list[str], code: int, said: str,
         assert said in ''.join(capsys.readouterr())
 
 
-def test_help_is_read_as_far_as_somebody_wants_to() -> None:
+def test_help_survives_a_closed_pipe() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, 'wb') as closed:
@@ -252,7 +252,7 @@ PARAMETERS = '/**:\n  ros__parameters:\n    '
     (controller, f'{PARAMETERS}model: /nowhere/lift.safetensors\n', '/nowhere/lift.safetensors'),
     (controller, f'{PARAMETERS}model: {{folder}}/cut.safetensors\n', 'cut.safetensors'),
 ])
-def test_bad_start_says_why_in_one_line(
+def test_a_failed_start_gives_its_reason_in_one_line(
         tmp_path: Path, capfd: pytest.CaptureFixture[str], node: ModuleType, text: str | None,
         words: str) -> None:
     whole = model_path('reactor_nz4').read_bytes()

@@ -67,7 +67,7 @@ class Ends:
     ('V', {'type': 'std_msgs/msg/Float64MultiArray', 'field': 'data[2]'}, 6.0, 6.0),
     ('mol/L', {'field': 'position[reactant [mol/L]]'}, 0.75, 0.75),
 ])
-def test_number_comes_back_through_a_message(
+def test_a_number_survives_a_message(
         shared_ros: Harness, unit: str, given: dict[str, str], value: float, sent: float) -> None:
     # a topic for each
     where = place(f'signal_{len(list(shared_ros.node.publishers))}', 'signal', unit, given)
@@ -115,7 +115,7 @@ def test_signals_of_one_topic_are_one_message(shared_ros: Harness) -> None:
     assert dict(ends.wait_for(3)[2].values) == {'angle': 4.0}
 
 
-def test_what_no_message_can_mean_is_no_number(shared_ros: Harness) -> None:
+def test_physically_impossible_values_become_nan(shared_ros: Harness) -> None:
     places = {'heat': place('furnace', 'heat', 'K')}
     ends = Ends(shared_ros, places, {'heat': 'K'})
     for celsius in (-273.16, math.nan, math.inf, -273.15, 20.0):
@@ -125,7 +125,7 @@ def test_what_no_message_can_mean_is_no_number(shared_ros: Harness) -> None:
         np.array([math.nan, math.nan, math.nan, 0.0, 293.15]), nan_ok=True)
 
 
-def test_measurement_is_coarse_and_tells_its_variance_in_the_unit_of_the_message(
+def test_a_quantised_measurement_has_its_variance_in_the_unit_of_the_message(
         shared_ros: Harness) -> None:
     given = {'type': 'sensor_msgs/msg/FluidPressure'}
     ends = Ends(shared_ros, {'pressure': place('vessel', 'pressure', 'bar', given)},
@@ -182,7 +182,7 @@ def test_place_that_cannot_be_is_refused(
 @pytest.mark.parametrize(('kind', 'field'), [
     ('std_msgs/msg/Bool', 'data'), ('std_msgs/msg/Int32', 'data'),
     ('std_msgs/msg/ByteMultiArray', 'data[0]')])
-def test_integers_are_heard_and_not_published(
+def test_integer_fields_are_read_and_not_published(
         shared_ros: Harness, kind: str, field: str) -> None:
     """A command of 23.7 would be sent as whatever the middleware makes of it."""
     places = {'pump': MessageField('pump', kind, field, '1')}

@@ -111,7 +111,7 @@ def test_shipped_lifts_keep_their_promise_on_fresh_data(n_z, episodes):
     assert_promise(shipped(f'nz{n_z}'), episodes)
 
 
-def test_the_lift_with_the_feed_temperature_knows_its_effect():
+def test_the_lift_with_feed_temperature_has_the_true_effect():
     """q/V is 1/min, whatever the temperatures; along episodes in which both of them step."""
     model, system = load(model_path(FEED)), reactor_with_feed()
     assert (model.inputs.names, model.disturbances.names) == (
@@ -125,7 +125,7 @@ def test_the_lift_with_the_feed_temperature_knows_its_effect():
         random_steps(system, design, 15.0, 7001)]) <= PROMISED_KELVIN[4]
 
 
-def test_the_lift_of_the_heated_line_knows_its_feed_its_valve_and_its_line():
+def test_the_lift_of_the_heated_line_has_its_feed_valve_and_dead_time():
     model = load(model_path(LINE))
     assert model.dead_time.tolist() == [LINE_VALVE.dead_time]
     assert model.provenance.metrics['rw'] <= PROMISED_FIT[4]
@@ -156,7 +156,7 @@ def retrained():
 # ten seconds of computing, several times as long beside other programs
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('n_z', [3, 4])
-def test_a_retrained_lift_keeps_what_the_shipped_one_promises(n_z, retrained, episodes):
+def test_a_retrained_lift_is_as_accurate_as_the_shipped_one(n_z, retrained, episodes):
     """
     Judge by the true plant alone: the bits of a training are those of its processor.
 
@@ -278,7 +278,7 @@ def test_shipped_lifts_of_the_library_keep_their_promise(name):
         assert cost < 1.001 * 990.1798
 
 
-def test_a_retrained_lift_of_the_library_keeps_what_the_shipped_one_promises():
+def test_a_retrained_lift_of_the_library_is_as_accurate_as_the_shipped_one():
     keeps('two_state_example', train_lift('two_state_example', loops=0))
 
 

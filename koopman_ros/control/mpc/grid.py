@@ -52,7 +52,7 @@ class HorizonGrid:
     def with_nodes(self, times: Array) -> HorizonGrid:
         """Return the grid with further nodes, as far as it reaches."""
         every = np.unique(np.concatenate((self.times, times)))
-        # what rounding has moved from a node is that node
+        # a time that rounding moved off a node is that node
         apart = np.diff(every) > 1e-9 * self.sample
         lengths = np.diff(every[np.concatenate(([True], apart))])
         return HorizonGrid(frozen(lengths, 'intervals', lengths.shape), self.sample)

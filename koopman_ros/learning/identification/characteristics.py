@@ -32,7 +32,7 @@ from koopman_ros.learning.identification.output_error import (
 )
 from koopman_ros.learning.identification.weak_form import weak_form
 
-_POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions beside states
+_POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions next to states
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
 _FEW_STEPS, _MOST_STEPS = 10, 40  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
@@ -146,7 +146,7 @@ def _better(found: Identified, functions: Hats, drift: DriftModel) -> DriftModel
         return None
     starts = [start]
     with contextlib.suppress(ValueError, np.linalg.LinAlgError):
-        # free of what the drift without them took for the effect of states
+        # free of effects that the drift without them attributed to states
         starts += [weak_form([replace(one, x=one.interpolated()) for one in more], box,
                              drift.degree, None, int(window), drift.input_degree)
                    for window in WeakFormParameters().windows]

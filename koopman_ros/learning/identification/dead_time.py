@@ -83,7 +83,7 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     best = _median(searches, tried)
     plain = min((one for one in tried if one.delays == none), key=lambda one: one.criterion,
                 default=best)
-    # errors that are not white hide whether a dead time is one, or what the models lack
+    # coloured errors may come from a dead time or from a deficit of the models
     if not (_white(best.errors) or clearly_positive(
             block_gains(best.errors, plain.errors, _BLOCKS))):
         best = plain

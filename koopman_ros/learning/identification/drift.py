@@ -289,7 +289,7 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     n_x = x0.shape[1]
     count = np.maximum(np.sum(segments.measured, axis=0), 1)
     best, least = x0, np.full_like(x0, np.inf)
-    # beside each segment the same from starts that differ in one state
+    # with each segment the same from starts that differ in one state
     beside = segments.repeated(1 + n_x)
     shifts = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
     for last in (False, False, True):

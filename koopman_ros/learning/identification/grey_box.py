@@ -43,7 +43,7 @@ _EDGE = 1e-3  # of half a range: nearer to its end a constant counts as at it
 # nothing.
 _UNKNOWN = 1.0 / np.sqrt(3.0)
 _SINGULAR = 1e-12  # a direction with so small a share of the information has none
-_INVOLVED = 1e-3  # a constant with such a share of such a direction is not told by the record
+_INVOLVED = 1e-3  # a constant with such a share of such a direction is undetermined
 
 
 def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], equations: Any,

@@ -55,7 +55,7 @@ _FEWEST = 8
 _RUN = 2000  # samples of a simulation of the record
 _COLOUR = 0.95  # highest autocorrelation of errors that counts
 
-# Called with (steps done, steps in all, what is done now); True ends the estimation.
+# Called with (steps done, steps in all, current step); True ends the estimation.
 Watch = Callable[[int, int, str], bool]
 
 
@@ -120,7 +120,7 @@ class EstimatedConstant:
     #: range, infinite where the record tells nothing of it
     standard_error: float
     lower: float  #: lowest value that was looked at
-    upper: float  #: highest likewise
+    upper: float  #: highest value
     standing: EstimateStatus
 
     def __str__(self) -> str:

@@ -24,7 +24,7 @@ from koopman_ros.learning.identification.structure_candidates import (
 
 UNITS = (3, 8)  # hidden units of the networks that are tried
 STARTS = 4  # of each network, of which the best is taken
-_RIDGE = 1e-4  # weight of its squared parameters beside the mean squared error
+_RIDGE = 1e-4  # weight of its squared parameters relative to the mean squared error
 
 
 def network_starts(seed: int) -> dict[str, tuple[int, int]]:

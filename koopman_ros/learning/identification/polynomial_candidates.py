@@ -33,7 +33,7 @@ from koopman_ros.learning.identification.structure_candidates import (
 from koopman_ros.model import Box
 
 UNIT = '1'  # of a state that is not measured: any other scale would do as well
-# Gains of filters to begin with, of outputs, of their rates and of what moves these, over powers
+# Initial filter gains of outputs, of their rates and of the accelerations, over powers
 # of the interval between samples (alpha, beta and gamma of tracking filters).
 _GAINS = ((0.5, 0.1, 0.01), (0.2, 0.02, 0.001), (0.8, 0.4, 0.1))
 _SAMPLES = 20  # between samples, in which rates are counted at first

@@ -76,7 +76,7 @@ HIGHEST_DEGREE = 3
 MOST_UNMEASURED = 3  # states that are tried where their number is not given
 BUDGET = 300.0  # s of processor time of a search
 _ROUNDS = 2  # of linear drifts with whose states characteristics are found
-_EXPLAINED = 1.2  # times the variance of what a filter does not foresee: nothing is left to learn
+_EXPLAINED = 1.2  # times the innovation variance of a filter: nothing is left to learn
 _SLIGHT = 0.01  # share of the motion, of which no state that is not measured is sought
 
 

@@ -18,7 +18,7 @@ from koopman_ros.learning.lift.network import Layout, Parameters, Pass
 from koopman_ros.learning.lift.residuals import CHUNK, ScaledSamples
 from koopman_ros.model import LiftedModel, NetworkObservables
 
-# Directions of the features smaller than this beside the largest are left out of a fit: their
+# Directions of the features smaller than this share of the largest are left out of a fit: their
 # weights would be as large as the inverse. Which share is best depends on the data.
 SMALLEST = (1e-9, 1e-6, 1e-3)
 # A unit that moves less on the samples is saturated: with a weight so large, its rounding would be
@@ -39,7 +39,7 @@ def with_readout(model: LiftedModel, samples: DriftSamples, smallest: float = SM
     f = samples.dxdt / model.states.scale - model.forcing(
         x, model.inputs.to_deviation(samples.u))
     phi = model.observables.features.lift(x)
-    # each feature in units of its size; one that stands still on all samples gets no weight
+    # each feature in units of its size; one that is constant on all samples gets no weight
     size = np.sqrt(np.mean(phi ** 2, axis=0))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > _STILL)
     weights = np.linalg.lstsq(phi * unit, f, rcond=smallest)[0].T

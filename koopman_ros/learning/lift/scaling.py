@@ -41,7 +41,7 @@ class Scaling:
         plain = _plain(box, inputs, samples)
         frame = None if pre_feedback is None else PrestabilizedFrame.of(inputs, *plain,
                                                                         pre_feedback)
-        # rates of order one put the residuals of the dynamics beside the others
+        # rates of order one make the residuals of the dynamics comparable with the others
         rate = frame.enter(*plain)[1] if frame else deviations(box, samples)[1]
         return Scaling(box, inputs, frame, float(np.sqrt(np.mean(rate ** 2))) or 1.0)
 

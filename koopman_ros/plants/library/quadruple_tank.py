@@ -11,7 +11,7 @@ from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.library.tanks import Tanks
 from koopman_ros.plants.system import ControlAffineSystem
 
-# flow into tanks 1 and 2 of what leaves each tank: 3 drains into 1, 4 into 2, 1 and 2 outside
+# share of the outflow of each tank that enters tanks 1 and 2: 3 drains into 1, 4 into 2
 _INTO = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 1.0],
                   [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, -1.0]])
 

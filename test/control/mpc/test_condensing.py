@@ -141,7 +141,7 @@ def test_condensed_cost_is_that_of_the_simulated_plan() -> None:
         np.testing.assert_allclose(nodes + by_inputs @ v, path, atol=1e-7)
 
 
-def test_what_is_no_number_stays_none() -> None:
+def test_nan_stays_nan_in_its_own_row() -> None:
     f, J = drift(model_arrays(MODELS['free lift']), np.array([[np.nan, 0.0], [0.1, 0.2]]))
     assert not np.isfinite(f[0]).all()
     assert not np.isfinite(J[0]).all()

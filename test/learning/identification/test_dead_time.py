@@ -56,7 +56,7 @@ def test_dead_times_are_found_within_a_sample(dead_times, time_constants):
 
 
 @pytest.mark.parametrize('seed', [6, 7])
-def test_two_lags_are_told_from_a_dead_time_by_a_model_without_zeros(seed):
+def test_two_lags_are_not_taken_for_a_dead_time(seed):
     # with zeros it is a sample off either way
     assert find_dead_times([record(seed, (12,), (16.0, 36.0))]).samples == (12,)
 
@@ -83,7 +83,7 @@ def test_a_nonlinear_plant_is_not_taken_for_a_late_one():
     assert find_dead_times([Episode(time, y, time, u)]).samples == (0,)
 
 
-def test_a_record_of_a_few_samples_tells_nothing():
+def test_a_record_of_a_few_samples_decides_nothing():
     time = np.arange(20.0)
     found = find_dead_times([Episode(time, np.zeros((20, 1)), time, np.zeros((20, 1)))])
     assert found.samples == (0,)

@@ -212,7 +212,7 @@ def test_smoothing_takes_away_noise_alone():
     assert np.all(np.sqrt(np.mean((found - true) ** 2, axis=0)) < sigma / 3.0)
 
 
-def test_smoothing_of_a_parabola_finds_it_and_leaves_what_has_no_noise():
+def test_smoothing_recovers_a_parabola_and_keeps_noise_free_data():
     t = np.arange(240) / 60.0
     true = (0.1 + 0.2 * t + 0.3 * t ** 2)[:, None]
     for seed in range(3):

@@ -89,7 +89,7 @@ def test_measured_input_that_never_moved_is_named_in_spite_of_its_noise() -> Non
             check_inputs(plant(3), record(u, seed, 0.05))
 
 
-def test_nothing_is_said_where_the_effects_are_known_or_there_is_one_input() -> None:
+def test_no_collinearity_warning_for_known_effects_or_one_input() -> None:
     u = steps(0, 12)
     u[:, 1] = u[:, 0]
     known = replace(plant(3), B=np.ones((1, 3)))

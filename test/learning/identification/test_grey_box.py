@@ -176,7 +176,7 @@ def test_reactor_at_its_saddle_from_its_temperature_alone():
     assert max(part.time[-1] - part.time[0] for part in found.held_out) < 60.0
 
 
-def test_a_constant_at_an_end_of_its_range_is_said():
+def test_an_estimate_at_the_end_of_its_range_is_reported():
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         found = estimate_parameters(VESSEL, [vessel(0)], Vessel,
@@ -189,7 +189,7 @@ def test_a_constant_at_an_end_of_its_range_is_said():
     assert leak.standing is EstimateStatus.ESTIMATED
 
 
-def test_constants_that_act_alike_are_said():
+def test_indistinguishable_constants_are_reported():
     found = estimate_parameters(VESSEL, [vessel(0)], Vessel,
                                 {'gain': None, 'strength': (0.5, 2.0), 'leak': None})
     gain, strength, leak = found.constants
@@ -271,7 +271,7 @@ def test_what_does_not_fit_is_refused(plant, equations, ranges, words):
         estimate_parameters(plant, [vessel(0)], equations, ranges)
 
 
-def test_it_ends_when_asked_and_a_short_record_is_refused():
+def test_training_can_be_cancelled_and_rejects_a_short_record():
     with pytest.raises(Stopped):
         estimate_parameters(VESSEL, [vessel(0)], Vessel, watch=lambda *_: True)
     with pytest.raises(ValueError, match='record at least 160'):

@@ -47,7 +47,7 @@ def test_takes_output_error_and_the_right_degree(found):
     assert found.noise == pytest.approx([NOISE], rel=0.1)
 
 
-def test_scores_say_what_was_tried(found):
+def test_scores_list_all_candidates(found):
     assert [(score.degree, score.method.split(' from')[0]) for score in found.scores] == [
         (degree, method) for degree in (1, 3, 4) for method in (
             'weak form, 10 samples', 'weak form, 20 samples', 'total variation', 'output error')]

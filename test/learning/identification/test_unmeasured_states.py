@@ -218,7 +218,7 @@ def simulated(drift, episode):
     return np.array(path)
 
 
-def test_it_says_what_it_does_and_ends_when_asked():
+def test_progress_is_reported_and_a_cancel_request_ends_the_job():
     said = []
 
     def watch(done, total, text):

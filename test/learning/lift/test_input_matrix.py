@@ -114,7 +114,7 @@ def test_targets_are_steady_states_of_the_plant():
 
 
 @pytest.mark.parametrize('law', [averaged, recentred])
-def test_the_error_moves_as_the_law_says(law):
+def test_the_error_obeys_the_equation_of_the_law(law):
     """Exactly so for a drift of degree 1, whose lift is closed: e' = (A_x + action) e."""
     model = Edmd(1).learn(UNKNOWN, samples())
     target = steady_state_target(model, np.array([0.4, -0.3]))
@@ -135,7 +135,7 @@ def test_the_loop_reaches_a_set_point_that_needs_another_flow():
     assert abs(u_ref[0] - 100.0) > 10.0
 
 
-def test_observer_and_hindsight_know_what_an_input_does_at_each_state():
+def test_observer_and_optimum_use_the_input_matrix_at_each_state():
     model = quartic(known=True)
     x, u = PLANT.nominal_state + 0.5 * HALF_X, PLANT.nominal_input + 0.6 * HALF_U
     after = advance(PLANT, x, u, 0.2)

@@ -30,7 +30,7 @@ def normals(seed):
 
 
 @identity_or_free
-def test_a_pass_is_what_the_model_evaluates_at_run_time(identity):
+def test_training_and_run_time_evaluate_the_same_network(identity):
     layout = Layout(2, 4, 5, identity)
     normal = normals(0)
     parts, x, f = layout.split(normal(layout.size)), normal(20, 2), normal(20, 2)

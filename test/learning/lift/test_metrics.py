@@ -134,7 +134,7 @@ def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
 @pytest.mark.parametrize('change', [
     {'x0': [2.2]}, {'inputs': [1.0, 2.0]}, {'inputs': [1.0]}, {'x0': [[2.2, 1.7]] * 3},
     {'sample_period': [0.1] * 3}, {'sample_period': -0.1}], ids=str)
-def test_a_roll_out_of_what_does_not_fit(change):
+def test_a_roll_out_of_mismatched_arguments_is_an_error(change):
     usual = {'x0': [2.2, 1.7], 'inputs': [[1.0], [2.0]], 'sample_period': 0.1}
     assert linear_model().predict(**usual).shape == (3, 2)
     with pytest.raises(ValueError, match=r'expected|must be above 0 s'):

@@ -121,7 +121,7 @@ def bags(tmp_path_factory):
     return bags_of(3, tmp_path_factory.mktemp('bags'))
 
 
-def test_the_same_is_read_whoever_reads(bags, places):
+def test_both_readers_return_the_same(bags, places):
     few, told = source(bags), []
     one = read_record(few, 3000, 7)
     other = read_record(few, 3000, 7, tick=told.append, backend=places['joblib:2'])

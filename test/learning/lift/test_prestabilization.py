@@ -115,7 +115,7 @@ def a_frame(identity=True, terms=False):
 
 @pytest.mark.parametrize('identity', [True, False])
 @pytest.mark.parametrize('terms', [False, True], ids=['known B', 'learned B'])
-def test_a_lift_changed_back_leaves_what_it_left_in_the_frame(identity, terms):
+def test_a_lift_changed_to_another_frame_and_back_is_unchanged(identity, terms):
     """With z = L z', residuals are L r', whatever lift, A and B are."""
     frame, given, lift = a_frame(identity, terms)
     rng = np.random.default_rng(3)
@@ -153,7 +153,7 @@ def test_the_frame_is_white_and_stable():
     # x2 decays, and it alone is moved
     (np.array([[0.0], [1.0]]), np.eye(2), 'no feedback of the inputs stabilises'),
     (np.array([[1.0], [1.0]]), np.ones((2, 2)), 'do not move independently')])
-def test_what_has_no_frame(B, states, message):
+def test_samples_without_a_frame_are_an_error(B, states, message):
     x = np.random.default_rng(0).normal(size=(50, 2)) @ states
     with pytest.raises(ValueError, match=message):
         PrestabilizedFrame.of(InputModel(B.shape[1], 0, B), x, x * np.array([1.0, -1.0]), None,

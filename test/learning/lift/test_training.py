@@ -111,7 +111,7 @@ def test_when_there_is_a_decoder(n_x, identity, asked, expected):
     assert grow(recipe, data).layout.decoder == expected
 
 
-def test_a_lift_that_cannot_grow_says_so():
+def test_a_lift_that_cannot_grow_is_reported():
     x = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]], dtype=torch.float64)
     with pytest.raises(ValueError, match='coordinate can be added'):
         grow(IncrementalTraining(4), ScaledSamples(x, -x))
