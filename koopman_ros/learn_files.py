@@ -4,7 +4,7 @@
 """
 Learn a model of a plant from files of measurements, without ROS.
 
-The model is written with a report. Exit code: 0 for an accepted model, 2 for a refused one, 1 for
+The model is written with a report. Exit code: 0 for an accepted model, 2 for a rejected one, 1 for
 an error.
 """
 

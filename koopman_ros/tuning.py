@@ -152,7 +152,7 @@ class Tuning:
     analysis_delay: Array = column(
         'states', 0.0, 'Largest delay of a value on analysis_topic, which corrects a Kalman '
                        'filter at its stamp (within the last 300 samples); 0: late values are '
-                       'refused.',
+                       'rejected.',
         's', maximum=86400.0)
     analysis_noise: Array = column(
         'states', 0.0, 'Standard deviation of the noise of a late value; 0: a hundredth of the '

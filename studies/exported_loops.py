@@ -50,7 +50,7 @@ FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wconversion', '-Werror', '-O1')
 SANITIZERS = ('-fsanitize=address,undefined', '-fno-sanitize-recover')
 #: largest relative difference of a command that is not due to rounding
 TOLERANCE = 1e-9
-# Which test refuses a Riccati equation without a solution is a matter of rounding.
+# Which test rejects a Riccati equation without a solution is a matter of rounding.
 _ALIKE = dict.fromkeys((str(CODES.index(code) + 1) for code in (
     StatusCode.NOT_STABILISABLE, StatusCode.RICCATI_INACCURATE, StatusCode.GAIN_TOO_LARGE)), '-')
 # The floor below which an error of a command counts as one of it, in half-ranges of the input.

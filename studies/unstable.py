@@ -177,8 +177,8 @@ def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
     begin = time.process_time()
     try:
         model, fresh = learn(seed), samples(1000 + seed, FRESH_EPISODES)
-    except TrainingFailed as refusal:
-        return f'seed {seed}: {refusal}'
+    except TrainingFailed as rejection:
+        return f'seed {seed}: {rejection}'
     seconds = time.process_time() - begin
     found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)
                        for one in (model, replace(model, readout=None)))
@@ -189,11 +189,11 @@ def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
 
 def _report(seeds: int, backend: Backend) -> int:
     """Print the tables; return the exit status, 1 where a seed gave no lift."""
-    rows, refused, first = [], False, None
+    rows, rejected, first = [], False, None
     for _, outcome in backend.run(judged, {f'seed {seed}': seed for seed in range(seeds)}):
         if isinstance(outcome, str):
             print(outcome, file=sys.stderr)
-            refused = True
+            rejected = True
             continue
         model, row = outcome
         first = first or model
@@ -208,7 +208,7 @@ def _report(seeds: int, backend: Backend) -> int:
         head = ['law', *steps, 'lost']
         print(table(head, [least_costs(first), *(
             limited(first, laws) for laws in (('mpc', 'sdre'), ('sdre',)))], range(1, len(head))))
-    return int(refused)
+    return int(rejected)
 
 
 if __name__ == '__main__':

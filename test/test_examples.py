@@ -173,14 +173,14 @@ def test_model_file_of_the_tanks_is_the_model(tanks: Run) -> None:
     assert np.all(np.abs(rate) < 0.1 * TANKS.B[0, 0])  # worth 0.1 V
 
 
-def test_unreachable_set_point_of_the_tanks_is_refused_as_the_truth_has_it(tanks: Run) -> None:
+def test_unreachable_set_point_of_the_tanks_is_rejected_as_the_truth_has_it(tanks: Run) -> None:
     # derived by hand: both outlets are alike, so that k u2 = a sqrt(2 g) (sqrt(h2) - sqrt(h1))
     u1, u2 = 0.1781e-4 * np.sqrt(2.0 * 9.81) / 3.3e-6 * np.array(
         [np.sqrt(0.15), np.sqrt(0.08) - np.sqrt(0.15)])
     assert _numbers(r'in truth it takes (\S+) V and (\S+) V', tanks.text) == pytest.approx(
         [u1, u2], abs=0.005)
     assert _numbers(r'^level_2 set-point 0.08 m cannot be held, because pump_2 would have to be '
-                    r'(\S+) V, but its range is 0 V to 12 V', tanks.names['refusal']) == [
+                    r'(\S+) V, but its range is 0 V to 12 V', tanks.names['rejection']) == [
         pytest.approx(u2, rel=0.2)]
 
 

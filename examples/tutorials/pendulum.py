@@ -102,7 +102,7 @@ print(found)
 # the drift is a polynomial, it is the other way round: see `buckled_beam.py`.
 
 # %%
-able = [one for one in found.contenders if not one.refusal]
+able = [one for one in found.contenders if not one.rejection]
 limit = 2.0 * min(one.rx for one in able)
 by_hand = next(one for one in able if one.rx <= limit)
 print(f'the plainest with rx up to {limit:.1e}: {by_hand.name}; chosen: {found.chosen.name}')

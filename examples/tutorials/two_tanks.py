@@ -115,7 +115,7 @@ decision = evaluate_model(found, trained, None, Thresholds(), loops=16)
 for name, error in (('lift', decision.rmse), ('identified drift', decision.drift_rmse),
                     ('best linear model', decision.linear_rmse), ('noise', decision.noise)):
     print(f'{name:18} {1e3 * error[0]:6.2f} mm {1e3 * error[1]:6.2f} mm')
-print(f'{"accepted" if decision.accepted else "refused"}; {decision.law_check}')
+print(f'{"accepted" if decision.accepted else "rejected"}; {decision.law_check}')
 for line in (*decision.reasons, *decision.warnings):
     print(line)
 
@@ -166,7 +166,7 @@ def controller(observer_bandwidth):
 tanks = Process(truth, 0, truth.nominal_state, truth.nominal_input)
 
 # %% [markdown]
-# A set-point that no voltage within the limits holds is refused, with what would be needed. Here
+# A set-point that no voltage within the limits holds is rejected, with what would be needed. Here
 # the lower tank, into which the upper one drains, is to stand lower than that: its pump would have
 # to draw water. So says the true plant, too.
 
@@ -174,9 +174,9 @@ tanks = Process(truth, 0, truth.nominal_state, truth.nominal_input)
 asked = np.array([0.15, 0.08])
 try:
     simulate(controller(0.1), tanks, [at(PERIOD, SetpointRequest(0, asked))], duration=PERIOD)
-except ValueError as refused:
-    refusal = str(refused)
-    print(refusal)
+except ValueError as rejected:
+    rejection = str(rejected)
+    print(rejection)
 needed = equilibrium_input(truth, asked)
 print(f'in truth it takes {needed[0]:.2f} V and {needed[1]:.2f} V')
 

@@ -58,7 +58,7 @@ class Controller(ControlStep):
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
         :param signals: (n,) which of the controlled ones are requested, the others stay as they
             are; None for all.
-        :return: the new state and None, or the old one with the reason of refusal.
+        :return: the new state and None, or the old one with the reason of rejection.
         :raises ValueError: for signals that are not controlled, or that do not fit the value.
         """
         asked, every = self.controlled.names if signals is None else signals, self.controlled
@@ -66,9 +66,9 @@ class Controller(ControlStep):
             raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '
                              f'{list(asked)}')
         value = numbers('set-point', value, asked)
-        refusal = setpoints.refusal(every.only(asked), value)
-        if refusal is not None:
-            return state, refusal
+        rejection = setpoints.rejection(every.only(asked), value)
+        if rejection is not None:
+            return state, rejection
         ahead = setpoints.lies_ahead(effective_ns, state.time_ns)
         lost = _unmeasured(state.supervisor.reason)
         if lost is not None and not ahead:
@@ -80,9 +80,11 @@ class Controller(ControlStep):
         whole[[every.names.index(name) for name in asked]] = value
         requested = setpoints.request(state.setpoint, read_only(whole), effective_ns,
                                       state.time_ns)
-        refusal = self._infeasibility(state, setpoints.at_its_time(
+        rejection = self._infeasibility(state, setpoints.at_its_time(
             requested, effective_ns, state.time_ns), len(asked) == len(every))
-        return (replace(state, setpoint=requested), None) if refusal is None else (state, refusal)
+        if rejection is not None:
+            return state, rejection
+        return replace(state, setpoint=requested), None
 
     def _infeasibility(self, state: State, goal: Array, whole: bool) -> Reason | None:
         """Return why a set-point (n_c,) cannot be held as things are, or None."""
@@ -106,16 +108,16 @@ class Controller(ControlStep):
                       setpoint.active):
             if value is not None:
                 given = np.isfinite(value)
-                refusal = setpoints.refusal(self.controlled.only(tuple(
+                rejection = setpoints.rejection(self.controlled.only(tuple(
                     name for name, one in zip(self.controlled.names, given, strict=True) if one)),
                     value[given])
-                if refusal is not None:
-                    return refusal
+                if rejection is not None:
+                    return rejection
         return None
 
     def request_manual_input(self, state: State, value: Array) -> tuple[State, Reason | None]:
         """
-        Set the input that manual mode commands; refused in automatic mode.
+        Set the input that manual mode commands; rejected in automatic mode.
 
         :param value: (n_u,) in input units; brought within the limits when commanded.
         :return: as :meth:`request_setpoint`.
@@ -172,7 +174,7 @@ class Controller(ControlStep):
         except BaseException as error:
             contained(error)
         return (state, reason(
-            StatusCode.ANALYSIS_REFUSED, signal=signal, value=value,
+            StatusCode.ANALYSIS_REJECTED, signal=signal, value=value,
             age=(newest_ns - stamp_ns) / NANOSECONDS,
             reach=(newest_ns - oldest_ns) / NANOSECONDS)) if found is None else (found, None)
 

@@ -96,11 +96,11 @@ Event: TypeAlias = (Measurement | Silence | SetpointRequest | ManualCommand | Mo
 class EventOutcome:
     """The outcome of an event."""
 
-    state: State  #: the new state; the old one when the event was refused
+    state: State  #: the new state; the old one when the event was rejected
     #: (n_u,) in the model's units, or None where the event is not answered
     command: Array | None = None
     report: StepReport | None = None  #: of the step, where there was one
-    refused: Reason | None = None  #: why the event was refused, or None
+    rejected: Reason | None = None  #: why the event was rejected, or None
 
 
 def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
@@ -114,20 +114,20 @@ def apply(controller: Controller, state: State, event: Event) -> EventOutcome:
         case Silence():
             return EventOutcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():
-            state, refused = controller.request_setpoint(
+            state, rejected = controller.request_setpoint(
                 state, event.value, event.stamp_ns, event.signals)
-            return EventOutcome(state, refused=refused)
+            return EventOutcome(state, rejected=rejected)
         case ManualCommand():
-            state, refused = controller.request_manual_input(state, event.value)
-            return EventOutcome(state, refused=refused)
+            state, rejected = controller.request_manual_input(state, event.value)
+            return EventOutcome(state, rejected=rejected)
         case ModeChange():
             return EventOutcome(controller.set_mode(state, event.mode))
         case Initialisation():
             return EventOutcome(controller.initialise(state, event.applied))
         case AnalysisValue():
-            state, refused = controller.take_analysis(
+            state, rejected = controller.take_analysis(
                 state, event.signal, event.value, event.stamp_ns)
-            return EventOutcome(state, refused=refused)
+            return EventOutcome(state, rejected=rejected)
         case ClearSafeState():
-            state, refused = controller.clear_safe_state(state)
-            return EventOutcome(state, refused=refused)
+            state, rejected = controller.clear_safe_state(state)
+            return EventOutcome(state, rejected=rejected)

@@ -88,7 +88,7 @@ class Experiment:
             drawn.append((ends[:used], levels[:used]))
         return tuple(drawn)
 
-    def refusal(self, measured: Array) -> Reason | None:
+    def rejection(self, measured: Array) -> Reason | None:
         """Return why the experiment must not go on with a measurement (n,), or None."""
         return out_of_range(self.measured, measured, self.measured_lower, self.measured_upper,
                             StatusCode.EXPERIMENT_BOUNDS)
@@ -138,7 +138,7 @@ def advance(experiment: Experiment, progress: ExperimentProgress, measured: Arra
     gap in the measurements as twice the interval before it.
     """
     ahead = time_ns - progress.time_ns
-    if measured is not None and (why := experiment.refusal(measured)):
+    if measured is not None and (why := experiment.rejection(measured)):
         progress = end(progress, ExperimentPhase.ABORTED, why)
     if ahead < -LATE_NANOSECONDS:
         progress = end(progress, ExperimentPhase.ABORTED, reason(StatusCode.CLOCK_WENT_BACK))

@@ -36,7 +36,7 @@ class Setpoint:
     ramped: Array | None = None
 
 
-def refusal(box: Coordinates, value: Array) -> Reason | None:
+def rejection(box: Coordinates, value: Array) -> Reason | None:
     """Return why a set-point (n,), in the units of the box, is outside of it, or None."""
     return out_of_range(box.names, value, box.lower, box.upper, StatusCode.SETPOINT_OUTSIDE,
                         StatusCode.SETPOINT_NOT_FINITE)

@@ -78,7 +78,7 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
 
     :param shape: expected; None where any length will do, -1 for a size that never fits.
     :param finite: whether infinity is rejected as well as NaN.
-    :raises ValueError: naming both shapes, or the first entry that is refused.
+    :raises ValueError: naming both shapes, or the first entry that is rejected.
     """
     array = real(value, name).copy()
     fits = array.ndim == len(shape) and all(
@@ -86,9 +86,9 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     if not fits:
         raise ValueError(f'incompatible {name}: expected {str(shape).replace("None", "any")}, '
                          f'got {array.shape}')
-    refused = ~np.isfinite(array) if finite else np.isnan(array)
-    if refused.any():
-        position = tuple(map(int, np.argwhere(refused)[0]))
+    rejected = ~np.isfinite(array) if finite else np.isnan(array)
+    if rejected.any():
+        position = tuple(map(int, np.argwhere(rejected)[0]))
         raise ValueError(f'{name} must be finite, but entry {list(position)} is '
                          f'{array[position]}: check its source')
     array.setflags(write=False)

@@ -84,7 +84,7 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     try:
         if not Q.any():
             raise np.linalg.LinAlgError('no state is weighted')
-        # values so large that something overflows end in a residual or a gain that is refused
+        # values so large that something overflows end in a residual or a gain that is rejected
         with np.errstate(all='ignore'):
             P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
                 A, B, Q, R)

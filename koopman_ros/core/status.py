@@ -139,11 +139,11 @@ class StatusCode(Enum):
     SCHEDULE_FULL = 'schedule_full', (
         '{most} set-points are already scheduled, the maximum: wait until some have taken effect, '
         'or send this one with stamp 0')
-    ANALYSIS_REFUSED = 'analysis_refused', (
+    ANALYSIS_REJECTED = 'analysis_rejected', (
         'the value {value:.6g} of {signal}, {age:.4g} s old, cannot correct the estimate, which '
         'reaches back {reach:.4g} s: check the analyser, its stamp, analysis_delay and estimator')
     NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
-        'manual command refused in automatic mode: switch to manual mode first')
+        'manual command rejected in automatic mode: switch to manual mode first')
     MANUAL_NOT_FINITE = 'manual_not_finite', (
         'manual {signal} {value:value} is not finite: the previous one is kept')
     EXPERIMENT_BOUNDS = 'experiment_bounds', (

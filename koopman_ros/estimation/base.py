@@ -132,7 +132,7 @@ class Estimator(ABC):
     def __init__(self, model: LiftedModel, outputs: Outputs, tuning: Tuning, parameters: Any
                  ) -> None:
         """
-        Prepare the estimator; a ValueError refuses the configuration.
+        Prepare the estimator; a ValueError rejects the configuration.
 
         :param model: whose drift predicts.
         :param outputs: the measured outputs.
@@ -195,7 +195,7 @@ class Estimator(ABC):
         """
         Correct by a value of one state alone, a scaled deviation with its standard deviation.
 
-        :raises NotImplementedError: by default; then such values are refused.
+        :raises NotImplementedError: by default; then such values are rejected.
         """
         raise NotImplementedError
 

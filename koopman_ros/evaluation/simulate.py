@@ -148,7 +148,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     :param stamp: the stamp of a measurement at a time of the plant, both in ns.
     :param stop: ends the simulation when it is true of state, command and report.
     :param disturbances: (n_d,) measured at a time in s, NaN for one that is not; None for none.
-    :raises ValueError: when arguments do not fit each other, or the controller refuses an event.
+    :raises ValueError: when arguments do not fit each other, or the controller rejects an event.
     """
     for name, value, fits in (('duration', duration, duration >= 0.0),
                               ('period', period, period > 0.0)):
@@ -210,11 +210,11 @@ def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[
 
 def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, StepReport | None]:
     outcome = apply(loop.controller, loop.state, event)
-    if outcome.refused is not None:
+    if outcome.rejected is not None:
         model = loop.controller.model
         units = dict(zip((*model.states.names, *model.inputs.names),
                          (*model.states.units, *model.inputs.units), strict=True))
-        raise ValueError(StatusFormatter(Displays(units))(outcome.refused))
+        raise ValueError(StatusFormatter(Displays(units))(outcome.rejected))
     plant = loop.plant
     if outcome.command is not None:
         plant = plant.commanded(outcome.command, plant.time_ns)

@@ -59,7 +59,7 @@ class Replay:
     lost: list[Lost] = field(default_factory=list)  #: records that are missing
     runs: int = 0  #: how often the controller was started, as far as it shows
     begins_late: int = 0  #: runs whose first records are missing
-    refused: int = 0  #: requests that were refused
+    rejected: int = 0  #: requests that were rejected
     #: names of those in force, in the order of their use
     models: list[str] = field(default_factory=list)
     #: the last one in force, or None where no state was found
@@ -178,7 +178,7 @@ class _ReplayRun:
         event = records.event_of(record)
         outcome = apply(self._controller, state, event)
         self._state = outcome.state
-        self._result.refused += outcome.refused is not None
+        self._result.rejected += outcome.rejected is not None
         target = None if outcome.report is None else outcome.report.target
         active = None if target is None else target.setpoint
         other = None

@@ -102,7 +102,7 @@ def fields_of(event: events.Event, outcome: events.EventOutcome) -> tuple[str, d
     elif isinstance(event, (
             events.SetpointRequest, events.ManualCommand, events.AnalysisValue,
             events.ClearSafeState)):
-        written |= {'accepted': outcome.refused is None, 'reason': _codes(outcome.refused)}
+        written |= {'accepted': outcome.rejected is None, 'reason': _codes(outcome.rejected)}
     return name, written
 
 

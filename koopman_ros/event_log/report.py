@@ -74,7 +74,7 @@ class ReplayedBag:
 
     @property
     def outside(self) -> int:
-        """At how many commands the new model would have refused the tracked set-point."""
+        """At how many commands the new model would have rejected the tracked set-point."""
         controller = self.found.controller
         if self.new_range is None or controller is None:
             return 0
@@ -182,7 +182,7 @@ def _section(bag: ReplayedBag) -> list[str]:
             (len(found.samples) - bag.check.compared, 'commands are not compared, because no '
                                                       'snapshot of the controller precedes them'),
             (found.runs - 1, 'restarts of the controller, or other controllers in the bag'),
-            (found.refused, 'requests were rejected'),
+            (found.rejected, 'requests were rejected'),
             (len(found.samples) - bag.measurements, 'commands were given without a measurement')):
         if count > 0:
             lines.append(f'- {count} {words}.')
@@ -200,7 +200,7 @@ def _figures(bag: ReplayedBag) -> dict[str, Any]:
         'recorded_model': _comparison(bag, bag.check),
         'not_compared': len(found.samples) - bag.check.compared,
         'commands_in_silence': len(found.samples) - bag.measurements,
-        'refused_requests': found.refused,
+        'rejected_requests': found.rejected,
         'began_before_bag': found.begins_late > 0,
         'lost_records': [[lost.run, lost.first, lost.last] for lost in found.lost],
         'runs': found.runs, 'models': found.models, 'complete': bag.complete,

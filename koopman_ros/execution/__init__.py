@@ -6,7 +6,7 @@
 from koopman_ros.execution.backends import (
     Backend,
     backend_of,
-    executor_refusal,
+    executor_rejection,
     SchedulerLost,
     Serial,
     Tell,
@@ -15,4 +15,4 @@ from koopman_ros.execution.backends import (
 )
 
 __all__ = ['Backend', 'SchedulerLost', 'Serial', 'Tell', 'Watch', 'WorkerLost', 'backend_of',
-           'executor_refusal']
+           'executor_rejection']

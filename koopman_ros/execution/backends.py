@@ -110,7 +110,7 @@ def backend_of(text: str) -> Backend:
     :raises SchedulerLost: when no scheduler answers at the address.
     :raises WorkerLost: when the scheduler has no worker.
     """
-    if reason := executor_refusal(text):
+    if reason := executor_rejection(text):
         raise ValueError(reason)
     if not text:
         return Serial()
@@ -121,7 +121,7 @@ def backend_of(text: str) -> Backend:
     return Processes(1 if text == 'process' else int(text.partition(':')[2] or 0))
 
 
-def executor_refusal(text: str) -> str:
+def executor_rejection(text: str) -> str:
     """Return why a text names no backend, or an empty text."""
     if text in ('', 'process', 'joblib') or text.startswith(_ADDRESSES):
         return ''

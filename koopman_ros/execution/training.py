@@ -40,11 +40,11 @@ class JobState:
         return bool(self.summary and self.summary['accepted'])
 
     @property
-    def refused(self) -> bool:
+    def rejected(self) -> bool:
         """Whether a lift was learned or tried and does not suffice, of a fleet the worst one."""
         if self.plants:
             return not self.accepted and all(
-                one.accepted or one.refused for one in self.plants.values())
+                one.accepted or one.rejected for one in self.plants.values())
         return bool(self.summary and not self.summary['accepted'])
 
 
@@ -185,8 +185,8 @@ def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
                  f'roll-out {_errors(one["heldout_error"], units)}',
                  f'law fails in {failed} of {loops} closed loops']
     line = 'chosen: ' * one['chosen'] + ', '.join([*parts, f'{one["seconds"]:.1f} s'])
-    return '; '.join(filter(None, [line, one['limit'], one['refusal'] and (
-        f'rejected: {one["refusal"]}')]))
+    return '; '.join(filter(None, [line, one['limit'], one['rejection'] and (
+        f'rejected: {one["rejection"]}')]))
 
 
 def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:

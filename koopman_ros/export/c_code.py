@@ -42,7 +42,7 @@ CODES = tuple(StatusCode[name] for name in (
     'RICCATI_INACCURATE', 'GAIN_TOO_LARGE', 'PREDICTED_UNSTABLE', 'COMMAND_NOT_FINITE',
     'CALCULATION_FAILED', 'NOT_PREDICTED', 'NO_STEADY_STATE'))
 # Fields of model and tuning that the templates do not name: their effect is in other tables, or
-# they have none in C. Any other one that is set is refused.
+# they have none in C. Any other one that is set is rejected.
 _WITHOUT_TABLE = re.compile(
     r'MODEL_(PROVENANCE|TIME_UNIT|PRE_FEEDBACK|DEAD_TIME)|OBSERVABLES_(V|IDENTITY|EXPONENTS)'
     r'|(STATES|INPUTS|DISTURBANCES)_(NAMES|UNITS|LOWER|UPPER)|INPUTS_CHARACTERISTICS'

@@ -61,7 +61,7 @@ def loop(model: str, law: str, parameters: Path | None = None
     """
     Return a model and its controller as the controller node would build it.
 
-    :raises ValueError: for a model or parameters that the node refuses.
+    :raises ValueError: for a model or parameters that the node rejects.
     """
     given = {'system': ''} if parameters is None else file_parameters(parameters, 'controller')
     loaded = load_suitable(model, force=bool(given.get('load_rejected_model', False)))

@@ -210,9 +210,9 @@ def _displaced(drift: Drift, inputs: Array, offset: Array, x: Array, u: Array) -
 
 @dataclass(frozen=True)
 class AcceptanceResult:
-    """Acceptance or refusal of a lift, with its figures on held-out segments."""
+    """Acceptance or rejection of a lift, with its figures on held-out segments."""
 
-    reasons: tuple[str, ...]  #: why it is refused; empty when it is accepted
+    reasons: tuple[str, ...]  #: why it is rejected; empty when it is accepted
     warnings: tuple[str, ...]  #: for the user, in either case
     rmse: Array  #: (n_x,) error of its predictions of the measurements, in state units
     drift_rmse: Array  #: (n_x,) the same of the drift that it was learned from
@@ -221,7 +221,7 @@ class AcceptanceResult:
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     law_check: ClosedLoopTest  #: closed loops on the estimated drift
     #: more of them, of which none took part in a choice, on this and alternative drifts, with the
-    #: disturbances in words; none of a model that is refused without them
+    #: disturbances in words; none of a model that is rejected without them
     further_checks: tuple[tuple[Drift, ClosedLoopTest, str], ...] = ()
     operating_points: tuple[OperatingPoint, ...] = ()  #: with the eigenvalues of the model
 

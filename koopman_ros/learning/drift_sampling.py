@@ -181,7 +181,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     The rule is the same, its error another: the mean square by which predictions of the
     measurements that were held out err beyond their noise. Differences within the chance variation
     of the noise count as equal. Classes that the acceptance test would reject for their law, their
-    coordinates or a linear model that is as good are refused.
+    coordinates or a linear model that is as good are rejected.
 
     :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
         them and the rule; of a linear drift for the linear one.
@@ -207,7 +207,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
         return replace(one, figures=replace(one.figures, rollout_rmse=rmse), law_check=law_check,
                        excess=float(np.mean(np.maximum(
                            (rmse / held_out.scale) ** 2 - noise ** 2, 0.0))),
-                       refusal='; '.join(reasons))
+                       rejection='; '.join(reasons))
 
     known, samples = _estimated(found, plant)
     # the mean square of so many white errors strays by this share

@@ -51,7 +51,7 @@ def retrain_fleet(tasks: Mapping[str, TrainingTask], scheduler: str = '',
     reported in the same way; a failure of one is its outcome and does not touch the others. Those
     whose sibling is ``'first'`` begin from the lift of the first plant of their kind that is
     accepted: of the same signals, class and number of coordinates. They wait for that; where one
-    is refused or fails, the next one of the kind is learned from nothing.
+    is rejected or fails, the next one of the kind is learned from nothing.
 
     The outcomes come round by round, in each in the order of the plants. The lifts are the same
     wherever they are learned.

@@ -38,12 +38,12 @@ class ModelCandidate:
     """A model of one class with its figures, or the reason why there is none."""
 
     name: str  #: of the class
-    model: LiftedModel | None  #: the best of the class, None when training refused all
+    model: LiftedModel | None  #: the best of the class, None when training rejected all
     rx: float  #: relative mean-square error of its drift on the validation episodes; else infinite
     figures: LiftMetrics | None  #: its figures on the test episodes, which chose nothing
     law_check: ClosedLoopTest | None  #: its law in closed loops, where there are any
     seconds: float  #: that it took to learn
-    refusal: str = ''  #: why it should not be used; empty when it may be
+    rejection: str = ''  #: why it should not be used; empty when it may be
     #: mean-square error of its predictions of a record beyond the noise, relative to the states'
     #: scale; None where no record judges
     excess: float | None = None
@@ -60,7 +60,7 @@ class ModelCandidate:
 class Judge:
     """Judgement of models in place of that by validation episodes and their polynomials."""
 
-    #: completes a contender that has no law check, no `excess` and no refusal yet
+    #: completes a contender that has no law check, no `excess` and no rejection yet
     judged: Callable[[ModelCandidate], ModelCandidate]
     resolution: float  #: errors below it count as equal
 
@@ -115,7 +115,7 @@ class ClassComparison:
                 *(('', '') if law is None else (f'{law.failed.sum()} of {law.loops}',
                                                 f'{law.median_ratio:.3f}')), f'{one.seconds:.1f}',
                 '; '.join(filter(None, [
-                    'chosen' * (one is self.chosen), one.limit, one.refusal]))])
+                    'chosen' * (one is self.chosen), one.limit, one.rejection]))])
         return table(head, rows, range(1, len(head) - 1))
 
 
@@ -140,7 +140,7 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
     In order of plainness: linear, polynomial, and the recipes, by default a neural drift, a lift
-    with identity coordinates and a free one. Refused are networks whose `rx` on validation
+    with identity coordinates and a free one. Rejected are networks whose `rx` on validation
     episodes is not below the linear one's, models whose law fails in closed loops, and classes of
     which no model can be learned. Of the others the plainest is taken whose `rx` there is at most
     twice the smallest; below 1e-20 it is rounding and counts as equal. Where every law fails, it
@@ -204,11 +204,11 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             one = judge.judged(ModelCandidate(name, model, prepared.rx(model), figures, None,
                                               seconds, steps=steps, limit=limit))
             found.append(replace(one, model=_noted(model, one)))
-        except (ValueError, np.linalg.LinAlgError) as refusal:
+        except (ValueError, np.linalg.LinAlgError) as rejection:
             if name == choose:
                 raise
             found.append(ModelCandidate(name, None, math.inf, None, None,
-                                        time.perf_counter() - since, str(refusal)))
+                                        time.perf_counter() - since, str(rejection)))
     chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
     return ClassComparison(tuple(found), chosen, plant.state_names, plant.state_units)
 
@@ -222,12 +222,12 @@ def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING)
     :param resolution: errors below it count as equal.
     :raises TrainingFailed: when there is no model of any class.
     """
-    able = [one for one in contenders if not one.refusal]
+    able = [one for one in contenders if not one.rejection]
     if not able:
         tried = [one for one in contenders if one.model is not None]
         if not tried:
             raise TrainingFailed('no class gave a model: ' + '; '.join(
-                f'{one.name}: {one.refusal}' for one in contenders))
+                f'{one.name}: {one.rejection}' for one in contenders))
         return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
     limit = _FACTOR * max(min(one.error for one in able), resolution)
     return next(one for one in able if one.error <= limit)
@@ -269,21 +269,21 @@ def _noted(model: LiftedModel, one: ModelCandidate) -> LiftedModel:
 
 def _polynomial(prepared: PreparedSamples, degrees: Sequence[int]) -> LiftedModel:
     """Choose the degree; those with too many monomials to tell apart or to save fall out."""
-    tried, refusal = [], 'no degree was given'
+    tried, rejection = [], 'no degree was given'
     training = prepared.parts[0]
     for degree in degrees:
         count = math.comb(training.x.shape[1] + degree, degree)
         if count >= len(training):
-            refusal = f'{len(training)} samples do not determine {count} monomials'
+            rejection = f'{len(training)} samples do not determine {count} monomials'
             continue
         try:
             model = Edmd(degree).learn(prepared.plant, training, prepared.box)
             model_file.check(model)
             tried.append(ModelCandidate(POLYNOMIAL, model, prepared.rx(model), None, None, 0.0))
         except (ValueError, np.linalg.LinAlgError) as error:
-            refusal = str(error)
+            rejection = str(error)
     if not tried:
-        raise TrainingFailed(refusal)
+        raise TrainingFailed(rejection)
     best = plainest(tried).model
     assert best is not None
     return best
@@ -309,8 +309,8 @@ def _judge(prepared: PreparedSamples, loops: int, backend: Backend | None) -> Ju
         law_check = evaluate_closed_loops(model, prepared.reference_drift(model), loops=loops,
                                           backend=backend,
                                           disturbances=prepared.plant.disturbance_names)
-        refused = law_check is not None and not law_check.accepted
+        rejected = law_check is not None and not law_check.accepted
         return replace(one, law_check=law_check,
-                       refusal=f'does not control the plant: {law_check}' if refused else '')
+                       rejection=f'does not control the plant: {law_check}' if rejected else '')
 
     return Judge(judged, ROUNDING)

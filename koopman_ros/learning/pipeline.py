@@ -93,7 +93,7 @@ class Retrained:
     #: the classes that were learned, None when there is no model worth judging
     learned: ClassComparison | None
     decision: AcceptanceResult | None  #: its figures, None without a lift
-    reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
+    reasons: tuple[str, ...]  #: why it was rejected; empty when it was accepted
     #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
     coverage: Mapping[tuple[str, str], float]
     plant: PlantDescription  #: names, units and nominal point; its time unit is that of the drift
@@ -140,7 +140,7 @@ class Retrained:
         def of_class(one: ModelCandidate) -> dict[str, object]:
             said: dict[str, object] = {
                 'chosen': self.learned is not None and one is self.learned.chosen,
-                'refusal': one.refusal, 'limit': one.limit, 'seconds': one.seconds,
+                'rejection': one.rejection, 'limit': one.limit, 'seconds': one.seconds,
                 'steps': one.steps}
             if one.figures and one.law_check:
                 assert one.figures.rollout_rmse is not None
@@ -226,7 +226,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
 
     An accepted lift goes to the output file; the file that it replaces is kept as
     ``.previous.safetensors``. A rejected lift goes to ``.rejected.safetensors``. If the lift that
-    training makes of a sibling's would be refused, training starts again without the sibling.
+    training makes of a sibling's would be rejected, training starts again without the sibling.
     The result does not depend on the executor of the task.
 
     :param on_progress: called with the share done and a text; True stops the training. By default
@@ -544,7 +544,7 @@ def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
            progress: _Progress, backend: Backend
            ) -> tuple[ClassComparison | None, AcceptanceResult | None, tuple[str, ...]]:
-    """Return the classes, the decision, and the reasons of a refusal; from a sibling first."""
+    """Return the classes, the decision, and the reasons of a rejection; from a sibling first."""
     task, found = bare.task, bare.found
     learned: ClassComparison | None = None
     decision: AcceptanceResult | None = None

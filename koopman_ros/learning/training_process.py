@@ -30,7 +30,7 @@ _PERIOD = 0.2  # s between two lines of progress
 
 
 def main() -> int:
-    """Run the task; the exit code is 0 for an accepted lift, 2 for a refused one, 1 otherwise."""
+    """Run the task; the exit code is 0 for an accepted lift, 2 for a rejected one, 1 otherwise."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -75,7 +75,7 @@ def _fleet(values: Mapping[str, Any], now_and_then: OnProgress) -> int:
         shares[name] = 1.0
         codes.append(_print_outcome(outcome, plant=name))
     _print(ended=True)
-    # a failure says more than a refusal
+    # a failure says more than a rejection
     return 1 if 1 in codes else max(codes)
 
 

@@ -59,7 +59,7 @@ class Provenance:
     """
     Origin of a model, its held-out figures and its acceptance.
 
-    :raises ValueError: for a refusal without a reason, or reasons without a verdict.
+    :raises ValueError: for a rejection without a reason, or reasons without a verdict.
     """
 
     plant: str  #: name of the plant it was learned from
@@ -74,7 +74,7 @@ class Provenance:
     #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
     model_class: str = ''
     accepted: bool | None = None  #: verdict of the acceptance test; None if not tested
-    reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a refusal
+    reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a rejection
     closed_loops: str = ''  #: result of simulated closed loops, with its confidence
 
     def __post_init__(self) -> None:

@@ -42,7 +42,7 @@ _MAX_SENTENCE = 4000
 _MAX_SEED = 1 << 128  # numpy's own seeds have up to 128 bits
 _MAX_ENTRIES = 100  # metrics, or reasons
 _COORDINATES = ('names', 'units', 'center', 'scale', 'lower', 'upper')
-_MAX_REASON = 300  # characters of a refusal, which may quote the file
+_MAX_REASON = 300  # characters of a rejection, which may quote the file
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -57,7 +57,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
 
     :raises OSError: when the folder cannot be written.
     :raises TypeError: for another lift than of a network or of monomials.
-    :raises ValueError: when :func:`load` would refuse the file.
+    :raises ValueError: when :func:`load` would reject the file.
     """
     check(model)
     about, tensors = _description(model), _tensors(model)

@@ -196,7 +196,7 @@ class ControllerNode(ManagedNode):
         if advance is Advance.TWO_SOURCES and before.command is not None:
             self._measured = sample.values
             self._counts.measurements += 1
-            self._counts.refused += 1
+            self._counts.rejected += 1
             if (held := self._loop.hold_between_sources(stamp_ns)) is not None:
                 self._report_command(held)
             return

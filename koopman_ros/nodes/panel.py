@@ -99,7 +99,7 @@ class PanelNode(LoopNode):
             name: Display(unit, read[name], '.6g') for name, unit in signals.units.items()
             if read[name] != display_unit(unit)})
         self._requests = Requests(
-            {SETPOINT: signals.controlled, MANUAL: tuple(signals.inputs)}, self._refusal)
+            {SETPOINT: signals.controlled, MANUAL: tuple(signals.inputs)}, self._rejection)
         self._actions: deque[tuple[Action, Future[Answer]]] = deque()
         self._repeated = RepeatedValues(self)
         self._training_ranges: dict[str, Range] = {}
@@ -313,7 +313,7 @@ class PanelNode(LoopNode):
     def _reply(self, action: Action, future: Future[Answer], answer: Answer) -> None:
         self._operator_actions.publish(String(data=action_text(
             action, answer, time.time(), self.view.read.get(action.name, ''))))
-        word = 'accepted' if answer.accepted else 'refused'
+        word = 'accepted' if answer.accepted else 'rejected'
         value = sanitize_text(f'{action.name} {action.value}', _LOGGED)
         self.get_logger().info(f'{action.who}: {action.what} {value}: {word}')
         if not future.done():
@@ -365,8 +365,8 @@ class PanelNode(LoopNode):
         self._requests.add(SETPOINT if setpoint else MANUAL, name, float(back(float(there(own)))),
                            time.monotonic(), on_answer, accepted)
 
-    def _refusal(self, codes: Sequence[str], name: str, value: float) -> str:
-        """Write the reason of a refused set-point; '' if more is known to the controller alone."""
+    def _rejection(self, codes: Sequence[str], name: str, value: float) -> str:
+        """Write the reason of a rejected set-point; '' if only the controller knows it."""
         if codes[:1] != (StatusCode.SETPOINT_OUTSIDE.value,) or name not in self._training_ranges:
             return ''
         low, high = self._training_ranges[name]

@@ -48,7 +48,7 @@ class TrainerNode(ManagedNode):
             present.provenance.plant or settings.system)
         wiring = SignalTopics.of(signals, settings)
         for kind in wiring.kinds:
-            # a field that its message type lacks is refused now, not when a bag holds nothing
+            # a field that its message type lacks is rejected now, not when a bag holds nothing
             list(by_topic(getattr(wiring, kind)))
         self._recording = Recording(self, settings, wiring)
         self._experiment = PlantExperiment(self, settings, wiring, self._commanded)
@@ -84,7 +84,7 @@ class TrainerNode(ManagedNode):
 
     def _on_trained(self, end: JobState) -> None:
         if self._settings.task == 'train' and self.active:
-            self.exit_code = 0 if end.accepted else 2 if end.refused else 1
+            self.exit_code = 0 if end.accepted else 2 if end.rejected else 1
 
     def _on_parameters(self, parameters: TrainerParameters) -> None:
         self._settings = parameters

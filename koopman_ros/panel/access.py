@@ -132,7 +132,7 @@ def write_user(path: str | os.PathLike[str], name: str, role: Role, secret: str)
     Add or replace a user; the file is replaced as a whole, with mode 0600.
 
     :param secret: hash of :func:`hashed`.
-    :raises ValueError: for a wrong name, or a file that :meth:`Users.read` refuses.
+    :raises ValueError: for a wrong name, or a file that :meth:`Users.read` rejects.
     :raises OSError: for a file that cannot be read or written.
     """
     # a link stays one

@@ -119,7 +119,7 @@ class Conditions:
     def _is_alarm(self, status: TaskStatus, now: float) -> bool:
         """Return whether a warning or an error is an alarm, and no other alarm shows it."""
         if status.name == REQUESTS or (
-                status.name == EXPERIMENT and status.message.startswith('refused')):
+                status.name == EXPERIMENT and status.message.startswith('rejected')):
             # the operator who made the request reads the answer
             return False
         if status.name in (EXPERIMENT, TRAINING):

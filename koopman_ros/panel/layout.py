@@ -228,15 +228,15 @@ class AnswerLine:
         self._label = label('div', '', 'answer').props('role=status aria-live=polite')
 
     def set_text(self, text: str) -> None:
-        """Show a text other than a refusal."""
+        """Show a text other than a rejection."""
         self._label.set_text(text)
-        self._label.classes(remove='refused')
+        self._label.classes(remove='rejected')
 
     def show(self, answer: Answer) -> None:
         """Show an answer."""
         self.set_text(str(answer) if answer.accepted else f'✖ {answer}')
         if not answer.accepted:
-            self._label.classes('refused')
+            self._label.classes('rejected')
 
 
 def show_if(element: Element, shown: bool) -> None:

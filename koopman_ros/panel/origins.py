@@ -19,11 +19,11 @@ def is_loopback(host: str) -> bool:
     return (mapped or address).is_loopback
 
 
-def refusal(kind: str, host: str, origin: str | None, scheme: str, *, users: bool) -> str:
+def rejection(kind: str, host: str, origin: str | None, scheme: str, *, users: bool) -> str:
     """
-    Return the reason to refuse a request of any session, or ''.
+    Return the reason to reject a request of any session, or ''.
 
-    Browsers send the origin with each WebSocket: a WebSocket without origin is refused as well.
+    Browsers send the origin with each WebSocket: a WebSocket without origin is rejected as well.
 
     :param kind: 'http' or 'websocket'.
     :param host: header Host.

@@ -12,8 +12,8 @@ import math
 from typing import Any
 
 TIMEOUT = 3.0  # s for the answer of a controller
-_SENTENCE = 1.5  # s until its status has the reason of a refusal
-REFUSED = 'request refused: '  #: prefix of that status
+_SENTENCE = 1.5  # s until its status has the reason of a rejection
+REJECTED = 'request rejected: '  #: prefix of that status
 
 SETPOINT, MANUAL = 'setpoint', 'manual_command'  #: events of records
 
@@ -40,8 +40,8 @@ class Answer:
 
     def __str__(self) -> str:
         """Write the answer as the pages show it."""
-        return self.text if self.accepted or self.text.startswith('refused') else (
-            f'refused: {self.text}')
+        return self.text if self.accepted or self.text.startswith('rejected') else (
+            f'rejected: {self.text}')
 
 
 def action_text(action: Action, answer: Answer, stamp: float, unit: str = '') -> str:
@@ -68,7 +68,7 @@ class _Open:
     deadline: float
     reply: Callable[[Answer], None]
     accepted: str  # text of the answer if the request is accepted
-    refused: str = ''  # words of the code
+    rejected: str = ''  # words of the code
 
 
 class Requests:
@@ -76,7 +76,7 @@ class Requests:
     Requests on topics that the controller has not answered yet.
 
     :param signals: signals in the records of each event, in their order.
-    :param words: writes the codes of a refusal of a value of a signal; '' if it cannot.
+    :param words: writes the codes of a rejection of a value of a signal; '' if it cannot.
     """
 
     def __init__(self, signals: Mapping[str, Sequence[str]],
@@ -99,7 +99,7 @@ class Requests:
             accepted, codes = bool(fields['accepted']), tuple(map(str, fields['reason']))
         except (KeyError, TypeError, ValueError):
             return
-        request = next((one for one in self._open if one.event == event and not one.refused
+        request = next((one for one in self._open if one.event == event and not one.rejected
                         and math.isclose(values.get(one.name, math.nan), one.value,
                                          rel_tol=1e-9, abs_tol=1e-12)), None)
         if request is None:
@@ -110,19 +110,19 @@ class Requests:
             self._answer(request, Answer(False, words))
         else:
             # the sentence follows with the next status
-            request.refused = ', '.join(code.replace('_', ' ') for code in codes) or 'refused'
+            request.rejected = ', '.join(code.replace('_', ' ') for code in codes) or 'rejected'
             request.deadline = now + _SENTENCE
 
     def take_status(self, message: str) -> None:
-        """Take the message of the controller's status, which may have the reason of a refusal."""
-        if message.startswith(REFUSED):
-            for request in [one for one in self._open if one.refused]:
-                self._answer(request, Answer(False, message.removeprefix(REFUSED)))
+        """Take the message of the controller's status, perhaps with the reason of a rejection."""
+        if message.startswith(REJECTED):
+            for request in [one for one in self._open if one.rejected]:
+                self._answer(request, Answer(False, message.removeprefix(REJECTED)))
 
     def advance(self, now: float) -> None:
         """Answer the requests for which the controller has no answer in time."""
         for request in [one for one in self._open if now > one.deadline]:
-            self._answer(request, Answer(False, request.refused or (
+            self._answer(request, Answer(False, request.rejected or (
                 f'the controller did not answer within {TIMEOUT:g} s: check its log')))
 
     def _answer(self, request: _Open, answer: Answer) -> None:

@@ -29,7 +29,7 @@ from koopman_ros.panel.connections import BACKLOG, Listener, RateLimiter
 from koopman_ros.panel.layout import PageLayout, Source
 from koopman_ros.panel.login import AccessControl, add_login
 from koopman_ros.panel.model_page import model_page
-from koopman_ros.panel.origins import is_loopback, refusal
+from koopman_ros.panel.origins import is_loopback, rejection
 from koopman_ros.panel.overview import overview
 from koopman_ros.panel.trend_page import trend_page
 from koopman_ros.panel.tuning_page import tuning_page
@@ -67,7 +67,7 @@ class _AuthMiddleware:
         kind, path = scope['type'], scope['path']
         page = kind == 'http' and path in _PAGES
         session = self._keeper.session(scope, use=page)
-        response = self._refusal(scope, page and scope['method'] == 'GET', session is not None)
+        response = self._rejection(scope, page and scope['method'] == 'GET', session is not None)
         if response is not None and kind == 'websocket':
             await receive()
             await send({'type': 'websocket.close', 'code': 1008})
@@ -79,19 +79,19 @@ class _AuthMiddleware:
             with self._listener.serving(scope[_PEER]):
                 await self._app(scope, receive, _with_headers(send))
 
-    def _refusal(self, scope: Any, page: bool, logged_in: bool) -> Response | None:
+    def _rejection(self, scope: Any, page: bool, logged_in: bool) -> Response | None:
         headers = {name: value.decode('latin-1') for name, value in scope['headers']}
-        if reason := refusal(scope['type'], headers.get(b'host', ''), headers.get(b'origin'),
+        if reason := rejection(scope['type'], headers.get(b'host', ''), headers.get(b'origin'),
                              'https' if _encrypted(scope) else 'http',
                              users=self._keeper.users is not None):
-            return Response(f'refused: {reason}\n', 403)
+            return Response(f'rejected: {reason}\n', 403)
         if not logged_in and scope['path'] != '/login':
             asked = '' if scope['path'] == '/' else f'?page={scope["path"]}'
             return RedirectResponse(f'/login{asked}', 303) if page else Response(
                 'log in first\n', 401)
         if scope['type'] == 'http' and scope['path'].startswith(_SOCKETS):
             # the id of a socket that polls would be a credential
-            return Response('refused: only WebSockets are served here\n', 403)
+            return Response('rejected: only WebSockets are served here\n', 403)
         return None
 
 

@@ -29,7 +29,7 @@ def named_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float] | None]:
     return found
 
 
-def refused(equations: str, texts: Sequence[str]) -> str:
+def rejected(equations: str, texts: Sequence[str]) -> str:
     """
     Return why equations cannot be fitted, or an empty string.
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models for a controller: loaded, and refused where they do not suit it."""
+"""Models for a controller: loaded, and rejected where they do not suit it."""
 
 import contextlib
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ def load_suitable(name: str, signals: Signals | None = None, *, force: bool = Fa
     """
     Load a model, of these signals where they are given; ModelFileError with the reason.
 
-    :param force: whether to load a model that its training refused.
+    :param force: whether to load a model that its training rejected.
     """
     if not name:
         raise ModelFileError('model is empty: name a bundled model or a .safetensors file')
@@ -109,14 +109,14 @@ def _with_defaults(model: LiftedModel) -> Controller:
     return built(table_of(model, {'system': ''}).snapshot({}), model)
 
 
-def refuse_setpoints(model: LiftedModel, situation: ModelCheckContext) -> None:
+def reject_setpoints(model: LiftedModel, situation: ModelCheckContext) -> None:
     """Raise ModelFileError for a model that cannot track the requested set-point."""
     controller = situation.controller(model)
-    if (refusal := controller.untrained(situation.state.setpoint)) is not None:
-        raise ModelFileError(words_of(signals_of(model))(refusal))
+    if (rejection := controller.untrained(situation.state.setpoint)) is not None:
+        raise ModelFileError(words_of(signals_of(model))(rejection))
 
 
-def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None:
+def reject_without_law(model: LiftedModel, situation: ModelCheckContext) -> None:
     """Raise ModelFileError for a model without a law where the plant is or shall go."""
     controller, asked = situation.controller(model), situation.state.setpoint
     margin = controller.usable.law.margin
@@ -136,7 +136,7 @@ def refuse_without_law(model: LiftedModel, situation: ModelCheckContext) -> None
                                      f'{tried}: train it again, or change the weights')
 
 
-def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheckContext) -> str:
+def reject_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheckContext) -> str:
     """
     Raise ModelFileError for a model that predicts recent measurements much worse.
 
@@ -151,7 +151,7 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: ModelCheck
         model, measured=situation.parameters.states).states.values())[i]
     words = (f'predicts {name} of the last {found.seconds:.3g} s with an error of '
              f'{found.candidate[i]:.2g} {unit}, the {{}} with {found.present[i]:.2g} {unit}')
-    # written so that NaN is refused, too
+    # written so that NaN is rejected, too
     most = situation.parameters.model_check_factor
     if most and not found.ratio[i] <= most:
         raise ModelFileError(

@@ -385,7 +385,7 @@ def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None
             into[f'{prefix}{key}'] = tuple(value) if isinstance(value, list) else value
 
 
-def refusal(names: Collection[str]) -> str:
+def rejection(names: Collection[str]) -> str:
     """Return why a list of names cannot be that of topics, or an empty string."""
     return '' if names and all(names) else (
         f'topics = {list(names)} must contain at least one name and no empty one')

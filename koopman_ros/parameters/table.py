@@ -100,7 +100,7 @@ class Specification:
             above = value > self.minimum if self.open_minimum else (
                 value >= self.smallest or value == self.minimum if self.smallest
                 else value >= self.minimum)
-            # written so that NaN, which compares false with everything, is refused, too
+            # written so that NaN, which compares false with everything, is rejected, too
             if not (above and value <= self.maximum and math.isfinite(value)):
                 return f'{self.name} = {value}{unit} must be {self._in_range_words()}'
         return ''

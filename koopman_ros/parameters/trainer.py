@@ -27,11 +27,11 @@ from koopman_ros.core.declaration import (
 )
 from koopman_ros.core.plugins import short_name
 from koopman_ros.core.units import conversion, display_unit
-from koopman_ros.execution import executor_refusal
+from koopman_ros.execution import executor_rejection
 from koopman_ros.identification_methods import parameters_of
 from koopman_ros.model import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, SAME
-from koopman_ros.parameters.equations import named_ranges, refused
+from koopman_ros.parameters.equations import named_ranges, rejected
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
     AUDIT_LOG,
@@ -45,7 +45,7 @@ from koopman_ros.parameters.signal_topics import (
     named_units,
     plant_defaults,
     PREDICTED_TRAJECTORY,
-    refusal,
+    rejection,
     Signals,
     signals_of,
     SignalTopics,
@@ -403,12 +403,12 @@ def _plan(signals: Signals, values: TrainerParameters) -> None:
 
 
 def _cross_check(signals: Signals, values: TrainerParameters) -> str:
-    if reason := refusal(values.topics):
+    if reason := rejection(values.topics):
         return reason
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
         return (f'output = {values.output!r} is a single file, which max_bag_size and '
                 'max_bag_duration cannot split: name a folder, without .mcap')
-    if reason := executor_refusal(values.executor):
+    if reason := executor_rejection(values.executor):
         return reason
     try:
         parameters_of(values.identification_methods)
@@ -441,7 +441,7 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
                 Characteristic.of(one.characteristic[::2], one.characteristic[1::2])
             except ValueError as error:
                 return f'{name}.characteristic = {list(one.characteristic)}: {error}'
-    return (refused(values.physical_model, values.estimated_constants)
+    return (rejected(values.physical_model, values.estimated_constants)
             or SignalTopics.of(signals, values).check())
 
 
@@ -500,7 +500,7 @@ class PlayerParameters:
 def _check_player(values: PlayerParameters) -> str:
     if values.bag.endswith('.csv') and values.rate == 0.0:
         return 'rate = 0 plays in lock-step, which a .csv of set-points cannot: set rate above 0'
-    return refusal(values.topics) or refusal((*values.measurement, values.answer))
+    return rejection(values.topics) or rejection((*values.measurement, values.answer))
 
 
 def player_table(given: Mapping[str, Any] = MappingProxyType({})

@@ -46,7 +46,7 @@ class Constants:
         for row in _rows(self):
             value, unit = getattr(self, row.name), row.metadata['unit']
             lower, upper = row.metadata['lower'], row.metadata['upper']
-            # Written so that NaN, which compares false with everything, is refused too.
+            # Written so that NaN, which compares false with everything, is rejected too.
             if not lower <= value <= upper:
                 raise ValueError(f'{row.name} is {value:.10g} {unit}, must lie in '
                                  f'[{lower:.10g}, {upper:.10g}] {unit}')

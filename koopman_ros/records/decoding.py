@@ -107,7 +107,7 @@ def _decoder(name: str, definition: bytes) -> _Decode:
     store.register({**_TIMES, **get_types_from_msg(
         _BYTE.sub('uint8', definition.decode('utf-8')), name)})
     found = store.get_msgdef(name)
-    # The store's own deserialize_cdr refuses more than three bytes behind a message, where ROS
+    # The store's own deserialize_cdr rejects more than three bytes behind a message, where ROS
     # leaves four behind an empty array of doubles.
     orders = found.deserialize_cdr_be, found.deserialize_cdr_le
 

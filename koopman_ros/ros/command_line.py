@@ -186,7 +186,7 @@ def _call(node: Node, options: argparse.Namespace) -> None:
         _filled(kind.Request(), options.request)), service)
     _show(_plain(response))
     if not getattr(response, 'success', True):
-        raise CommandError(f'{service} refused')
+        raise CommandError(f'{service} rejected')
 
 
 def _parameter(node: Node, options: argparse.Namespace) -> None:

@@ -40,12 +40,12 @@ _LATCHED = 'the safe state is latched'
 
 @dataclass
 class Counts:
-    """Counts of measurements (all, late, missed, refused) and of failed plans."""
+    """Counts of measurements (all, late, missed, rejected) and of failed plans."""
 
     measurements: int = 0
     late: int = 0
     missed: int = 0
-    refused: int = 0
+    rejected: int = 0
     late_plans: int = 0
     unsolved_plans: int = 0
 
@@ -54,7 +54,7 @@ class Counts:
         self.measurements += 1
         self.late += report.measurement.arrival is Arrival.LATE
         self.missed += report.measurement.missed
-        self.refused += report.measurement.arrival is Arrival.REJECTED
+        self.rejected += report.measurement.arrival is Arrival.REJECTED
         if report.reason is not None and (cause := report.reason.cause) is not None:
             self.late_plans += cause.code is StatusCode.TOO_LATE
             self.unsolved_plans += cause.code in (StatusCode.PLAN_NOT_SOLVED,
@@ -79,8 +79,8 @@ class StatusContext:
     unheard: Sequence[str]  #: topics of the commands without a subscriber
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
-    request: str  #: why the operator's last request was refused or limited, or empty
-    model_rejected: str  #: why the last model, or the current one, was refused; or empty
+    request: str  #: why the operator's last request was rejected or limited, or empty
+    model_rejected: str  #: why the last model, or the current one, was rejected; or empty
     model: Callable[[], Mapping[str, object]]  #: gives figures of the current model
 
     @property
@@ -356,7 +356,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,
         'missed measurements': now.counts.missed,
-        'measurements rejected': now.counts.refused,
+        'measurements rejected': now.counts.rejected,
         **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
            if 'mpc' in now.parameters.tuning.fallback_order else {}),
         **{f'{what} messages of {name}': count for what, counts in (

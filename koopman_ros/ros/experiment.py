@@ -63,7 +63,7 @@ class PlantExperiment:
 
     async def _on_service(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
-        if reason := self._node.refusal:
+        if reason := self._node.rejection:
             response.message = reason
         elif not request.data:
             response.success, response.message = self._stop()
@@ -74,7 +74,7 @@ class PlantExperiment:
             if self._run is not None:
                 reason = self._words(await self._run.started)
             response.success = not reason
-            response.message = f'refused: {reason}' if reason else (
+            response.message = f'rejected: {reason}' if reason else (
                 f'started on {self._run.topics if self._run else ""}')
             if reason:
                 self._release(TaskReport(Severity.WARN, response.message))

@@ -268,8 +268,8 @@ class ExperimentRun:
         if self._on_setpoints:
             self.plan = self._settings.experiment(
                 self._signals, np.array([self._tracked[name] for name in self._units]))
-        self.started.set_result(refusal := self.plan.refusal(measured))
-        if refusal is not None:
+        self.started.set_result(rejection := self.plan.rejection(measured))
+        if rejection is not None:
             return False
         self.progress = begin(
             self.plan, stamp_ns, None if self._on_setpoints else self._present(stamp_ns))

@@ -29,7 +29,7 @@ def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
     ended at a signal.
 
     :param arrived: signals, as they come.
-    :return: exit code: 0 when all new lifts are accepted, 2 when one is refused, 1 when a plant
+    :return: exit code: 0 when all new lifts are accepted, 2 when one is rejected, 1 when a plant
         could not be retrained, or none could be tried.
     """
     # processes of many loops alone need it
@@ -57,7 +57,7 @@ def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
     if not tasks:
         return 1
     end = _retrain({'plants': tasks, 'executor': scheduler}, arrived)
-    return 1 if failed or not (end.accepted or end.refused) else 0 if end.accepted else 2
+    return 1 if failed or not (end.accepted or end.rejected) else 0 if end.accepted else 2
 
 
 def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:

@@ -66,14 +66,14 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._alone = False
 
     def configure(self) -> None:
-        """Create publishers, subscriptions, services and timers; raise an error to refuse."""
+        """Create publishers, subscriptions, services and timers; raise an error to reject."""
 
     def activate(self) -> None:
-        """Begin to act; raise an error to refuse."""
+        """Begin to act; raise an error to reject."""
 
     @property
-    def refusal(self) -> str:
-        """Reason to refuse a request of a service, or an empty string."""
+    def rejection(self) -> str:
+        """Reason to reject a request of a service, or an empty string."""
         return '' if self.active else f'{self.get_name()} is not active: activate it first'
 
     def deactivate(self) -> None:
@@ -152,7 +152,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
     def _clean_up(self) -> None:
         self.complete()
-        self._refuse_requests()
+        self._reject_requests()
         self.forget_tables()
         self.diagnostics.clear()
         destroyers: tuple[Callable[[Any], Any], ...] = (
@@ -163,7 +163,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                 if not any(entity is other for other in kept):
                     destroy(entity)
 
-    def _refuse_requests(self) -> None:
+    def _reject_requests(self) -> None:
         """Answer the requests that wait at the services to be destroyed."""
         for service in self.services:
             if any(service is kept for kept in self._kept[1]):

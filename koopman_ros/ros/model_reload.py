@@ -20,9 +20,9 @@ from koopman_ros.parameters.model_checks import (
     load_suitable,
     LoadedModel,
     ModelCheckContext,
-    refuse_setpoints,
-    refuse_without_law,
-    refuse_worse,
+    reject_setpoints,
+    reject_without_law,
+    reject_worse,
 )
 from koopman_ros.parameters.signal_topics import Signals
 
@@ -51,9 +51,9 @@ class _Trial:
             self.written = _written(self.path)
             outcome = load_suitable(
                 name, signals, force=situation.parameters.load_rejected_model)
-            refuse_setpoints(outcome.model, situation)
-            refuse_without_law(outcome.model, situation)
-            outcome = replace(outcome, comparison=refuse_worse(present, outcome.model, situation))
+            reject_setpoints(outcome.model, situation)
+            reject_without_law(outcome.model, situation)
+            outcome = replace(outcome, comparison=reject_worse(present, outcome.model, situation))
         except (ModelFileError, FileNotFoundError) as error:
             outcome = str(error)
         except BaseException as error:
@@ -98,16 +98,16 @@ class ModelReload:
     files together.
 
     :param reloaded: called in the executor when the service has activated another model.
-    :param refused: called there when a model was refused.
+    :param rejected: called there when a model was rejected.
     """
 
     def __init__(self, node: Node, in_force: LoadedModel, signals: Signals,
                  situation: Callable[[], ModelCheckContext], reloaded: Callable[[], None],
-                 refused: Callable[[], None]) -> None:
+                 rejected: Callable[[], None]) -> None:
         self._signals = signals
-        self.in_force, self.reloads, self.refused = in_force, 0, ''
+        self.in_force, self.reloads, self.rejected = in_force, 0, ''
         self._node, self._situation = node, situation
-        self._on_reloaded, self._on_refused = reloaded, refused
+        self._on_reloaded, self._on_rejected = reloaded, rejected
         self._accepted: LoadedModel | None = None
         self._late: _Trial | None = None  # too late for the last change of the parameter
         self._reading: list[_Trial] = []
@@ -135,7 +135,7 @@ class ModelReload:
             self._on_reloaded()
             response.success, response.message = True, outcome.about
         else:
-            response.success, response.message = False, self._refuse(outcome)
+            response.success, response.message = False, self._reject(outcome)
             self._node.get_logger().error(response.message)
         return response
 
@@ -164,7 +164,7 @@ class ModelReload:
         if isinstance(outcome, LoadedModel):
             self._accepted = outcome
             return ''
-        return self._refuse(outcome)
+        return self._reject(outcome)
 
     def take_over(self) -> bool:
         """Activate the model that was accepted with the last change of parameters, if any."""
@@ -179,9 +179,9 @@ class ModelReload:
 
     @property
     def complaint(self) -> str:
-        """Why the last model was refused, or why training refused the current one; or ''."""
+        """Why the last model was rejected, or why training rejected the current one; or ''."""
         about = self.in_force.model.provenance
-        return self.refused or ('' if about.accepted is not False else (
+        return self.rejected or ('' if about.accepted is not False else (
             f'the current model {self.in_force.name} was {about.acceptance}: train it again'))
 
     def figures(self) -> dict[str, object]:
@@ -191,7 +191,7 @@ class ModelReload:
             'model file time': self.in_force.file_time,
             'model training data': self.in_force.model.provenance.data_digest[:12] or 'none',
             'model reloads': self.reloads,
-            'model rejected': self.refused or 'none',
+            'model rejected': self.rejected or 'none',
             'model check': self.in_force.comparison or 'none',
             'model acceptance': self.in_force.model.provenance.acceptance,
         }
@@ -212,17 +212,17 @@ class ModelReload:
         """Check the set-points, which may have changed while the file was read."""
         if isinstance(outcome, LoadedModel):
             try:
-                refuse_setpoints(outcome.model, self._situation())
+                reject_setpoints(outcome.model, self._situation())
             except ModelFileError as error:
                 return str(error)
         return outcome
 
     def _swap(self, loaded: LoadedModel) -> None:
-        self.in_force, self.refused, self._late = loaded, '', None
+        self.in_force, self.rejected, self._late = loaded, '', None
         self.reloads += 1
         self._node.get_logger().info(f'{loaded.about}; {loaded.comparison}')
 
-    def _refuse(self, reason: str) -> str:
-        self.refused = f'the current model is kept: {reason}'
-        self._on_refused()
-        return self.refused
+    def _reject(self, reason: str) -> str:
+        self.rejected = f'the current model is kept: {reason}'
+        self._on_rejected()
+        return self.rejected

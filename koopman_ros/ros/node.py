@@ -43,7 +43,7 @@ class LoopNode(HostedNode):
     """
 
     exit_code: int | None = None
-    _clocks_refused = 0
+    _clocks_rejected = 0
 
     def __init__(self, name: str, hosting: HostContext | None = None, **options: Any) -> None:
         self._followers: list[Any] = []  # callbacks by which tables are followed
@@ -74,10 +74,10 @@ class LoopNode(HostedNode):
             if told.sec >= 0 and told.nanosec < NANOSECONDS:
                 callback(message)
                 return
-            self._clocks_refused += 1
+            self._clocks_rejected += 1
             self.get_logger().warning(
                 f'ignored an invalid /clock message (sec {told.sec}, nanosec {told.nanosec}; '
-                f'{self._clocks_refused} so far): check the publisher of /clock',
+                f'{self._clocks_rejected} so far): check the publisher of /clock',
                 throttle_duration_sec=10.0)
 
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
@@ -94,7 +94,7 @@ class LoopNode(HostedNode):
 
     def describe_parameter(self, name: str) -> msg.ParameterDescriptor:
         """Return the descriptor of a parameter with its range."""
-        # the one that rclpy keeps has none: rclpy would refuse by it before the table does, in
+        # the one that rclpy keeps has none: rclpy would reject by it before the table does, in
         # words without the unit, and accept values beyond it by a rounding
         descriptor = copy.copy(super().describe_parameter(name))
         limits = self._ranges.get(name)
@@ -133,11 +133,11 @@ class LoopNode(HostedNode):
         self._code = {name: own_code(table.values(snapshot)[name])
                       for name, row in table.rows.items() if row.code}
         if self._code:
-            self.add_on_set_parameters_callback(self._refuse_other_code)
+            self.add_on_set_parameters_callback(self._reject_other_code)
         return snapshot
 
-    def _refuse_other_code(self, changes: list[Parameter]) -> msg.SetParametersResult:
-        """Refuse a module:name that was not given at the start, before it is imported."""
+    def _reject_other_code(self, changes: list[Parameter]) -> msg.SetParametersResult:
+        """Reject a module:name that was not given at the start, before it is imported."""
         for change in changes:
             known = self._code.get(change.name)
             other = [] if known is None else [
@@ -181,9 +181,9 @@ class LoopNode(HostedNode):
                     if change.name in table.rows}
 
         def validate(changes: list[Parameter]) -> msg.SetParametersResult:
-            if not (code := self._refuse_other_code(changes)).successful:
+            if not (code := self._reject_other_code(changes)).successful:
                 return code
-            # rclpy has refused values of another type
+            # rclpy has rejected values of another type
             values = changed(changes)
             merged = table.amended(current, **values)
             reason = table.check(merged, current) or accept(merged, set(values))

@@ -20,7 +20,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.control_loop import ControlLoop
 from koopman_ros.ros.signals import MeasuredInputs, SignalSample, SignalSubscriber
 
-_SHOWN = 60.0  # s for which a request that was refused or limited is a warning
+_SHOWN = 60.0  # s for which a request that was rejected or limited is a warning
 
 
 class OperatorRequests:
@@ -53,7 +53,7 @@ class OperatorRequests:
 
     @property
     def complaint(self) -> str:
-        """Why the last request was refused or limited, for a minute; or an empty string."""
+        """Why the last request was rejected or limited, for a minute; or an empty string."""
         return self._note if time.monotonic() - self._noted < _SHOWN else ''
 
     def _on_setpoint(self, received: SignalSample) -> None:
@@ -108,12 +108,12 @@ class OperatorRequests:
         return response
 
     def _change(self, event: events.Event) -> bool:
-        """Apply an event; return whether it is not refused."""
-        refused = self._loop.change(event).refused
+        """Apply an event; return whether it is not rejected."""
+        rejected = self._loop.change(event).rejected
         self._note = ''
-        if refused is not None:
-            self._warn(f'request rejected: {self._words(refused)}')
-        return refused is None
+        if rejected is not None:
+            self._warn(f'request rejected: {self._words(rejected)}')
+        return rejected is None
 
     def _warn(self, note: str) -> None:
         self._note, self._noted = note, time.monotonic()

@@ -159,7 +159,7 @@ def _given(args: list[str] | None) -> dict[str, str]:
 
 
 def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None:
-    """Print help or version, or refuse an argument; return an exit code, or None to start."""
+    """Print help or version, or reject an argument; return an exit code, or None to start."""
     if '--version' in (sys.argv if args is None else args):
         print(__version__, flush=True)
         return 0

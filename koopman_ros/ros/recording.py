@@ -124,7 +124,7 @@ class Recording:
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response
                    ) -> SetBool.Response:
-        if reason := self._node.refusal:
+        if reason := self._node.rejection:
             response.success, response.message = False, reason
             return response
         recording = self._recorder is not None

@@ -113,8 +113,8 @@ class Training:
             self._on_end(state)
 
     def _on_train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._job is not None or self._node.refusal:
-            response.message = self._node.refusal or 'already training'
+        if self._job is not None or self._node.rejection:
+            response.message = self._node.rejection or 'already training'
             return response
         try:
             response.message, response.success = self.start(), True
@@ -145,7 +145,7 @@ class Training:
         # a line each, because rclpy allows one severity a line
         if self._state.accepted:
             log.info(self._state.text)
-        elif self._state.refused:
+        elif self._state.rejected:
             log.warning(self._state.text)
         else:
             log.error(self._state.text)
@@ -166,5 +166,5 @@ class Training:
             # the sentence stays while the figures move, or there would be a status a step
             return TaskReport(Severity.OK, state.text.split(',')[0],
                               {**values, 'step': state.text})
-        return TaskReport(Severity.OK if state.accepted else Severity.WARN if state.refused else
+        return TaskReport(Severity.OK if state.accepted else Severity.WARN if state.rejected else
                           Severity.ERROR, state.text, values)

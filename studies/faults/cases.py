@@ -203,8 +203,8 @@ _PROCESSES = (
                processes.starved, plant=processes.RUNNING, largest_step=processes.RUNNING_STEP,
                settle=100.0, afterwards=100.0, recovery=100.0))
 
-def refused_values(on: FaultPlant) -> list[dict[str, Any]]:
-    """Return parameter values that the controller of a plant must refuse."""
+def rejected_values(on: FaultPlant) -> list[dict[str, Any]]:
+    """Return parameter values that the controller of a plant must reject."""
     common = {'': (('max_gain', 0.0), ('max_riccati_residual', -1.0),
                    ('measurement_timeout', math.nan), ('model', ''),
                    ('model', '/nowhere/lift.safetensors'), ('model', 3.0))}
@@ -224,9 +224,9 @@ def _cycled(changes: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 
 def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, Any]]],
-                refused: bool = False) -> FaultCase:
+                rejected: bool = False) -> FaultCase:
     return FaultCase('operators', name, f'{REQUESTS} {does}',
-                     partial(operators.storm_of_parameters, make=make, refused=refused))
+                     partial(operators.storm_of_parameters, make=make, rejected=rejected))
 
 
 def _setpoints(name: str, does: str, *values: float, code: StatusCode | None = None) -> FaultCase:
@@ -250,7 +250,7 @@ _OPERATORS = (
     _parameters('ramps-storm', 'changes of the ramp of the set-point', partial(
         operators.drawn, 2, {'temperature.setpoint_ramp': (-5.0, 1.0)}, True)),
     _parameters('bad-values-storm', 'parameters that cannot be',
-                lambda: _cycled(refused_values(REACTOR)), True),
+                lambda: _cycled(rejected_values(REACTOR)), True),
     _setpoints('setpoint-storm', ', all the same', *REACTOR.setpoint),
     _setpoints('setpoint-storm-nan', ': NaN', math.nan, code=StatusCode.SETPOINT_NOT_FINITE),
     _setpoints('setpoint-storm-outside', ': 500 and -1e308 degC', 500.0, -1e308,
@@ -363,8 +363,8 @@ def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
         operators.storm_of_parameters,
         make=lambda: itertools.islice(operators.drawn(0, weights, True), 100)))
     yield case('bad-values-storm', f'{REQUESTS} parameters that cannot be, of each signal',
-               partial(operators.storm_of_parameters, make=lambda: _cycled(refused_values(on)),
-                       refused=True))
+               partial(operators.storm_of_parameters, make=lambda: _cycled(rejected_values(on)),
+                       rejected=True))
 
 
 def _tank_processes(on: FaultPlant) -> Iterator[FaultCase]:
@@ -534,9 +534,9 @@ _HEATED_LINE = (
           'disturbances'),
     _line('sensor', 'analyser-lost', 'analyser: no value', lost, 1200.0, 'late'),
     _line('sensor', 'analyser-nan', 'analyser: NaN', _shows(math.nan), 1200.0, 'late',
-          code=StatusCode.ANALYSIS_REFUSED),
+          code=StatusCode.ANALYSIS_REJECTED),
     _line('sensor', 'analyser-late', 'analyser: each value later than analysis_delay',
-          lambda: delayed(2), 1200.0, 'late', code=StatusCode.ANALYSIS_REFUSED),
+          lambda: delayed(2), 1200.0, 'late', code=StatusCode.ANALYSIS_REJECTED),
     _line('messages', 'measurements-lost', '30 % of the measurements lost', lambda: lost(0.3),
           600.0),
     _line('messages', 'commands-lost', '30 % of the commands lost', lambda: lost(0.3), 600.0,
@@ -558,7 +558,7 @@ _HEATED_LINE = (
                    operators.storm_of_modes),
     _line_operator('bad-values-storm', f'{REQUESTS} parameters that cannot be',
                    partial(operators.storm_of_parameters,
-                           make=lambda: _cycled(refused_values(HEATED_LINE)), refused=True)),
+                           make=lambda: _cycled(rejected_values(HEATED_LINE)), rejected=True)),
     _line_operator('latched', 'NaN until the safe input is latched, which is cleared then',
                    partial(late.latched, alteration=_shows(math.nan)(), seconds=200.0),
                    between=True, controller={'safe_latch': True}),

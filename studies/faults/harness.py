@@ -237,7 +237,7 @@ class FaultHarness:
         self.trace.setpoints.append((self.now, values))
 
     def set_parameters(self, node: str, **values: Any) -> list[str]:
-        """Set parameters one by one; return why they were refused, if any was."""
+        """Set parameters one by one; return why they were rejected, if any was."""
         return [result.reason for result in self.ros.set_parameters(node, **values)
                 if not result.successful]
 

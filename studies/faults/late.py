@@ -27,10 +27,10 @@ def reloaded(loop: FaultHarness, seconds: float) -> None:
     loop.run_for(20.0)
     with loop.fault():
         # on a busy machine reading takes longer than the loop may stand still for it
-        while 'still being read' in (refused := str(loop.set_parameters(
+        while 'still being read' in (rejected := str(loop.set_parameters(
                 'controller', model=str(file)))):
             pass
-        loop.expect(refused == '[]', f'the model was refused: {refused}')
+        loop.expect(rejected == '[]', f'the model was rejected: {rejected}')
 
 
 def modes_in_a_step(loop: FaultHarness) -> None:

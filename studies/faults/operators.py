@@ -91,8 +91,8 @@ def drawn(seed: int, ranges: Mapping[str, tuple[float, float]], exponents: bool 
 
 
 def storm_of_parameters(loop: FaultHarness, make: Callable[[], Iterable[Mapping[str, Any]]],
-                        refused: bool = False) -> None:
-    """Change a controller's parameters as fast as it goes, all of which are taken or refused."""
+                        rejected: bool = False) -> None:
+    """Change a controller's parameters as fast as it goes, all of which are taken or rejected."""
     with loop.fault():
         loop.request(*loop.on.other)
         changes = list(make())
@@ -101,16 +101,16 @@ def storm_of_parameters(loop: FaultHarness, make: Callable[[], Iterable[Mapping[
         seconds = time.monotonic() - started
         loop.trace.notes.append(f'{len(answers)} changes at {len(answers) / seconds:.0f} 1/s')
         results = [result for answer in answers for result in answer.results]
-        if refused:
+        if rejected:
             taken = sum(result.successful for result in results)
             loop.expect(taken == 0, f'{taken} bad values were taken')
-            loop.expect(all(result.reason for result in results), 'refused without a reason')
+            loop.expect(all(result.reason for result in results), 'rejected without a reason')
         else:
             reasons = {result.reason for result in results if not result.successful}
-            loop.expect(not reasons, f'good values were refused: {sorted(reasons)[:2]}')
+            loop.expect(not reasons, f'good values were rejected: {sorted(reasons)[:2]}')
             last = loop.set_parameters('controller', **{
                 name: loop.on.default(name) for change in changes[:1] for name in change})
-            loop.expect(not last, f'the defaults were refused: {last}')
+            loop.expect(not last, f'the defaults were rejected: {last}')
 
 
 def storm_of_setpoints(loop: FaultHarness, asked: tuple[Mapping[str, float], ...]) -> None:
@@ -187,7 +187,7 @@ def out_of_reach(loop: FaultHarness) -> None:
     """Request a set-point outside the trained range; the previous one stays."""
     with loop.fault():
         loop.ask(temperature=120.0)
-        loop.wait_for_report('request refused')
+        loop.wait_for_report('request rejected')
 
 
 def limited(loop: FaultHarness) -> None:
@@ -195,8 +195,8 @@ def limited(loop: FaultHarness) -> None:
     name = f'mpc.{reactor.TEMPERATURE}.max'
     limits: list[JointState] = loop.ros.listen(JointState, topics.ACTIVE_CONSTRAINTS)
     with loop.fault():
-        refused = loop.set_parameters('controller', **{name: LIMIT})
-        loop.expect(not refused, f'the limit was refused: {refused}')
+        rejected = loop.set_parameters('controller', **{name: LIMIT})
+        loop.expect(not rejected, f'the limit was rejected: {rejected}')
         loop.run_for(120.0)
         since = loop.now
         loop.run_for(120.0)

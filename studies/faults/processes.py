@@ -47,7 +47,7 @@ def plant_reset(loop: FaultHarness) -> None:
     """Put the plant back to where it started."""
     with loop.fault():
         answer = loop.ros.trigger('plant/reset')
-        loop.expect(answer.success, f'the reset was refused: {answer.message}')
+        loop.expect(answer.success, f'the reset was rejected: {answer.message}')
 
 
 def controller_again(loop: FaultHarness, setpoint: tuple[float, ...] = (), dead: float = 0.0
@@ -134,10 +134,10 @@ def reload(loop: FaultHarness, spoil: str) -> None:
     file = loop.folder / 'lift.safetensors'
     shutil.copy(model_path('reactor_nz4'), file)
     # on a busy machine reading takes longer than the loop may stand still for it
-    while 'still being read' in (refused := str(loop.set_parameters(
+    while 'still being read' in (rejected := str(loop.set_parameters(
             'controller', model=str(file)))):
         pass
-    loop.expect(refused == '[]', f'the model was refused: {refused}')
+    loop.expect(rejected == '[]', f'the model was rejected: {rejected}')
     with loop.fault():
         if spoil == 'deleted':
             file.unlink()
@@ -149,7 +149,7 @@ def reload(loop: FaultHarness, spoil: str) -> None:
             shutil.copy(model_path('reactor_nz3'), file)
         answer = loop.ros.trigger('controller/reload_model')
         if spoil == 'changed':
-            loop.expect(answer.success, f'the reload was refused: {answer.message}')
+            loop.expect(answer.success, f'the reload was rejected: {answer.message}')
         else:
             loop.expect(not answer.success, 'a spoilt model was accepted')
             loop.expect('the current model is kept' in answer.message,

@@ -189,8 +189,8 @@ def no_plug_in(loop: FaultHarness) -> None:
     """Name objects that are not laws or estimators, or that end a process, while the loop runs."""
     with loop.fault():
         for change in _NO_PLUG_INS:
-            refused = loop.set_parameters('controller', **change)
-            loop.expect(bool(refused) and all(refused), f'{change} was taken')
+            rejected = loop.set_parameters('controller', **change)
+            loop.expect(bool(rejected) and all(rejected), f'{change} was taken')
             loop.run_for(5.0)
 
 
@@ -265,7 +265,7 @@ def open_loop(loop: FaultHarness) -> None:
 
 
 def demo(loop: FaultHarness) -> None:
-    """Start the demo in the domain of a loop: it refuses, and names the domain."""
+    """Start the demo in the domain of a loop: it rejects, and names the domain."""
     domain = loop.ros.environment['ROS_DOMAIN_ID']
     with loop.fault():
         # its results go there

@@ -155,7 +155,7 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
             try:
                 model = LEARNERS[label](plant, given, seed).model if label in _POLYNOMIALS else (
                     train(plant, given, RECIPES[label](case.system.n_x), seed=seed, starts=1,
-                          refuse=False).model)
+                          reject=False).model)
             except TrainingFailed:
                 figures[figure] = None
                 continue

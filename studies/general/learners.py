@@ -22,7 +22,7 @@ class Learned:
 
     model: LiftedModel
     seconds: float  #: of the processor, of a training that decides by itself
-    refused: str | None = None  #: why it was refused, or ''; None for a class that never is
+    rejected: str | None = None  #: why it was rejected, or ''; None for a class that never is
 
 
 Learner: TypeAlias = Callable[[PlantDescription, DriftSamples, int], Learned]
@@ -75,14 +75,14 @@ def _trained(recipe: Callable[[int], Recipe]) -> Learner:
         made = recipe(samples.x.shape[1])
         begin = time.process_time()
         try:
-            refused, model = '', train(plant, samples, made, seed=seed, starts=1).model
+            rejected, model = '', train(plant, samples, made, seed=seed, starts=1).model
         except TrainingFailed as error:
-            refused = str(error)
+            rejected = str(error)
         seconds = time.process_time() - begin
-        if refused:
-            # the same once more, to see what the refusal is worth
-            model = train(plant, samples, made, seed=seed, starts=1, refuse=False).model
-        return Learned(model, seconds, refused)
+        if rejected:
+            # the same once more, to see what the rejection is worth
+            model = train(plant, samples, made, seed=seed, starts=1, reject=False).model
+        return Learned(model, seconds, rejected)
 
     return learn
 

@@ -87,7 +87,7 @@ def _acceptance(cases: Mapping[str, Models]) -> str:
             pairs.count(pair) for pair in ((True, True), (True, False),
                                            (False, True), (False, False)))))
     return table(('trained models', 'accepted, law held', 'accepted, law missed',
-                  'refused, law held', 'refused, law missed'), rows)
+                  'rejected, law held', 'rejected, law missed'), rows)
 
 
 def _draw(cases: Mapping[str, Models], path: Path) -> Picture:
@@ -127,4 +127,4 @@ def _draw(cases: Mapping[str, Models], path: Path) -> Picture:
     return Picture(path.name, (
         'Cost on the true plant over that of the better law that knows it, at the worst of '
         f'{STARTS} starts, by the error of the learned drift; a point a model and seed. Crosses: '
-        'the plant did not arrive from every start. Hollow: training refused the model.'))
+        'the plant did not arrive from every start. Hollow: training rejected the model.'))

@@ -53,7 +53,7 @@ def predicted(case: Regulation, learned: Learned, held_out: DriftSamples) -> Met
     return {'rw': found.rw, 'rx': found.rx,
             'rollout': None if error is None else float(np.max(error / case.units[0])),
             'seconds': learned.seconds,
-            'accepted': None if learned.refused is None else not learned.refused}
+            'accepted': None if learned.rejected is None else not learned.rejected}
 
 
 EXPERIMENTS: dict[str, Experiment] = {name: partial(run, name) for name in CASES}

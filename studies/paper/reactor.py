@@ -115,7 +115,7 @@ def run(seed: int) -> tuple[Metrics, Models]:
     """
     samples, plant = training_samples(seed), describe(SYSTEM)
     models = {f'nz={model.n_z}': model for model in learning.train(
-        plant, samples, RECIPE, seed=seed, starts=STARTS, refuse=False).path}
+        plant, samples, RECIPE, seed=seed, starts=STARTS, reject=False).path}
     models['linear'] = learning.Linearisation(SYSTEM.drift_jacobian(SYSTEM.nominal_state)).learn(
         plant, samples)
     models['edmd'] = learning.Edmd(EDMD_DEGREE).learn(plant, samples)
@@ -133,7 +133,7 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
         try:
             models[f'nz={n_z}'] = learning.train(
                 describe(SYSTEM), samples, learning.Algorithm1(n_z, max_iterations=100), seed=seed,
-                starts=1, refuse=False).model
+                starts=1, reject=False).model
         except learning.TrainingFailed:
             continue
     return _all_judged(models, seed), {f'paper_{name}': model for name, model in models.items()}

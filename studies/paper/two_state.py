@@ -151,7 +151,7 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
 def _learned(data: DriftSamples, recipe: learning.IncrementalTraining | learning.Algorithm1,
              seed: int, starts: int = 1) -> LiftedModel:
     return learning.train(describe(SYSTEM), data, recipe, seed=seed, starts=starts,
-                          refuse=False).model
+                          reject=False).model
 
 
 def judged(model: LiftedModel, seed: int) -> Metrics:

@@ -42,9 +42,9 @@ class Own:
         """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""
         if self._setpoint is None or (setpoint != self._setpoint).any():
             self._setpoint = setpoint
-            self._state, refused = self._controller.request_setpoint(self._state, setpoint)
-            if refused is not None:
-                raise ValueError(f'the set-point {setpoint.tolist()} is refused: {refused}')
+            self._state, rejected = self._controller.request_setpoint(self._state, setpoint)
+            if rejected is not None:
+                raise ValueError(f'the set-point {setpoint.tolist()} is rejected: {rejected}')
         self._state, command, _ = self._controller.step(
             self._state, y, after_a_second(self._number * self._period_ns))
         self._number += 1

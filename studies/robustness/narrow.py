@@ -64,7 +64,7 @@ def reactor_courses() -> dict[tuple[str, str], Simulation]:
     # an hour of steps within 1.5 K of the steady state
     samples = box_episodes(REACTOR, DESIGN, 60, 1.0, 0)
     lift = train(describe(REACTOR), samples, IncrementalTraining(3), seed=0, starts=1,
-                 refuse=False).model
+                 reject=False).model
     return {(trial.name, kind): trial.run(loop.reactor_controller(
         bandwidth=trial.bandwidth, fallback=fallback, model=model)) for trial in TRIALS
         for kind, model, fallback in (('narrow', lift, False), ('guarded', lift, True),
@@ -93,7 +93,7 @@ def two_state_courses() -> dict[tuple[str, str], Simulation]:
     models = {name: train(
         describe(system), two_state.samples(box, 0),
         two_state.WIDE_RECIPE if name == 'wide' else two_state.NARROW_RECIPE, seed=0, starts=1,
-        refuse=False).model for name, box in boxes.items()}
+        reject=False).model for name, box in boxes.items()}
     models['true linearisation'] = Linearisation(system.drift_jacobian(np.zeros(2))).learn(
         describe(system), two_state.samples(two_state.WIDE, 0, episodes=5))
     return {(name, kind): _two_state_course(model, fallback=kind == 'guarded')
@@ -108,7 +108,7 @@ def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
         safe_value=np.zeros(1), bumpless_transfer_time=1.0,
         **({'recovery_time': 1.0} if fallback else loop.NO_FALLBACK)))
 
-    # put into the controller's state, since it refuses set-points outside its data
+    # put into the controller's state, since it rejects set-points outside its data
     def to_origin(before: evaluation.Loop) -> evaluation.Loop:
         origin = control.Setpoint(np.zeros(2), np.zeros(2))
         return replace(before, state=replace(before.state, setpoint=origin))

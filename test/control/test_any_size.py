@@ -133,28 +133,28 @@ def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
                     share = 0.5 + np.clip(values[:len(r)], -3.0, 3.0) / 6.0
                     r = asked_of.lower + share * (asked_of.upper - asked_of.lower)
                 when = now * (kind == 'schedule')
-                asked, refused = loop.request_setpoint(state, r, when, signals)
+                asked, rejected = loop.request_setpoint(state, r, when, signals)
                 inside = asked_of.violation(r) == 0.0
-                if refused is None:
+                if rejected is None:
                     assert inside
                 else:
                     assert asked is state
-                    assert not inside or refused.code in (
+                    assert not inside or rejected.code in (
                         StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_SETPOINT_HELD,
                         StatusCode.SETPOINT_UNMEASURED)
-                if refused is not None and refused.code is StatusCode.SETPOINT_NOT_HELD:
+                if rejected is not None and rejected.code is StatusCode.SETPOINT_NOT_HELD:
                     # what is named as the nearest one can be asked for
-                    held = dict(refused.values['held'])
+                    held = dict(rejected.values['held'])
                     assert loop.controlled.only(tuple(held)).violation(
                         np.array(list(held.values()))) == 0.0
                     assert loop.request_setpoint(
                         state, np.array(list(held.values())), when, tuple(held))[1] is None
                 state = asked
             case 'manual':
-                asked, refused = loop.request_manual_input(state, u)
-                assert (refused is None) == (
+                asked, rejected = loop.request_manual_input(state, u)
+                assert (rejected is None) == (
                     state.mode is Mode.MANUAL and bool(np.all(np.isfinite(u))))
-                assert refused is None or asked is state
+                assert rejected is None or asked is state
                 state = asked
             case 'mode':
                 state = loop.set_mode(state, Mode.MANUAL if values[0] > 0.0 else Mode.AUTOMATIC)
@@ -187,8 +187,8 @@ def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
     block = expm(np.block([[A, np.eye(n)], [np.zeros((n, 2 * n))]]) / 60.0)
     motion, integral = block[:n, :n], block[:n, n:]
     wanted = model.states.to_physical(np.full(n, 0.4))
-    state, refused = loop.request_setpoint(State(), wanted)
-    assert refused is None
+    state, rejected = loop.request_setpoint(State(), wanted)
+    assert rejected is None
     x = np.zeros(n)
     for k in range(600):
         state, command, report = loop.step(
@@ -199,7 +199,7 @@ def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
     np.testing.assert_allclose(state.estimate.w, load, rtol=0, atol=1e-5)
 
 
-def test_an_array_of_another_size_is_refused():
+def test_an_array_of_another_size_is_rejected():
     good = tuned(random_lift(2, n_u=2))
     for name in ('state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
                  'tracking_tolerance', 'safe_value'):

@@ -41,8 +41,8 @@ def test_commands_are_those_of_the_inverted_characteristic(law):
             commands.append(command)
         if k == 5:
             for i, controller in enumerate((curved, straight)):
-                states[i], refusal = controller.request_setpoint(states[i], np.array([1.4]))
-                assert refusal is None
+                states[i], rejection = controller.request_setpoint(states[i], np.array([1.4]))
+                assert rejection is None
         # published and limited as the input, acting as its effect
         assert VALVE.effect(commands[0]) == pytest.approx(commands[1], rel=1e-6, abs=1e-6)
         assert commands[0] != pytest.approx(commands[1], abs=1e-3) or k == 1

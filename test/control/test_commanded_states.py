@@ -43,8 +43,8 @@ def run(model, count=60, goal=0.5, late=0, manual=None, **tuning):
     state, x, path, commands, reports = State(), 0.0, [], [0.0] * late, []
     for k in range(1, count):
         if k == 5:
-            state, refusal = controller.request_setpoint(state, np.array([goal]))
-            assert refusal is None
+            state, rejection = controller.request_setpoint(state, np.array([goal]))
+            assert rejection is None
         if manual is not None and k in manual:
             state = controller.set_mode(state, manual[k])
         state, command, report = controller.step(state, np.array([x]), k * round(

@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, State, Tuning
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
+from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, rejection, request, Setpoint
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
@@ -37,8 +37,8 @@ def started(loop=None, *requests):
     loop = loop or controller()
     state = loop.step(State(), np.array([START]), NOW)[0]
     for kelvin, *effective_ns in requests:
-        state, refused = loop.request_setpoint(state, np.array([kelvin]), *effective_ns)
-        assert refused is None
+        state, rejected = loop.request_setpoint(state, np.array([kelvin]), *effective_ns)
+        assert rejected is None
     return state
 
 
@@ -210,9 +210,9 @@ def test_a_hold_without_measurements_rejects_setpoints():
         held, command, report = loop.hold(state, NOW + 20 * SECOND, cause)
         assert (report.level, report.reason.code) == ('hold', cause)
         np.testing.assert_array_equal(command, state.command)
-        same, refused = loop.request_setpoint(held, np.array([316.0]))
+        same, rejected = loop.request_setpoint(held, np.array([316.0]))
         assert same is held
-        assert (refused.code, refused.cause.code) == (StatusCode.SETPOINT_UNMEASURED, cause)
+        assert (rejected.code, rejected.cause.code) == (StatusCode.SETPOINT_UNMEASURED, cause)
         # what lies ahead may be tracked then, and what is measured again is
         assert loop.request_setpoint(held, np.array([316.0]), NOW + 60 * SECOND)[1] is None
         again = measured(loop, held, START, 21)[0]
@@ -239,11 +239,11 @@ def test_a_manual_command_moves_at_the_rate_limit_without_measurements():
 def test_a_full_schedule_rejects_later_setpoints_but_not_immediate_ones():
     loop = controller()
     state = started(loop, *((316.0, NOW + (n + 1) * SECOND) for n in range(1000)))
-    full, refused = loop.request_setpoint(state, np.array([317.0]), NOW + 2000 * SECOND)
+    full, rejected = loop.request_setpoint(state, np.array([317.0]), NOW + 2000 * SECOND)
     assert full is state
-    assert say(refused).startswith('1000 set-points are already scheduled')
-    state, refused = loop.request_setpoint(state, np.array([317.0]))
-    assert refused is None
+    assert say(rejected).startswith('1000 set-points are already scheduled')
+    state, rejected = loop.request_setpoint(state, np.array([317.0]))
+    assert rejected is None
     np.testing.assert_array_equal(state.setpoint.requested, [317.0])
 
 
@@ -253,8 +253,8 @@ def manual(loop, *commands, state=None):
     """Return a state in manual mode after commands of the operator."""
     state = loop.set_mode(started(loop) if state is None else state, Mode.MANUAL)
     for kelvin in commands:
-        state, refused = loop.request_manual_input(state, np.array([kelvin]))
-        assert refused is None
+        state, rejected = loop.request_manual_input(state, np.array([kelvin]))
+        assert rejected is None
     return state
 
 
@@ -318,7 +318,7 @@ def test_the_mode_changes_between_operator_and_law():
     ('', 'state_weight', 'heavy'), ('', 'learned_model_margin', -0.1), ('', 'hold_timeout', -1.0),
     ('', 'recovery_time', math.nan), ('', 'fallback_order', ()),
     ('', 'fallback_order', ('sdre', 'sdre'))])
-def test_a_tuning_that_makes_no_sense_is_refused(part, name, value):
+def test_a_tuning_that_makes_no_sense_is_rejected(part, name, value):
     loop = controller()
     tuning = loop.tuning
     changed = replace(tuning, **{name: value}) if not part else replace(
@@ -327,14 +327,14 @@ def test_a_tuning_that_makes_no_sense_is_refused(part, name, value):
         replace(loop, tuning=changed)
 
 
-def test_margins_in_the_wrong_order_are_refused():
+def test_margins_in_the_wrong_order_are_rejected():
     loop = controller()
     with pytest.raises(ValueError, match='margin'):
         replace(loop, tuning=replace(loop.tuning, learned_model_margin=2.0))
 
 
 @pytest.mark.parametrize('part', ['limits', 'sensor'])
-def test_limits_in_the_wrong_order_are_refused(part):
+def test_limits_in_the_wrong_order_are_rejected(part):
     loop = controller()
     wrong = replace(getattr(loop.tuning, part), lower=400.0, upper=300.0)
     with pytest.raises(ValueError, match=r'must be lower < upper, got \[400'):
@@ -380,9 +380,9 @@ def schedule(setpoint):
         300.0, 330.123, np.nextafter(MODEL.states.lower[0], 0.0),
         np.nextafter(MODEL.states.upper[0], np.inf))),
     *((value, StatusCode.SETPOINT_NOT_FINITE) for value in (np.nan, np.inf, -np.inf))])
-def test_a_setpoint_outside_the_training_range_is_refused(value, code):
-    refused = refusal(MODEL.states, kelvin(value))
-    assert (refused and refused.code) is code
+def test_a_setpoint_outside_the_training_range_is_rejected(value, code):
+    rejected = rejection(MODEL.states, kelvin(value))
+    assert (rejected and rejected.code) is code
 
 
 @pytest.mark.parametrize(('effective_ns', 'waits'), [
@@ -476,7 +476,7 @@ def test_the_filter_follows_a_step_with_its_time_constant():
     (lambda loop, state: loop.request_manual_input(loop.set_mode(state, Mode.MANUAL), []),
      'incompatible manual input: expected one number for each of coolant_temperature, got ')],
     ids=['measurement', 'no list', 'applied', 'found', 'set-point', 'manual'])
-def test_another_size_is_refused(act, message):
+def test_another_size_is_rejected(act, message):
     loop = controller()
     with pytest.raises(ValueError, match=message):
         act(loop, started(loop))

@@ -142,24 +142,24 @@ def test_each_level_is_reached_along_its_rate_and_home_at_the_end(
     ((math.nan, 2e5), 'the measured temperature is nan, not finite: check the sensor'),
     ((315.0, -math.inf), 'the measured pressure is -inf, not finite'),
 ])
-def test_a_bad_measurement_aborts_and_refuses_a_start(
+def test_a_bad_measurement_aborts_and_rejects_a_start(
         measured: tuple[float, float], words: str | None) -> None:
     y = np.array(measured)
     write = StatusFormatter(Displays({'temperature': 'K', 'pressure': 'Pa'}))
     # a stamp heard before moves nothing, but what it carries counts
     for time_ns in (START + SECOND, START):
         after = advance(PAIR, begin(PAIR, START), y, time_ns)
-        assert (PAIR.refusal(y) is None) == (words is None)
+        assert (PAIR.rejection(y) is None) == (words is None)
         assert after.phase is (ExperimentPhase.RUNNING if words is None
                                else ExperimentPhase.ABORTED)
         if words is not None:
-            assert words in write(PAIR.refusal(y))
+            assert words in write(PAIR.rejection(y))
             assert words in write(after.reason)
 
 
-def test_a_measurement_of_another_number_of_signals_is_refused() -> None:
+def test_a_measurement_of_another_number_of_signals_is_rejected() -> None:
     with pytest.raises(ValueError, match='shorter'):
-        PAIR.refusal(INSIDE)
+        PAIR.rejection(INSIDE)
 
 
 @pytest.mark.parametrize(('bad', 'last'), [((400.0, 2e5), (299.5, 0.4)),
@@ -229,7 +229,7 @@ def test_a_repeated_stamp_moves_nothing_a_clock_set_back_aborts_and_a_gap_is_cut
     ({'duration': math.inf}, 'duration = inf s must be finite and above 0'),
     ({'rate': np.array([1.0, 0.0])}, 'valve: rate = 0.0 must be above 0'),
 ])
-def test_contradicting_limits_are_refused(change: dict[str, Any], words: str) -> None:
+def test_contradicting_limits_are_rejected(change: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         replace(PAIR, **change)
 

@@ -345,6 +345,6 @@ def test_a_law_that_is_predicted_unstable_is_not_used():
         # a gain for continuous time under a sample a second
         patched.setattr(riccati, 'feedback', lambda *arguments, interval, **bounds: feedback(
             *arguments, **bounds))
-        refused = law.compute(estimate, setpoint_target(model), None, 1.0, None)
-    assert refused.failure.code is StatusCode.PREDICTED_UNSTABLE
-    assert refused.failure.values['interval'] == 1.0
+        rejected = law.compute(estimate, setpoint_target(model), None, 1.0, None)
+    assert rejected.failure.code is StatusCode.PREDICTED_UNSTABLE
+    assert rejected.failure.values['interval'] == 1.0

@@ -154,15 +154,15 @@ def test_a_model_takes_over_and_a_record_keeps_the_disturbance():
 
 def test_a_set_point_is_feasible_where_the_feed_allows_it():
     loop = controller()
-    for kelvin, refused in ((NOMINAL, False), (NOMINAL + 60.0, True)):
+    for kelvin, rejected in ((NOMINAL, False), (NOMINAL + 60.0, True)):
         state = loop.step(loop.initialise(State(), np.array([290.0])), np.array([START]), SECOND,
                           disturbances=np.array([kelvin]))[0]
         state = replace(state, estimate=replace(state.estimate, w=np.zeros(1)))
         why = loop.request_setpoint(state, np.array([START - 12.0]))[1]
-        assert (why is not None) is refused
+        assert (why is not None) is rejected
 
 
-def test_another_number_of_disturbances_is_refused():
+def test_another_number_of_disturbances_is_rejected():
     with pytest.raises(ValueError, match='one number for each of feed_temperature, got'):
         controller().step(State(), np.array([START]), SECOND, disturbances=np.ones(2))
 

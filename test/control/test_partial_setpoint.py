@@ -79,8 +79,8 @@ def disturbed(controller, x, w):
 def test_one_of_two_levels_is_held_under_a_disturbance(w):
     controller = loop(SERIES, 'h2')
     state = disturbed(controller, [1.0, 1.0], w)
-    state, refused = asked(controller, 1.4, state)
-    assert refused is None
+    state, rejected = asked(controller, 1.4, state)
+    assert rejected is None
     target = controller.levels['sdre'].target(
         np.array([1.4]), state.estimate.w, None)
     # 0.2 (h1 - 1) = 0.1 * 0.4 - w2 and 0.1 (q - 3) = 0.2 (h1 - 1) - w1
@@ -111,8 +111,8 @@ def test_an_input_makes_up_for_another_at_its_limit():
         np.array([1.65]), np.zeros(2), None)
     np.testing.assert_allclose(BOTH.inputs.to_physical(target.u), [3.45, 3.2], atol=1e-9)
     # both together reach 0.5 + 0.2
-    refused = asked(controller, 1.9)[1]
-    assert refused.values['nearest'] == pytest.approx(1.7, abs=1e-6)
+    rejected = asked(controller, 1.9)[1]
+    assert rejected.values['nearest'] == pytest.approx(1.7, abs=1e-6)
 
 
 def parabola(**others):
@@ -131,8 +131,8 @@ def parabola(**others):
 @pytest.mark.parametrize('y', [0.01, 0.25, 1.0, 2.25, 3.9])
 def test_a_steady_state_that_is_not_linear_in_the_setpoint(y):
     controller = parabola()
-    state, refused = asked(controller, y)
-    assert refused is None
+    state, rejected = asked(controller, y)
+    assert rejected is None
     report = stepped(controller, state, [1.0, 1.0], 0)[2]
     np.testing.assert_allclose(report.target.state, [math.sqrt(y), y], rtol=0, atol=1e-8)
     np.testing.assert_allclose(report.target.input, [math.sqrt(y)], rtol=0, atol=1e-8)
@@ -151,8 +151,8 @@ def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
     controller = parabola()
     # y = x^2 + w2 is never below w2
     state = disturbed(controller, [1.0, 1.0], [0.0, 0.0])
-    state, refused = asked(controller, 0.5, state)
-    assert refused is None
+    state, rejected = asked(controller, 0.5, state)
+    assert rejected is None
     state = replace(state, estimate=Estimate(state.estimate.x, np.array([0.0, 0.7])))
     state, command, report = controller.step(
         state, np.array([1.0, 1.0]), EPOCH + SECOND // 1000)
@@ -163,10 +163,10 @@ def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
     # the linearised model has one: 2 xi - eta + w2 = 0
     np.testing.assert_allclose(report.target.setpoint, [0.5])
     assert report.target.state[0] == pytest.approx(1.0 + 0.5 * (-0.5 - 0.7), abs=0.01)
-    refused = asked(controller, -0.5)[1]
-    assert (refused.code, refused.values['cause'].code) == (
+    rejected = asked(controller, -0.5)[1]
+    assert (rejected.code, rejected.values['cause'].code) == (
         StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_STEADY_STATE)
-    assert refused.values['nearest'] == pytest.approx(0.0, abs=1e-3)
+    assert rejected.values['nearest'] == pytest.approx(0.0, abs=1e-3)
 
 
 # What cannot be held.
@@ -184,33 +184,34 @@ def test_a_rejection_names_the_nearest_level_and_the_required_pump_input(
         value, upper, w, needed, nearest):
     controller = loop(SERIES, 'h2', lower=2.5, upper=upper)
     state = disturbed(controller, [1.0, 1.0], [w, 0.0])
-    same, refused = asked(controller, value, state)
+    same, rejected = asked(controller, value, state)
     assert same is state
-    assert refused.code is StatusCode.SETPOINT_NOT_HELD
-    assert (refused.values['signal'], refused.values['value']) == ('h2', value)
-    assert refused.values['nearest'] == pytest.approx(nearest, abs=1e-5)
-    why = refused.cause
+    assert rejected.code is StatusCode.SETPOINT_NOT_HELD
+    assert (rejected.values['signal'], rejected.values['value']) == ('h2', value)
+    assert rejected.values['nearest'] == pytest.approx(nearest, abs=1e-5)
+    why = rejected.cause
     assert (why.code, why.values['signal']) == (StatusCode.INPUT_NEEDED, 'q1')
     assert (why.values['lower'], why.values['upper']) == (2.5, upper)
     assert why.values['value'] == pytest.approx(needed, abs=1e-9)
-    assert asked(controller, refused.values['nearest'], state)[1] is None
+    assert asked(controller, rejected.values['nearest'], state)[1] is None
 
 
-def test_another_level_that_would_overflow_refuses_too():
+def test_another_level_that_would_overflow_rejects_too():
     # h1 - 1 = (0.1 (h2 - 1) - w2) / 0.2 may go to 2 m and by the margin of 0.1 half-ranges beyond
     controller = loop(SERIES, 'h2', lower=-9.0, upper=9.0)
     state = disturbed(controller, [1.0, 1.0], [0.0, -0.2])
-    refused = asked(controller, 1.6, state)[1]
-    assert refused.code is StatusCode.SETPOINT_NOT_HELD
-    assert (refused.cause.code, refused.cause.values['signal']) == (StatusCode.STATE_LEAVES, 'h1')
-    assert refused.cause.values['value'] == pytest.approx(2.3, abs=1e-9)
-    assert refused.values['nearest'] == pytest.approx(1.2, abs=1e-5)
+    rejected = asked(controller, 1.6, state)[1]
+    assert rejected.code is StatusCode.SETPOINT_NOT_HELD
+    assert rejected.cause.code is StatusCode.STATE_LEAVES
+    assert rejected.cause.values['signal'] == 'h1'
+    assert rejected.cause.values['value'] == pytest.approx(2.3, abs=1e-9)
+    assert rejected.values['nearest'] == pytest.approx(1.2, abs=1e-5)
 
 
 def test_a_limit_tightened_afterwards_withdraws_nothing():
     wide, narrow = loop(SERIES, 'h2'), loop(SERIES, 'h2', upper=3.5)
-    state, refused = asked(wide, 1.9)
-    assert refused is None
+    state, rejected = asked(wide, 1.9)
+    assert rejected is None
     state = stepped(wide, state, [1.0, 1.0], 0)[0]
     state = narrow.switch_to(wide, state)
     state, command, report = stepped(narrow, state, [1.0, 1.0], 1)
@@ -222,10 +223,10 @@ def test_every_level_with_one_pump_has_to_be_a_steady_state():
     controller = loop(SERIES)
     # 2 (h1 - 1) = h2 - 1
     assert asked(controller, [1.2, 1.4])[1] is None
-    refused = asked(controller, [1.4, 1.4])[1]
-    assert (refused.code, refused.cause.code) == (
+    rejected = asked(controller, [1.4, 1.4])[1]
+    assert (rejected.code, rejected.cause.code) == (
         StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_STEADY_STATE)
-    held = dict(refused.values['held'])
+    held = dict(rejected.values['held'])
     # the foot of the perpendicular: (0.4, 0.4) . (1, 2) / 5 = 0.24
     assert held == pytest.approx({'h1': 1.24, 'h2': 1.48}, abs=1e-4)
 
@@ -234,12 +235,12 @@ def test_the_nearest_of_two_levels_is_that_of_least_squares():
     # q1 - 3 = h1 - 1 = a and q2 - 3 = b = (h2 - 1) - a: with b at 0.2, a^2 + (a + 0.2 - 0.9)^2 is
     # least at a = 0.35
     controller = loop(BOTH, upper=[3.5, 3.2])
-    refused = asked(controller, [1.0, 1.9])[1]
-    assert dict(refused.values['held']) == pytest.approx({'h1': 1.35, 'h2': 1.55}, abs=1e-5)
+    rejected = asked(controller, [1.0, 1.9])[1]
+    assert dict(rejected.values['held']) == pytest.approx({'h1': 1.35, 'h2': 1.55}, abs=1e-5)
     # one alone leaves the other where it is
     state = stepped(controller, State(), [1.0, 1.0], 0)[0]
-    refused = asked(controller, 1.9, state, signals=('h2',))[1]
-    assert dict(refused.values['held']) == pytest.approx({'h1': 1.0, 'h2': 1.2}, abs=1e-5)
+    rejected = asked(controller, 1.9, state, signals=('h2',))[1]
+    assert dict(rejected.values['held']) == pytest.approx({'h1': 1.0, 'h2': 1.2}, abs=1e-5)
 
 
 # Several signals.
@@ -247,11 +248,11 @@ def test_the_nearest_of_two_levels_is_that_of_least_squares():
 def test_a_setpoint_for_one_of_two_signals_keeps_the_other():
     controller = loop(THREE, 'h2', 'h3')
     state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
-    state, refused = asked(controller, 1.3, state, signals=('h3',))
-    assert refused is None
+    state, rejected = asked(controller, 1.3, state, signals=('h3',))
+    assert rejected is None
     np.testing.assert_array_equal(state.setpoint.requested, [1.0, 1.3])
-    state, refused = asked(controller, [0.9, 1.2], state, signals=('h3', 'h2'))
-    assert refused is None
+    state, rejected = asked(controller, [0.9, 1.2], state, signals=('h3', 'h2'))
+    assert rejected is None
     np.testing.assert_array_equal(state.setpoint.requested, [1.2, 0.9])
     report = stepped(controller, state, [1.0, 1.0, 1.0], 1)[2]
     # 0.05 (h2 - 1) - 0.1 (h3 - 1) + 0.1 (q2 - 3) = 0
@@ -259,21 +260,21 @@ def test_a_setpoint_for_one_of_two_signals_keeps_the_other():
     np.testing.assert_allclose(report.target.input, [3.2, 2.8], rtol=0, atol=1e-9)
 
 
-def test_one_signal_refused_is_brought_nearest_by_itself():
+def test_one_signal_rejected_is_brought_nearest_by_itself():
     # q2 - 3 = (h3 - 1) - 0.5 (h2 - 1) is at most 0.5
     controller = loop(THREE, 'h2', 'h3', upper=3.5)
     state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
-    state, refused = asked(controller, 1.4, state, signals=('h2',))
-    assert refused is None
-    refused = asked(controller, 1.9, state, signals=('h3',))[1]
-    assert refused.values['signal'] == 'h3'
-    assert dict(refused.values['held']) == pytest.approx({'h2': 1.4, 'h3': 1.7}, abs=1e-5)
+    state, rejected = asked(controller, 1.4, state, signals=('h2',))
+    assert rejected is None
+    rejected = asked(controller, 1.9, state, signals=('h3',))[1]
+    assert rejected.values['signal'] == 'h3'
+    assert dict(rejected.values['held']) == pytest.approx({'h2': 1.4, 'h3': 1.7}, abs=1e-5)
 
 
 def test_before_the_first_measurement_the_other_signal_stays_open():
     controller = loop(THREE, 'h2', 'h3')
-    state, refused = asked(controller, 1.3, signals=('h3',))
-    assert refused is None
+    state, rejected = asked(controller, 1.3, signals=('h3',))
+    assert rejected is None
     report = stepped(controller, state, [0.9, 1.1, 1.0], 0)[2]
     np.testing.assert_array_equal(report.target.setpoint, [1.1, 1.3])
 
@@ -283,13 +284,13 @@ def test_schedules_are_kept_per_signal():
     state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
     for value, second, signals in (
             ([1.1, 1.2], 2, None), (1.3, 4, ('h2',)), (1.4, 4, ('h3',)), (0.9, 6, ('h3',))):
-        state, refused = asked(controller, value, state, signals=signals,
+        state, rejected = asked(controller, value, state, signals=signals,
                                effective_ns=EPOCH + second * SECOND)
-        assert refused is None
+        assert rejected is None
     assert len(state.setpoint.scheduled) == 3
     # at once: this ends what was scheduled for h2, and leaves h3 what was
-    state, refused = asked(controller, 0.8, state, signals=('h2',))
-    assert refused is None
+    state, rejected = asked(controller, 0.8, state, signals=('h2',))
+    assert rejected is None
     for second in range(1, 8):
         state, _, report = stepped(controller, state, [1.0, 1.0, 1.0], second)
         tracked.append(report.target.setpoint.tolist())
@@ -322,7 +323,7 @@ def test_requests_that_fit_no_signal_are_errors(signals, value, message):
     (THREE, ('temperature',), 'some of the states h1, h2, h3, .* got temperature'),
     (tanks(-np.eye(3), np.ones((3, 1))), ('h1', 'h2'),
      r'2 signals \(h1, h2\): list')])
-def test_signals_that_cannot_be_controlled_are_refused(model, names, message):
+def test_signals_that_cannot_be_controlled_are_rejected(model, names, message):
     with pytest.raises(ValueError, match=message):
         loop(model, *names)
 
@@ -460,8 +461,8 @@ def test_of_more_states_than_inputs_behind_a_lag_the_target_is_a_compromise():
     spring = Controller(model, Tuning.for_model(model))
     assert spring.controlled.names == ('place', 'speed')
     state = spring.step(State(), np.zeros(2), 0)[0]
-    state, refusal = spring.request_setpoint(state, np.array([0.5, 0.0]))
-    assert refusal is None
+    state, rejection = spring.request_setpoint(state, np.array([0.5, 0.0]))
+    assert rejection is None
     x, period = np.zeros(3), 0.1
     ahead = expm(period * np.block([[A, B], [np.zeros((1, 4))]]))[:3]
     for k in range(1, 200):

@@ -112,8 +112,8 @@ def test_only_the_operator_clears_a_latched_safe_input():
     loop.run(5)
 
     def cleared():
-        state, refused = loop.loop.controller.clear_safe_state(loop.loop.state)
-        return state.supervisor, refused and refused.code
+        state, rejected = loop.loop.controller.clear_safe_state(loop.loop.state)
+        return state.supervisor, rejected and rejected.code
 
     assert cleared()[1] is StatusCode.NOT_LATCHED
     loop.loop = replace(loop.loop, state=replace(
@@ -314,8 +314,8 @@ def test_it_leads_back_from_either_side(side):
         limits=InputLimits(np.array([-9.0]), np.array([9.0]), np.ones(1)),
         observer_bandwidth=0.5, bumpless_transfer_time=5.0, safe_value=np.array([4.0 * side])))
     state = step.initialise(State(), np.array([4.0 * side]))
-    state, refused = step.request_setpoint(state, np.array([-0.5 * side]))
-    assert refused is None
+    state, rejected = step.request_setpoint(state, np.array([-0.5 * side]))
+    assert rejected is None
     x, shares = 4.0 * side + 0.2, []
     for second in range(1, 150):
         state, u, report = step.step(state, np.array([x]), second * SECOND)

@@ -32,6 +32,6 @@ def test_its_slope_is_that_of_its_segments():
 @pytest.mark.parametrize(('values', 'effects'), [
     ([0.0, 1.0, 2.0], [0.0, 1.0, 0.5]), ([0.0, 1.0], [1.0, 1.0]), ([0.0, 0.0], [0.0, 1.0]),
     ([0.0], [0.0]), ([], []), ([0.0, 1.0], [0.0]), ([0.0, np.nan], [0.0, 1.0])])
-def test_one_that_does_not_rise_is_refused(values, effects):
+def test_one_that_does_not_rise_is_rejected(values, effects):
     with pytest.raises(ValueError, match='characteristic'):
         Characteristic.of(values, effects)

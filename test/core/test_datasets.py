@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Episodes and samples: what acted when, how they are cut and split, and what is refused."""
+"""Episodes and samples: what acted when, how they are cut and split, and what is rejected."""
 
 from dataclasses import replace
 import math

@@ -37,7 +37,7 @@ def test_a_missing_field_is_named(field):
 
 
 @pytest.mark.parametrize('field', ['', '.x', 'x.', 'a b', 'data[', 'data[]', 'x..y', '3'])
-def test_field_that_is_no_path_is_refused(field):
+def test_field_that_is_no_path_is_rejected(field):
     with pytest.raises(ValueError, match='not the path'):
         MessageField('t', 'std_msgs/msg/Float64', field, '1')
 

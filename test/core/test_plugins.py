@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Code named by a parameter: whatever it raises or returns is a refusal with a sentence."""
+"""Code named by a parameter: whatever it raises or returns is a rejection with a sentence."""
 
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     f'plug_{name}:Law' for name in MODULES), 'json:dumps', 'os:getcwd', 'builtins:dict',
     'no.such:thing', ':x', 'sys:'])
 @pytest.mark.parametrize('parameter', ['fallback_order', 'estimator'])
-def test_law_or_estimator_that_is_none_is_refused(parameter: str, name: str) -> None:
+def test_law_or_estimator_that_is_none_is_rejected(parameter: str, name: str) -> None:
     table = table_of(load(model_path('reactor_nz4')))
     reason = table.check(table.snapshot({
         parameter: ('sdre', name) if parameter == 'fallback_order' else name}))
@@ -66,7 +66,7 @@ def test_law_or_estimator_that_is_none_is_refused(parameter: str, name: str) -> 
 @pytest.mark.parametrize(('parameter', 'value', 'missing'), [
     ('fallback_order', ('own_plugs:HalfLaw',), 'lacks compute'),
     ('estimator', 'own_plugs:HalfEstimator', 'lacks correct, restart')])
-def test_a_refusal_names_the_methods_that_a_class_lacks(
+def test_a_rejection_names_the_methods_that_a_class_lacks(
         parameter: str, value: object, missing: str) -> None:
     table = table_of(load(model_path('reactor_nz4')))
     assert missing in table.check(table.snapshot({parameter: value}))
@@ -74,13 +74,13 @@ def test_a_refusal_names_the_methods_that_a_class_lacks(
 
 @pytest.mark.usefixtures('modules')
 @pytest.mark.parametrize('name', ['Exits', 'Raises', 'nothing'])
-def test_plant_that_cannot_be_built_is_refused(name: str) -> None:
+def test_plant_that_cannot_be_built_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match=f'the plant {name} '):
         plants.build(plants.plant_class(f'own_plugs:{name}'), {})
 
 
 @pytest.mark.usefixtures('modules')
-def test_system_whose_module_exits_is_refused() -> None:
+def test_system_whose_module_exits_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"'plug_exits:Plant' cannot be loaded \(SystemExit"):
         PlantTable({'system': 'plug_exits:Plant'})
 

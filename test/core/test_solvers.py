@@ -101,9 +101,9 @@ def test_a_bound_on_the_gain(reach):
     assert solution.status is RiccatiStatus.SOLVED
     assert solution.gain > 2.0 / reach
     assert solve_riccati(*problem, max_gain=1.001 * solution.gain).status is RiccatiStatus.SOLVED
-    refused = solve_riccati(*problem, max_gain=0.999 * solution.gain)
-    assert refused.status is RiccatiStatus.GAIN_TOO_LARGE
-    assert refused.gain == solution.gain
+    rejected = solve_riccati(*problem, max_gain=0.999 * solution.gain)
+    assert rejected.status is RiccatiStatus.GAIN_TOO_LARGE
+    assert rejected.gain == solution.gain
 
 
 @pytest.mark.parametrize('exponent', range(3, 17))

@@ -155,7 +155,7 @@ def test_squared_innovations_match_the_stated_noise(factor, consistent):
     ([[-1.0, 0.0], [0.0, -0.5]], [[1.0], [0.0]], False),
     # the input does not reach what is measured: its rate has a disturbance of its own
     ([[-1.0, 0.0], [1.0, -0.5]], [[0.0], [1.0]], False)])
-def test_a_state_that_cannot_be_seen_is_refused(A, B, hidden):
+def test_a_state_that_cannot_be_seen_is_rejected(A, B, hidden):
     model = linear(A, B)
     if hidden:
         with pytest.raises(ValueError, match='do not determine the states x0, x1'):
@@ -376,16 +376,16 @@ def test_late_values_correct_the_filter_at_their_own_times_in_any_order(dead_tim
         now = state
         for time in order:
             value = model.states.center[1] + model.states.scale[1] * late[time]
-            now, refused = loop.take_analysis(now, model.states.names[1], value, round(
+            now, rejected = loop.take_analysis(now, model.states.names[1], value, round(
                 time * SECOND))
-            assert refused is None
+            assert rejected is None
         assert now.estimate.x == pytest.approx(estimate.x, abs=1e-9)
         assert now.estimate.w == pytest.approx(estimate.w, abs=1e-9)
         assert now.estimate.covariance == pytest.approx(estimate.covariance, rel=1e-7, abs=1e-12)
     for signal, time in ((1, 5.0), (0, 25.0)):
-        unchanged, refused = loop.take_analysis(
+        unchanged, rejected = loop.take_analysis(
             state, model.states.names[signal], model.states.center[signal], round(time * SECOND))
-        assert (unchanged, refused.code) == (state, StatusCode.ANALYSIS_REFUSED)
+        assert (unchanged, rejected.code) == (state, StatusCode.ANALYSIS_REJECTED)
     assert loop.set_mode(state, Mode.MANUAL).history == History()
 
 

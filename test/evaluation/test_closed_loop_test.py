@@ -126,7 +126,7 @@ def test_noise_is_in_the_loops_of_all_laws():
     assert off.excess == pytest.approx(quiet.excess, rel=0.1)
 
 
-def test_an_input_of_the_wrong_sign_is_refused():
+def test_an_input_of_the_wrong_sign_is_rejected():
     found = evaluate_closed_loops(two_states(-B), two_state_rate, loops=16)
     assert not found.accepted
     assert (found.loops, found.arrived, found.share_failed) == (16, 0, 1.0)
@@ -136,14 +136,14 @@ def test_an_input_of_the_wrong_sign_is_refused():
     assert len(repr(found)) < 300
 
 
-def test_a_model_without_a_gain_is_refused():
+def test_a_model_without_a_gain_is_rejected():
     """What drifts away in it is moved by no input."""
     found = evaluate_closed_loops(scalar(1.0, 0.0), linear_rate(1.0), loops=16)
     assert found.no_gain.all()
     assert '(16 without a gain), from level' in str(found)
 
 
-def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
+def test_a_law_that_fails_in_a_part_of_its_box_is_rejected_with_that_part():
     """
     The plant is dx/dt = 0.5 x + u, the model has -1.5 (x^3 + x^4) beside.
 
@@ -305,12 +305,12 @@ def test_a_model_keeps_the_loops_in_which_its_law_is_lost():
     (np.zeros((3, 2)), np.zeros((3, 1)), np.zeros(3)),
     (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)),
     (np.zeros((1025, 2)), np.zeros((1025, 2)), np.zeros(1025))])
-def test_tried_loops_that_do_not_fit_are_refused(starts, setpoints, lost):
+def test_tried_loops_that_do_not_fit_are_rejected(starts, setpoints, lost):
     with pytest.raises(ValueError, match='incompatible'):
         VerifiedLoops(starts, setpoints, lost)
 
 
-def test_tried_loops_of_another_plant_are_refused():
+def test_tried_loops_of_another_plant_are_rejected():
     tried = VerifiedLoops(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
     with pytest.raises(ValueError, match='incompatible verified_loops: expected 1 states, got 2'):
         replace(scalar(), verified_loops=tried)
@@ -325,8 +325,8 @@ def levels_on_the_way(model, levels, start, setpoint):
         linear_model_margin=1.0,
         recovery_time=0.5))
     x, h, found = np.array([start]), 0.05, []
-    state, refused = loop.request_setpoint(State(), np.array([setpoint]))
-    assert refused is None
+    state, rejected = loop.request_setpoint(State(), np.array([setpoint]))
+    assert rejected is None
     for k in range(200):
         state, u, report = loop.step(state, x, round(k * h * NANOSECONDS))
         x = math.exp(h) * x + (math.exp(h) - 1.0) * u

@@ -277,7 +277,7 @@ def test_a_simulation_ends_at_its_time_and_where_the_plant_cannot_continue():
     ({'duration': math.inf}, 'duration is inf s'),
     ({'period': 0.0}, r'period is 0\.0 s, must be finite and above 0'),
     ({'noise': np.ones(2)}, 'incompatible noise: expected one number for each of temperature')])
-def test_arguments_that_make_no_sense_are_refused(change, message):
+def test_arguments_that_make_no_sense_are_rejected(change, message):
     case = CASES['reactor_nz4']
     with pytest.raises(ValueError, match=message):
         simulate(controller(case), process(case), **{'duration': 5.0, **change})

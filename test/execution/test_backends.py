@@ -174,7 +174,7 @@ def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
 
 @pytest.mark.parametrize('text', [
     'joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
-def test_other_names_are_refused(text):
+def test_other_names_are_rejected(text):
     with pytest.raises(ValueError, match=f'executor is {text!r}, must be empty'):
         backend_of(text)
     table = trainer_table(None, {

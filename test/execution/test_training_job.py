@@ -62,7 +62,7 @@ def test_process_that_gets_a_signal(
     os.kill(job.process.pid, number)
     *_, state = follow(job)
     assert (state.text, state.ended) == (words, True)
-    assert (state.accepted, state.refused) == (False, False)
+    assert (state.accepted, state.rejected) == (False, False)
     assert state.share < 1.0
     job.close()
     assert job.process.returncode == code

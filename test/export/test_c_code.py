@@ -135,7 +135,7 @@ def test_the_export_command_rejects_unsupported_loops(
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_receding_horizon_law_and_a_high_degree_are_refused() -> None:
+def test_a_receding_horizon_law_and_a_high_degree_are_rejected() -> None:
     controller, _ = BUNDLED['reactor_nz4']
     with pytest.raises(ExportError, match='acados'):
         c_code(Controller(controller.model, replace(
@@ -164,7 +164,7 @@ def test_the_export_rejects_unsupported_features(
         c_code(built(table_of(learned).snapshot(given), learned), 1.0)
 
 
-def test_a_part_of_a_model_that_the_code_does_not_know_is_refused() -> None:
+def test_a_part_of_a_model_that_the_code_does_not_know_is_rejected() -> None:
     @dataclass(frozen=True)
     class BacklashModel(LiftedModel):
         backlash: Array = field(default_factory=lambda: np.zeros(1))

@@ -183,7 +183,7 @@ def test_the_condition_number_of_monomials_does_not_matter(found, trained, shipp
     assert strict.reasons == loose.reasons
 
 
-def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
+def test_a_controller_that_destabilises_is_rejected(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
     decision = evaluate_model(found, wrong, shipped, Thresholds(), loops=16)
     assert decision.law_check.share_failed > 0.9
@@ -223,7 +223,7 @@ def test_drifts_that_differ_are_named(found, factor, said):
 
 
 @pytest.mark.usefixtures('no_loops')
-def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, trained):
+def test_a_lift_that_diverges_is_rejected_even_where_the_present_one_does(found, trained):
     model = trained.model
     diverging = linearised_model(np.array([[1e4]]), np.array([[1.0]]), model.states, model.inputs,
                                  model.time_unit, Provenance(model.provenance.plant))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which start and lift a training takes and refuses, what its watch sees, what interrupts keep."""
+"""Which start and lift a training takes and rejects, what its watch sees, what interrupts keep."""
 
 from dataclasses import replace
 import itertools
@@ -91,13 +91,13 @@ def test_a_linear_plant_gets_a_lift_only_on_request():
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     with pytest.raises(TrainingFailed, match='n_z = 2 does not predict the motion better'):
         train(BENT, linear, SMALL, starts=1)
-    trained = train(BENT, linear, SMALL, starts=1, refuse=False)
+    trained = train(BENT, linear, SMALL, starts=1, reject=False)
     # both are exact, to rounding: which has less of it depends on the processor
     assert max(trained.figures.fit.rx, trained.linear.fit.rx) < ROUNDING
     assert trained.law_check is None
 
 
-def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
+def test_a_lift_that_loses_a_state_is_rejected_whatever_its_rw():
     """Two free coordinates can be x1 and x1^2, whose rw is 0 and which do not hold x2."""
     plant, samples = small_plants.TWO_STATE, small_plants.two_state_samples(400)
     exact = IncrementalTraining(3, identity=False, decoder=0, max_iterations=150)

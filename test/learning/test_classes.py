@@ -110,15 +110,15 @@ def test_noise_neither_hides_an_error_nor_makes_one(bend, chosen):
     assert evaluate_model(found, comparison, None, GATE, loops=16).accepted
 
 
-def test_a_class_that_the_gate_would_refuse_is_not_chosen(found, best):
+def test_a_class_that_the_gate_would_reject_is_not_chosen(found, best):
     # between the coordinates of the neural drift, which are the states, and those of the others
     strict = Thresholds(condition=0.5 * (1.0 + best.contenders[1].figures.fit.cond))
     again = compared(found, thresholds=strict, n_z=1)
     assert again.chosen.name == 'neural drift'
-    assert again.contenders[1].refusal.startswith('the condition number of its coordinates')
+    assert again.contenders[1].rejection.startswith('the condition number of its coordinates')
     # nor is one that cannot be learned: identity coordinates beyond the state are none here
     assert again.contenders[3].model is None
-    assert again.contenders[3].refusal.startswith('n_z = 1 is too small for 1 states')
+    assert again.contenders[3].rejection.startswith('n_z = 1 is too small for 1 states')
     with pytest.raises(ValueError, match='n_z = 1 is too small for 1 states'):
         compared(found, 'identity lift', n_z=1)
 
@@ -135,7 +135,7 @@ def test_a_class_that_is_named_is_learned_alone(found, name):
     assert decision.accepted
 
 
-def test_a_refusal_advises_to_compare_the_classes_unless_they_were_compared(found, best):
+def test_a_rejection_advises_to_compare_the_classes_unless_they_were_compared(found, best):
     strict = Thresholds(condition=0.5 * (1.0 + best.figures.fit.cond))
     for learned, advised in ((best, False), (compared(found, 'polynomial'), True)):
         (reason,) = evaluate_model(found, learned, None, strict, loops=16).reasons
@@ -190,7 +190,7 @@ def test_classes_side_by_side_in_report_and_summary(tmp_path):
     chosen = figures['model_class']
     assert [name for name, one in figures['classes'].items() if one['chosen']] == [chosen]
     lift, best = (figures['classes'][name] for name in ('identity lift', chosen))
-    assert 'condition number' in lift['refusal']
+    assert 'condition number' in lift['rejection']
     assert best['heldout_error'] == figures['heldout_error']
     rows = [line for line in page_of(retrained).splitlines()
             if line.split(' | ')[0][2:] in CLASSES]

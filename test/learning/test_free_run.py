@@ -145,7 +145,7 @@ def test_a_constant_disturbance_is_found_where_the_first_samples_contradict(push
     (('position [s]', 'force'), {}, r"position: .* as 'position \[unit\]'"),
     (('position [m]', 'force [N]'), {'init': 0}, 'init = 0'),
 ])
-def test_refuses_a_record_of_other_signals(signals, options, words):
+def test_rejects_a_record_of_other_signals(signals, options, words):
     with pytest.raises(ValueError, match=words):
         simulate(lifted(), read(table(), *signals), **options)
 

@@ -68,6 +68,6 @@ def test_the_applied_input_is_a_state_of_the_model(tmp_path):
 @pytest.mark.parametrize(('lag', 'words'), [
     ({'pump': 3.0}, 'lag names pump'), ({'coolant_temperature': 0.2}, 'half of a sample interval'),
     ({'coolant_temperature': 200.0}, 'record longer')])
-def test_a_lag_that_does_not_fit_is_refused(tmp_path, lag, words):
+def test_a_lag_that_does_not_fit_is_rejected(tmp_path, lag, words):
     with pytest.raises(ValueError, match=words):
         retrain(task(tmp_path / 'new.safetensors', lag=lag), record=record())

@@ -52,7 +52,7 @@ def test_eigenvalues_are_those_of_the_derivative():
     (-1.0, 150.0, -0.1, False),
     # it is unstable, too, or grows by less than e^2 in the record
     (1.0, 150.0, 0.1, False), (1.0, 60.0, -0.1, False)])
-def test_an_unstable_model_is_refused_where_a_stable_one_explains_the_record(
+def test_an_unstable_model_is_rejected_where_a_stable_one_explains_the_record(
         growth, seconds, other, unfounded):
     lift = model(growth)
     said = unfounded_instability(lift, record(moving(seconds)), operating_points(
@@ -64,7 +64,7 @@ def test_an_unstable_model_is_refused_where_a_stable_one_explains_the_record(
 @pytest.mark.parametrize(('place', 'minutes', 'unfounded'), [
     # half of the time counts, in which a deviation grows e^25-fold, or e^15-fold
     (0.0, 50.0, True), (0.0, 30.0, False), (1.0, 50.0, False)])
-def test_an_unstable_model_is_refused_where_the_plant_rested(place, minutes, unfounded):
+def test_an_unstable_model_is_rejected_where_the_plant_rested(place, minutes, unfounded):
     found = record(resting(place, 60.0 * minutes))
     said = unfounded_instability(model(1.0), found, (), {})
     assert ('unstable at x1 0 m' in said or 'where the plant rested' in said) == unfounded

@@ -44,19 +44,19 @@ from support.small_plants import (
 RECIPES = {'neural drift': NeuralDrift(3, max_iterations=40), 'identity lift': SMALL}
 
 
-def contender(name, rx, refusal=''):
-    return ModelCandidate(name, None, rx, None, None, 0.0, refusal)
+def contender(name, rx, rejection=''):
+    return ModelCandidate(name, None, rx, None, None, 0.0, rejection)
 
 
-@pytest.mark.parametrize(('errors', 'refused', 'chosen'), [
+@pytest.mark.parametrize(('errors', 'rejected', 'chosen'), [
     ([1e-2, 1e-4, 1e-6], (), 2), ([1e-2, 1.9e-6, 1e-6], (), 1), ([1e-2, 2.1e-6, 1e-6], (), 2),
     ([1.9e-6, 1.9e-6, 1e-6], (), 0), ([1e-2, 1e-4, 1e-6], (2,), 1),
     ([1e-2, 1e-4, 1e-6], (1, 2), 0),
     # rounding
     ([1e-30, 1e-33, 0.0], (), 0), ([1e-2, 1.9e-20, 1e-33], (), 1),
     ([1e-2, math.inf, 1e-6], (1,), 2)])
-def test_the_plainest_within_a_factor_of_two_is_taken(errors, refused, chosen):
-    those = [contender(str(i), rx, 'refused' if i in refused else '')
+def test_the_plainest_within_a_factor_of_two_is_taken(errors, rejected, chosen):
+    those = [contender(str(i), rx, 'rejected' if i in rejected else '')
              for i, rx in enumerate(errors)]
     assert plainest(those) is those[chosen]
 
@@ -111,7 +111,7 @@ def test_a_class_that_cannot_be_learned_has_its_reason():
                     starts=1, loops=0)
     assert found.chosen.name == 'linear'
     assert [one.model is None for one in found.contenders] == [False, True, True]
-    assert 'is too small for 1 states' in found.contenders[2].refusal
+    assert 'is too small for 1 states' in found.contenders[2].rejection
     with pytest.raises(TrainingFailed, match='a model: a: is none; b: is none'):
         plainest([contender(name, math.inf, 'is none') for name in ('a', 'b')])
 
@@ -128,7 +128,7 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     monkeypatch.setattr(model_selection, 'evaluate_closed_loops', fails)
     found = compare(BENT, bent_samples(), {}, loops=16)
     assert found.chosen.name == chosen
-    assert f'the law fails in {failing[2]} of 16' in found.contenders[1].refusal
+    assert f'the law fails in {failing[2]} of 16' in found.contenders[1].rejection
 
 
 def test_all_laws_are_tried_where_the_data_are(monkeypatch):

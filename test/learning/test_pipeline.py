@@ -116,7 +116,7 @@ def test_progress_rises_to_the_end(accepted):
     assert words[-2:] == ('judging: further closed loops', 'writing')
 
 
-def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
+def test_rejected_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
     present = accepted[2] / 'new.safetensors'
     output = tmp_path / 'deep' / 'er' / 'new.safetensors'
     retrained = retrain(small(bag, output, present))
@@ -124,12 +124,12 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     assert 'is not 10 % below that of the current model' in retrained.reasons[0]
     # nothing replaces the output, and the same data and seed give the same numbers
     assert [path.name for path in output.parent.iterdir()] == ['new.rejected.safetensors']
-    refused = load(retrained.model_file)
-    assert refused.provenance.accepted is False
-    assert refused.provenance.reasons == retrained.reasons
+    rejected = load(retrained.model_file)
+    assert rejected.provenance.accepted is False
+    assert rejected.provenance.reasons == retrained.reasons
     again = tmp_path / 'again.safetensors'
-    save(replace(refused, provenance=replace(
-        refused.provenance, accepted=True, reasons=(),
+    save(replace(rejected, provenance=replace(
+        rejected.provenance, accepted=True, reasons=(),
         closed_loops=load(present).provenance.closed_loops)), again)
     assert again.read_bytes() == present.read_bytes()
 
@@ -191,7 +191,7 @@ def test_models_of_alternative_drifts_are_kept_next_to_the_model(
 
 
 @pytest.mark.usefixtures('learned')
-def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
+def test_rejected_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
     original = task_module.evaluate_model
     monkeypatch.setattr(task_module, 'evaluate_model', lambda *arguments, **named: replace(
         original(*arguments, **named), rmse=np.array([np.inf]), reasons=('it diverges',)))
@@ -200,10 +200,10 @@ def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypa
 
 
 def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkeypatch):
-    def refuse(*_):
+    def reject(*_):
         raise PermissionError
 
-    monkeypatch.setattr(task_module.os, 'link', refuse)
+    monkeypatch.setattr(task_module.os, 'link', reject)
     output = tmp_path / 'a.safetensors'
     for content in (b'first', b'second'):
         output.write_bytes(content)

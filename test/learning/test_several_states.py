@@ -231,7 +231,7 @@ def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
     ({'physical_model': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
     ({'constants': {'orifice_1': None}},
      'constants name orifice_1, but no physical_model')])
-def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
+def test_a_task_whose_equations_do_not_fit_is_rejected(given, words):
     with pytest.raises(ValueError, match=words):
         resolve_signals(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)
 

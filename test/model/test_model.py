@@ -331,7 +331,7 @@ def test_a_model_cannot_be_changed():
     ({'training_states': TrainingStates(np.zeros((1, 3)), 0.0)},
      'incompatible training_states: expected 2 states, got 3'),
 ])
-def test_a_model_that_does_not_fit_is_refused(change, message):
+def test_a_model_that_does_not_fit_is_rejected(change, message):
     with pytest.raises(ValueError, match=message):
         replace(random_lift(), **change)
 
@@ -364,7 +364,7 @@ def test_a_measured_disturbance_acts_as_the_input_that_it_was():
     ({'pre_feedback': np.ones((2, 2))}, ('u1',), 'must not depend on the state'),
     ({'dead_time': np.array([0.0, 3.0])}, ('u1',), 'has no dead time'),
 ])
-def test_an_input_that_cannot_be_a_disturbance_is_refused(changes, names, message):
+def test_an_input_that_cannot_be_a_disturbance_is_rejected(changes, names, message):
     with pytest.raises(ValueError, match=message):
         replace(random_lift(n_u=2), **changes).with_disturbances(names)
 
@@ -380,7 +380,7 @@ def test_an_input_that_cannot_be_a_disturbance_is_refused(changes, names, messag
     ({'lower': np.array([4.0, 0.0])}, r'the box is empty: lower \[4.0, 0.0\], upper \[3.5, 2.5\]'),
     ({'lower': np.array([3.5, 0.0])}, 'the box is empty'),
 ])
-def test_coordinates_that_do_not_fit_are_refused(change, message):
+def test_coordinates_that_do_not_fit_are_rejected(change, message):
     with pytest.raises(ValueError, match=message):
         replace(coordinates('x', 2), **change)
 
@@ -500,7 +500,7 @@ def test_distance_of_a_model_is_the_larger_of_box_and_data():
     (np.zeros((0, 2)), 0.0, 'M from 1 to 256'), (np.zeros((257, 2)), 0.0, 'M from 1 to 256'),
     (np.zeros(2), 0.0, 'M from 1 to 256'), (np.full((1, 2), np.nan), 0.0, 'must be finite'),
     (np.zeros((1, 2)), -1.0, 'fill_distance must be'), (np.zeros((1, 2)), math.inf, 'fill_dis')])
-def test_what_does_not_fit_is_refused(states, fill, words):
+def test_what_does_not_fit_is_rejected(states, fill, words):
     with pytest.raises(ValueError, match=words):
         TrainingStates(states, fill)
 
@@ -508,7 +508,7 @@ def test_what_does_not_fit_is_refused(states, fill, words):
 def test_training_on_several_states_notes_them_and_on_one_does_not():
     recipe = IncrementalTraining(3, hidden_first=3, max_iterations=2)
     samples = two_state_samples()
-    model = train(TWO_STATE, samples, recipe, starts=1, refuse=False).model
+    model = train(TWO_STATE, samples, recipe, starts=1, reject=False).model
     known = model.training_states
     assert known is not None
     assert known.states.shape == (256, 2)
@@ -516,10 +516,10 @@ def test_training_on_several_states_notes_them_and_on_one_does_not():
     assert all(model.distance(x) < 1e-12 for x in samples.x)
     assert model.distance(np.array([-6.0, 12.0])) > 0.5
     assert train(BENT, bent_samples(), IncrementalTraining(2, hidden_first=3, max_iterations=2),
-                 starts=1, refuse=False).model.training_states is None
+                 starts=1, reject=False).model.training_states is None
 
 
-def test_lists_do_as_arrays_do_and_another_size_is_refused():
+def test_lists_do_as_arrays_do_and_another_size_is_rejected():
     model, x = random_lift(), [0.3, -0.2]
     for act in (model.lift, model.jacobian, model.drift, model.distance):
         np.testing.assert_array_equal(act(x), act(np.array(x)))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model file: bit for bit there and back, and a refusal for everything else."""
+"""The model file: bit for bit there and back, and a rejection for everything else."""
 
 from dataclasses import replace
 import hashlib
@@ -54,7 +54,7 @@ MODELS = {
     'input terms': replace(PLAIN, input_terms=InputTerms(RNG.normal(size=(5, 2, 1)))),
     'tried loops': replace(PLAIN, verified_loops=VerifiedLoops(
         *RNG.normal(size=(2, 7, 2)), np.arange(7) % 3 == 0)),
-    'refused': with_origin(model_class='neural drift', accepted=False,
+    'rejected': with_origin(model_class='neural drift', accepted=False,
                            reasons=('too large', 'too few')),
     'accepted': with_origin(accepted=True, reasons=('error 0.2 K',)),
     'monomials': replace(PLAIN, observables=PolynomialObservables.total_degree(2, 2),
@@ -87,8 +87,8 @@ def sound(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def refusal(path: Path, file: bytes) -> str:
-    """Write a file and return the message of its refusal."""
+def rejection(path: Path, file: bytes) -> str:
+    """Write a file and return the message of its rejection."""
     path.write_bytes(file)
     with pytest.raises(ModelFileError) as caught:
         load(path)
@@ -143,21 +143,21 @@ def test_anything_but_a_regular_file_of_a_fair_size_is_not_read(path, make, word
         b'{}', b'[]', b'{"A": ', b'\xff\xfe{}', b'[' * 100_000, b'{"A":' * 100_000,
         b'{"__metadata__":{"format":"pt"}}')),
     (1 << 60).to_bytes(8, 'little') + bytes(64)])
-def test_foreign_content_is_refused(path, foreign):
-    refusal(path, foreign)
+def test_foreign_content_is_rejected(path, foreign):
+    rejection(path, foreign)
 
 
-def test_a_file_cut_off_longer_or_with_flipped_bits_is_refused(path, sound):
+def test_a_file_cut_off_longer_or_with_flipped_bits_is_rejected(path, sound):
     rng = np.random.default_rng(12)
     for length in (*range(0, len(sound), 9), len(sound) - 1):
-        refusal(path, sound[:length])
-    refusal(path, sound + b'\0')
+        rejection(path, sound[:length])
+    rejection(path, sound + b'\0')
     # half of them in the header
     for end in [len(sound), 8 + int.from_bytes(sound[:8], 'little')] * 200:
         damaged = bytearray(sound)
         for position in rng.choice(end, size=rng.integers(1, 4), replace=False):
             damaged[position] ^= 1 << int(rng.integers(8))
-        refusal(path, bytes(damaged))
+        rejection(path, bytes(damaged))
 
 
 # A file in the right format whose checksum is right, too.
@@ -176,7 +176,7 @@ def changed(file: bytes, about: Any = None, **tensors: Any) -> bytes:
 
 
 HUGE, INFINITE = 10 ** 400, float('inf')
-# Changes of a part of the description, and words of the refusal.
+# Changes of a part of the description, and words of the rejection.
 DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
     ('', {'identity': 1}, 'identity must be a bool'), ('', {'identity': False}, 'incompatible A'),
     *(('', {'dead_time': value}, words) for value, words in (
@@ -240,34 +240,34 @@ ARRAYS: list[tuple[str, dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(('part', 'changes', 'words'), DESCRIPTIONS, ids=lambda value: (
     f'{value!a:.60}'))
-def test_a_description_that_does_not_fit_is_refused(path, sound, part, changes, words):
-    assert words in refusal(path, changed(sound, lambda about: (
+def test_a_description_that_does_not_fit_is_rejected(path, sound, part, changes, words):
+    assert words in rejection(path, changed(sound, lambda about: (
         about[part] if part else about).update(changes)))
 
 
 @pytest.mark.parametrize('name', ['identity', 'inputs', 'provenance', 'states', 'time_unit'])
-def test_a_description_without_an_entry_is_refused(path, sound, name):
-    assert f'{name!r} is missing' in refusal(path, changed(sound, lambda about: about.pop(name)))
+def test_a_description_without_an_entry_is_rejected(path, sound, name):
+    assert f'{name!r} is missing' in rejection(path, changed(sound, lambda about: about.pop(name)))
 
 
 @pytest.mark.parametrize('fill', [-0.5, np.nan, '0', None])
-def test_a_fill_distance_that_does_not_fit_is_refused(path, fill):
+def test_a_fill_distance_that_does_not_fit_is_rejected(path, fill):
     save(MODELS['training states'], path)
-    assert 'fill_distance' in refusal(path, changed(
+    assert 'fill_distance' in rejection(path, changed(
         path.read_bytes(), lambda about: about.update(fill_distance=fill)))
 
 
 @pytest.mark.parametrize(('name', 'arrays', 'words'), ARRAYS)
-def test_arrays_that_do_not_fit_are_refused(path, name, arrays, words):
+def test_arrays_that_do_not_fit_are_rejected(path, name, arrays, words):
     save(MODELS[name], path)
-    assert words in refusal(path, changed(path.read_bytes(), **arrays))
+    assert words in rejection(path, changed(path.read_bytes(), **arrays))
 
 
 @pytest.mark.parametrize(('metadata', 'words'), [
     ('{"format_version": 2}', 'format version 2, this package reads 1'),
     ('{}', "'format_version' is missing"), ('[1]', ''), ('{n_x', ''), ('[' * 100_000, '')])
-def test_metadata_of_another_format_is_refused(path, sound, metadata, words):
-    assert words in refusal(path, safetensors.numpy.save(
+def test_metadata_of_another_format_is_rejected(path, sound, metadata, words):
+    assert words in rejection(path, safetensors.numpy.save(
         safetensors.numpy.load(sound), metadata={model_file._KEY: metadata}))
 
 
@@ -290,7 +290,7 @@ def test_a_model_beyond_the_limits_is_neither_written_nor_read(path, words, monk
         with monkeypatch.context() as careless:
             careless.setattr(model_file, 'check', lambda _: None)
             save(LARGE[words], path)
-        assert words in refusal(path, path.read_bytes())
+        assert words in rejection(path, path.read_bytes())
 
 
 def test_a_lift_of_another_kind_is_not_written(path):
@@ -339,7 +339,7 @@ def test_a_reader_sees_the_old_file_or_the_new_one(path, sound, monkeypatch):
     (MODELS['monomials'], 'polynomial', 'not tested'),
     (MODELS['linear'], 'linear', 'not tested'),
     (MODELS['accepted'], 'identity lift, n_z = 5', 'accepted (error 0.2 K)'),
-    (MODELS['refused'], 'neural drift', 'rejected (too large; too few)')])
+    (MODELS['rejected'], 'neural drift', 'rejected (too large; too few)')])
 def test_class_and_acceptance_are_named(model, kind, acceptance, path):
     save(model, path)
     assert (load(path).kind, load(path).provenance.acceptance) == (kind, acceptance)

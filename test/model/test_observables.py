@@ -152,7 +152,7 @@ def test_neither_a_lift_nor_its_results_share_memory(lift):
     ({'W': np.zeros((0, 2)), 'b': np.zeros(0), 'V': np.zeros((3, 0))}, 'needs hidden units'),
     ({'V': np.zeros((0, 5)), 'identity': False}, 'a lift needs coordinates'),
 ])
-def test_a_network_that_does_not_fit_is_refused(change, message):
+def test_a_network_that_does_not_fit_is_rejected(change, message):
     with pytest.raises(ValueError, match=message):
         replace(random_network(), **change)
 
@@ -240,6 +240,6 @@ def test_monomials_of_a_total_degree(n_x, degree, exponents):
     ([[1], [2], [0]], ValueError, 'constant'),
     ([[1], [3], [2], [3]], ValueError, r'the row \[3\] of exponents'),
 ])
-def test_exponents_that_do_not_fit_are_refused(exponents, error, message):
+def test_exponents_that_do_not_fit_are_rejected(exponents, error, message):
     with pytest.raises(error, match=message):
         PolynomialObservables(exponents)

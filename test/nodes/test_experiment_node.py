@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The identification experiment across processes: steps on a plant, refusals, ways back."""
+"""The identification experiment across processes: steps on a plant, rejections, ways back."""
 
 from itertools import pairwise
 import math
@@ -133,7 +133,7 @@ def test_an_obstacle_prevents_the_start_of_an_experiment(shared_bench: Bench) ->
              'degC to 53.85 degC'), (math.nan, 'is nan, not finite: check the sensor')):
         started, said = bench.start(celsius)
         assert not started
-        assert said.startswith('refused: ')
+        assert said.startswith('rejected: ')
         assert words in said
         assert bench.status(words).level == DiagnosticStatus.WARN
         assert bench.commands == []
@@ -141,7 +141,7 @@ def test_an_obstacle_prevents_the_start_of_an_experiment(shared_bench: Bench) ->
 
     bench.set(experiment_timeout=0.3)
     assert bench.ask(True)[1] == (
-        'refused: no newer measurement for more than 0.3 s: check sensor and plant')
+        'rejected: no newer measurement for more than 0.3 s: check sensor and plant')
     # a busy machine may be as slow
     bench.set(experiment_timeout=10.0)
 
@@ -189,7 +189,7 @@ def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     bench.set(experiment_timeout=10.0, **{'coolant_temperature.experiment_rate_limit': 1.0})
 
 
-def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Bench) -> None:
+def test_another_commander_ends_it_at_once_and_rejects_the_next(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     assert bench.start()[0]
     bench.answer()
@@ -203,7 +203,7 @@ def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Be
     ros.wait_until(lambda: ros.node.count_publishers(JACKET) == 1)
     assert ros.wait_until(lambda: '/bench publishes' in (answer := bench.start())[1]
                           and answer) == (
-        False, 'refused: /bench publishes on /unit_1/jacket: stop it, or choose another '
+        False, 'rejected: /bench publishes on /unit_1/jacket: stop it, or choose another '
         'experiment_signal')
     ros.node.destroy_publisher(other)
 

@@ -56,7 +56,7 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     ros.meet('trainer')
     # who asks for set-points beside the experiment is in its way; its name may be known later
     said = ros.set_bool(SERVICE, True).message
-    assert re.match('refused: (/bench|another node) publishes on /level_1/setpoint: stop it, or '
+    assert re.match('rejected: (/bench|another node) publishes on /level_1/setpoint: stop it, or '
                     'choose', said)
     for name, publisher, level in zip(LEVELS, asked, before, strict=True):
         publisher.publish(JointState(name=[name], position=[float(level)]))
@@ -88,7 +88,7 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     ros.wait_until(lambda: len(measured[0]) > last + 100)
     assert [heard[-1].position[0] for heard in measured] == pytest.approx(before, rel=0.02)
 
-    # one that the controller refuses
+    # one that the controller rejects
     assert ros.set_bool(SERVICE, False).success
     (result,) = ros.set_parameters('trainer', **{'level_2.setpoint_max': 5.0})
     assert result.successful, result.reason
@@ -105,7 +105,7 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     ros.set_bool('controller/set_automatic', False)
     words = 'the controller is in manual mode: switch it to automatic mode'
     ros.wait_for_status(STATUS, lambda s: s.message == f'aborted: {words}')
-    assert ros.set_bool(SERVICE, True).message == f'refused: {words}'
+    assert ros.set_bool(SERVICE, True).message == f'rejected: {words}'
 
     # but passes on the pumps that an experiment asks for by hand, until it is automatic again
     ros.set_parameters('trainer', experiment_signal='manual', experiment_length=60000.0)
@@ -140,12 +140,12 @@ def test_an_experiment_of_setpoints_without_a_controller_is_rejected(
 
     ros.node.create_timer(0.02, measure)
     assert ros.set_bool(SERVICE, True).message == (
-        'refused: /pump_1_setpoint is not published: start the controller and switch it to '
+        'rejected: /pump_1_setpoint is not published: start the controller and switch it to '
         'automatic mode')
     ros.node.create_publisher(JointState, 'pump_1_setpoint', topics.LOOP_QOS)
     # until the graph tells the trainer
     said = ros.wait_until(lambda: 'unknown' in (
         said := ros.set_bool(SERVICE, True).message) and said)
     assert said == (
-        'refused: the active set-points have been unknown for 1 s: switch the controller to '
+        'rejected: the active set-points have been unknown for 1 s: switch the controller to '
         'automatic mode, and check sensor and plant')

@@ -311,7 +311,7 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT))
     assert change(ros, 'trainer', 'deactivate')
     ros.wait_until(asked.done)
-    assert asked.result().message == 'refused: it was stopped before the first measurement'
+    assert asked.result().message == 'rejected: it was stopped before the first measurement'
 
     record = ros.node.create_client(SetBool, 'trainer/record')
     ros.wait_until(record.service_is_ready)

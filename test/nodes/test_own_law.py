@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Laws of one's own in one file, over ROS: one with a parameter, one that raises, one refused."""
+"""Laws of one's own in one file, over ROS: one with a parameter, one that raises, one rejected."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,15 +64,15 @@ def test_a_law_acts_by_its_own_parameters_when_the_one_before_raises(own_laws: H
     assert set_parameters('controller', **{
         'Proportional.coolant_temperature.bias': 0.25}).successful
     assert bench.measure(STEADY + 0.5, 5.0).temperature == pytest.approx(at_rest - 0.25, abs=0.02)
-    refused = set_parameters('controller', **{'Proportional.gain': 51.0})
-    assert not refused.successful
-    assert 'Proportional.gain = 51.0' in refused.reason
+    rejected = set_parameters('controller', **{'Proportional.gain': 51.0})
+    assert not rejected.successful
+    assert 'Proportional.gain = 51.0' in rejected.reason
     status = own_laws.wait_for_status(STATUS, lambda s: 'KeyError' in s.message)
     assert (status.level, value(status, 'active law')) == (
         DiagnosticStatus.WARN, 'own_laws:Proportional')
 
 
-def test_a_law_without_compute_is_refused_at_the_start(own_laws: Harness) -> None:
+def test_a_law_without_compute_is_rejected_at_the_start(own_laws: Harness) -> None:
     process = own_laws.start('controller', {'fallback_order': ['own_laws:WithoutCompute']})
     assert own_laws.wait_for_end(process) != 0
     assert 'lacks compute' in process.output()

@@ -59,7 +59,7 @@ class _Stay(HTTPRedirectHandler):
 
 def get(url: str, data: bytes | None = None, trusting: ssl.SSLContext | None = None,
         **headers: str) -> tuple[int, str, Any]:
-    """Return status, text and headers of a page, or of what it is refused with."""
+    """Return status, text and headers of a page, or of what it is rejected with."""
     request = Request(url, data, {name.replace('_', '-'): text for name, text in headers.items()})
     try:
         opener = build_opener(_Stay, HTTPSHandler(context=trusting))
@@ -84,7 +84,7 @@ def test_pages_are_served_to_this_machine_alone_and_a_port_only_once(
     for headers in ({'Origin': 'http://elsewhere'}, {'Host': 'elsewhere.example'}):
         status, text, _ = get(url, **headers)
         assert status == 403
-        assert text.startswith('refused: ')
+        assert text.startswith('rejected: ')
     # browsers always say the origin
     assert [opened(url, *origin) for origin in (
         ('Origin: http://elsewhere',), (), (f'Origin: {url}',))] == ['403', '403', '101']
@@ -286,8 +286,9 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     # a set-point that is accepted, and one that is not
     assert desk.ask('setpoint', reactor.TEMPERATURE, 46.0) == Answer(True, 'accepted')
     desk.wait(lambda: node.snapshot.states[0].setpoint == pytest.approx(46.0))
-    refused = desk.ask('setpoint', reactor.TEMPERATURE, 80.0)
-    assert re.fullmatch(r'refused: outside 31\.85 to 53\.85 degC, the trained range', str(refused))
+    rejected = desk.ask('setpoint', reactor.TEMPERATURE, 80.0)
+    assert re.fullmatch(
+        r'rejected: outside 31\.85 to 53\.85 degC, the trained range', str(rejected))
     # nobody is in the way of an experiment
     desk.wait(lambda: not ros.node.count_publishers(reactor.SETPOINT))
     # manual mode and back
@@ -303,8 +304,8 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     # parameters
     assert desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 30.0}).accepted
     desk.wait(lambda: node.snapshot.inputs[0].limits == pytest.approx((41.0, 86.0)))
-    refused = desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 4.0})
-    assert 'coolant_temperature.min = 5.0 degC must be below' in refused.text
+    rejected = desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 4.0})
+    assert 'coolant_temperature.min = 5.0 degC must be below' in rejected.text
     # services of the trainer
     assert desk.ask('record', TRAINER, False).accepted
     assert desk.ask('cancel', TRAINER) == Answer(False, 'not training')

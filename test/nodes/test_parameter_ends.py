@@ -81,7 +81,7 @@ def cases(table: str) -> list[dict[str, Any]]:
 
 
 def usable_for_itself(reason: str) -> bool:
-    """Tell whether a value is refused that its range has: next to nothing, or the only weight."""
+    """Tell whether a value is rejected that its range has: next to nothing, or the only weight."""
     return ' = 5e-324' in reason or (
         'temperature.weight = 0.0 1/K^2' in reason and ' is not usable: ' in reason)
 
@@ -201,7 +201,7 @@ def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends(ros: H
                 sensor.publish(temperature(40.0, float(next(times))))
                 ros.spin_once()
                 fire_timers(node)
-            assert begun.result().success or begun.result().message.startswith('refused: ')
+            assert begun.result().success or begun.result().message.startswith('rejected: ')
             for _ in range(2):
                 ros.set_bool('trainer/experiment', False)
             assert finite(commands)
@@ -210,7 +210,7 @@ def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends(ros: H
                         if next(iter(change)).startswith(EXPERIMENT)], work)
 
 
-def test_trainer_refuses_names_that_cannot_be_topics(ros: Harness) -> None:
+def test_trainer_rejects_names_that_cannot_be_topics(ros: Harness) -> None:
     with running(ros, TrainerNode, record_at_start=False) as node:
         for name, words in (('{nobody}', 'unknown substitution'),
                             ('a//b', 'topic name must not contain'),

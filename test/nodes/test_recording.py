@@ -179,9 +179,9 @@ def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Pa
     assert values(recorded(bag)) == list(range(900))
     ros.node.destroy_publisher(publisher)
 
-    refused = ros.set_bool('trainer/record', True)
-    assert not refused.success
-    assert 'less than min_free_disk = 1000000000 MB: free some space' in refused.message
+    rejected = ros.set_bool('trainer/record', True)
+    assert not rejected.success
+    assert 'less than min_free_disk = 1000000000 MB: free some space' in rejected.message
     ros.set_parameters('trainer', min_free_disk=0.0)
     again = ros.set_bool('trainer/record', True)
     assert again.success

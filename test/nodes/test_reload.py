@@ -144,10 +144,10 @@ def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None
 SHIPPED = load(model_path('reactor_nz4'))
 
 
-def test_refused_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
+def test_rejected_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
         ros: Harness, tmp_path: Path) -> None:
     ros.start('controller', PATIENT)
-    bench, file = Bench(ros), tmp_path / 'refused.safetensors'
+    bench, file = Bench(ros), tmp_path / 'rejected.safetensors'
 
     def measure() -> float:
         bench.measure(STEADY)

@@ -101,7 +101,7 @@ def run_a_day(operator: Operator) -> None:
     operator.measure_on(8, STEADY, -0.05)
     operator.setpoint.publish(temperature(45.0))
     operator.measure_on(12, STEADY, -0.3)
-    # refused, and one for later
+    # rejected, and one for later
     operator.setpoint.publish(temperature(200.0))
     operator.setpoint.publish(temperature(48.0, operator.time + 6.5))
     operator.measure_on(10, 47.3, -0.1)
@@ -126,7 +126,7 @@ def run_a_day(operator: Operator) -> None:
 
 
 def tune_and_swap(operator: Operator) -> None:
-    """Change parameters and models, also to what is refused, and go on a little each time."""
+    """Change parameters and models, also to what is rejected, and go on a little each time."""
     shutil.copy(model_path('reactor_nz3'), operator.model)
     for change, taken in (
             ({'coolant_temperature.weight': 0.3}, True),
@@ -202,10 +202,10 @@ def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Pa
         f'all {len(found.recorded)} recorded commands are reproduced exactly')
 
     events = Counter(record.event for record in written)
-    # the manual command in automatic mode is refused
+    # the manual command in automatic mode is rejected
     assert {name: events[name] for name in ('setpoint', 'mode', 'manual_command', 'model')} == {
         'setpoint': 15, 'mode': 4, 'manual_command': 3, 'model': 2}
-    assert found.found.refused == 2
+    assert found.found.rejected == 2
     # on a busy machine there may be more
     assert events['silence'] >= 6
     # that of a controller may come before the trainer has found it

@@ -53,12 +53,12 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
 @pytest.mark.parametrize('name', ['best', 'neural drift'])
 def test_class_is_passed_on_and_each_that_was_learned_is_shown(
         monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], name: str) -> None:
-    """The process refuses with the class that its task names."""
+    """The process rejects with the class that its task names."""
     learned = {
-        'linear': {'chosen': True, 'refusal': '', 'limit': '', 'seconds': 0.04, 'heldout_rx': 0.02,
-                   'heldout_error': {'temperature': 0.5}, 'closed_loops': 128,
+        'linear': {'chosen': True, 'rejection': '', 'limit': '', 'seconds': 0.04,
+                   'heldout_rx': 0.02, 'heldout_error': {'temperature': 0.5}, 'closed_loops': 128,
                    'closed_loops_failed': 1},
-        'free lift': {'chosen': False, 'refusal': 'it has lost a state', 'limit': '',
+        'free lift': {'chosen': False, 'rejection': 'it has lost a state', 'limit': '',
                       'seconds': 2.0}}
     end = {'accepted': False, 'model_class': 'linear', 'model_file': '',
            'units': {'temperature': 'K'}, 'classes': learned}

@@ -104,14 +104,14 @@ def test_a_wrong_line_is_named_and_not_quoted(file: Path, line: str, words: str)
 @pytest.mark.parametrize(('content', 'mode', 'words'), [
     ('', 0o620, 'writable by others'), ('', 0o602, 'writable by others'),
     (b'\xff', 0o600, "can't decode"), ('#' * 300_000, 0o600, 'more than')])
-def test_a_file_that_cannot_be_trusted_is_refused(
+def test_a_file_that_cannot_be_trusted_is_rejected(
         file: Path, content: str | bytes, mode: int, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Users.read(_write(file, content, mode))
 
 
 @pytest.mark.parametrize('kind', ['pipe', 'folder', 'device'])
-def test_another_kind_of_file_is_refused_at_once(file: Path, kind: str) -> None:
+def test_another_kind_of_file_is_rejected_at_once(file: Path, kind: str) -> None:
     if kind == 'pipe':
         os.mkfifo(file)
     elif kind == 'folder':
@@ -162,7 +162,7 @@ def test_other_lines_and_links_stay(file: Path) -> None:
     ('a:b', [], None, 0, 'a name must have'), ('', [], None, 0, 'a name must have'),
     ('a\nb', [], None, 0, 'a name must have'),
     ('ada', [], 'nonsense\n', 0o600, 'line 1'), ('ada', [], '', 0o666, 'writable by others')])
-def test_the_command_refuses_and_writes_nothing(
+def test_the_command_rejects_and_writes_nothing(
         file: Path, typed: list[str], name: str, answers: list[str], text: str | None, mode: int,
         words: str, capsys: pytest.CaptureFixture[str]) -> None:
     if text is not None:

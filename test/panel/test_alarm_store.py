@@ -116,7 +116,7 @@ def test_a_damaged_file_is_moved_aside_and_reported(
     b'anna:operator:scrypt$16384$8$5$c2FsdHNhbHQ=$aGFzaA==\n', b'[]', b'\xff', b'[' * 100_000,
     b'{"__metadata__": {"format": "koopman_ros.lift"}}', b'# note',
     b'{"alarms": [], "version": 1}'])
-def test_a_file_of_something_else_is_refused_and_stays(tmp_path: Path, content: bytes) -> None:
+def test_a_file_of_something_else_is_rejected_and_stays(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / 'other'
     path.write_bytes(content)
     path.chmod(0o640)

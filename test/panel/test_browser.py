@@ -221,7 +221,7 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         expect(experiment).to_contain_text('steps: setpoint')
         press(experiment, 'Start …')
         expect(page.get_by_role('dialog')).to_contain_text('set-points 40 °C to 50 °C')
-        confirmed(page, 'Start the experiment', experiment, re.compile('^(?!.*refused).+'))
+        confirmed(page, 'Start the experiment', experiment, re.compile('^(?!.*rejected).+'))
 
         def recorded() -> int:
             status = ros.wait_for_status('trainer: recording', lambda status: any(
@@ -303,13 +303,13 @@ def test_an_operator_logs_in_and_the_reactor_arrives_at_a_set_point(site: Site) 
         json.loads(message.data) for message in site.actions)))
 
 
-def test_the_reason_of_a_refusal_is_next_to_its_control(site: Site) -> None:
+def test_the_reason_of_a_rejection_is_next_to_its_control(site: Site) -> None:
     with site.page() as page:
         ready(page)
         own = asked(page)
         before = float(own.input_value())
         expect(ask_setpoint(page, '80')).to_have_text(
-            re.compile(r'✖ refused: outside 31\.85 to 53\.85 °C'))
+            re.compile(r'✖ rejected: outside 31\.85 to 53\.85 °C'))
         expect(own).to_have_value(re.compile(rf'^{before:g}(\.0)?$'))
 
 
@@ -477,7 +477,7 @@ def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site
         expect(page.get_by_label('Last 24 hours')).to_contain_text('acknowledged by anna')
 
 
-def test_parameters_are_set_checked_and_refused(site: Site) -> None:
+def test_parameters_are_set_checked_and_rejected(site: Site) -> None:
     with site.page('/tuning') as page:
         own = page.get_by_label('Parameters of the controller')
         own.get_by_text('coolant temperature', exact=True).click()
@@ -485,10 +485,10 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
         expect(row).to_contain_text('max [°C]')
         given = row.get_by_role('textbox')
         expect(given).to_have_value('32')
-        for text, said in (('31', 'set'), ('x', "✖ refused: 'x' is not a number"),
-                           ('-300', re.compile('✖ refused: coolant_temperature.max = -300.0 °C '
+        for text, said in (('31', 'set'), ('x', "✖ rejected: 'x' is not a number"),
+                           ('-300', re.compile('✖ rejected: coolant_temperature.max = -300.0 °C '
                                                 'must be in ')),
-                           ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 °C must '
+                           ('4', re.compile('✖ rejected: coolant_temperature.min = 5.0 °C must '
                                             'be below')),
                            ('32', 'set')):
             given.fill(text)
@@ -617,7 +617,7 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
         expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
         fits(page)
         expect(ask_setpoint(page, '45')).to_have_text(
-            '✖ refused: the controller is not running: start it')
+            '✖ rejected: the controller is not running: start it')
         for path, name in (('/', 'Controller'), ('/model', 'Model'),
                            ('/tuning', 'Parameters of the controller')):
             page.goto(f'{site.url}{path}')
@@ -642,5 +642,5 @@ def test_a_page_finds_its_panel_again(site: Site) -> None:
         expect(lost).to_be_hidden()
         expect(page.locator('header')).to_contain_text('operator')
         ready(page)
-        # of the connection that was refused meanwhile
+        # of the connection that was rejected meanwhile
         site.browser.forgive()

@@ -221,7 +221,7 @@ def test_the_id_of_a_page_opens_it_to_its_own_session_alone(site: Site) -> None:
                 'document_id': 'document', 'next_message_id': '0'}, OTHER, '', '', {}) as own:
             assert received(own).startswith('0{')
             own.send('40')
-            assert received(own).startswith('44'), 'the connection is refused'
+            assert received(own).startswith('44'), 'the connection is rejected'
     with socketed(site, anna, page) as told:
         assert told.accepted is True
 
@@ -370,7 +370,7 @@ def test_no_text_from_outside_runs_in_the_browser(site: Site, browser: Pages) ->
                 expect(page.get_by_role('dialog')).to_contain_text(TEXTS[4])
                 page.get_by_role('button', name='Cancel').last.click()
                 page.get_by_role('button', name='Train').click()
-                expect(page.get_by_text(f'refused: {TEXTS[0]}').first).to_be_visible()
+                expect(page.get_by_text(f'rejected: {TEXTS[0]}').first).to_be_visible()
             assert page.evaluate('window.CAUGHT') is None, path
         browser.forgive()
 

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from koopman_ros.panel.access import Role
-from koopman_ros.panel.origins import is_loopback, refusal
+from koopman_ros.panel.origins import is_loopback, rejection
 from koopman_ros.panel.sessions import MAX_SESSIONS_OF_A_USER, Sessions, Throttle
 
 
@@ -168,9 +168,9 @@ def test_the_sessions_of_a_user_are_bounded(sessions: Sessions) -> None:
           'http://localhost:8080', 'http://127.0.0.1:8080, http://evil.example')),
     ('http', '127.0.0.1:8080', 'http://127.0.0.1:8080', 'https', True, 'origin'),
     ('http', '127.0.0.1:8080', 'https://127.0.0.1:8080', 'http', True, 'trusted_proxy')])
-def test_requests_of_other_hosts_and_origins_are_refused(
+def test_requests_of_other_hosts_and_origins_are_rejected(
         kind: str, host: str, origin: str | None, scheme: str, users: bool, word: str) -> None:
-    found = refusal(kind, host, origin, scheme, users=users)
+    found = rejection(kind, host, origin, scheme, users=users)
     assert word in found
     assert bool(word) is bool(found)
 

@@ -406,8 +406,8 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
 
 def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     own = view()
-    status(own, CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
-    status(own, REQUESTS, WARN, 'request refused: a', {}, NOW)
+    status(own, CONTROL, WARN, 'request rejected: a; stuck', {'condition': 'requests'}, NOW)
+    status(own, REQUESTS, WARN, 'request rejected: a', {}, NOW)
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
@@ -436,8 +436,8 @@ LATE = {'measurements': '9', 'since last measurement [s]': '40'}
               f'{MEASUREMENTS}: {MEASUREMENTS}: late (returned)'}),
     (CONTROL, OK, 'automatic', LATE, 2.0, {20.0: 'silence of plant: no measurement'}),
     # the operator who made a request reads the answer
-    (REQUESTS, WARN, 'request refused: outside', {}, 99.0, {5.0: '', 40.0: ''}),
-    (EXPERIMENT, WARN, 'refused: another node commands', {}, 99.0, {5.0: '', 40.0: ''}),
+    (REQUESTS, WARN, 'request rejected: outside', {}, 99.0, {5.0: '', 40.0: ''}),
+    (EXPERIMENT, WARN, 'rejected: another node commands', {}, 99.0, {5.0: '', 40.0: ''}),
     # what has ended stands until it is acknowledged, and no longer
     (EXPERIMENT, ERROR, 'aborted: too hot', {}, 99.0, {
         5.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot',
@@ -582,7 +582,7 @@ def test_texts_are_parsed_as_values_of_their_type(value: Any, text: str, read: A
 @pytest.mark.parametrize(('given', 'text', 'words'), [
     (parameter('p', 1.0), 'x', 'not a number'), (parameter('p', 1), '1.5', 'whole number'),
     (parameter('p', True), 'on', 'true or false'), (parameter('p', (1.0,)), 'a', 'numbers')])
-def test_wrong_texts_are_refused(
+def test_wrong_texts_are_rejected(
         given: ParameterDescription, text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         given.parse(text)
@@ -596,14 +596,14 @@ def record(value: float, accepted: bool = True, *codes: str) -> dict[str, Any]:
     ('', [(SETPOINT, record(300.0)), (MANUAL, record(318.15)), ('measurement', {})], []),
     ('', [(SETPOINT, record(318.15)), (SETPOINT, record(318.15))], ['accepted']),
     ('outside 32 to 54 degC', [(SETPOINT, record(318.15, False, 'setpoint_outside'))],
-     ['refused: outside 32 to 54 degC']),
+     ['rejected: outside 32 to 54 degC']),
     # the sentence of a code follows with the status, or never
     ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')), 'automatic'], []),
     ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')),
-          'request refused: it cannot be held'], ['refused: it cannot be held']),
+          'request rejected: it cannot be held'], ['rejected: it cannot be held']),
     ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')), 2.0],
-     ['refused: setpoint not held']),
-    ('', [TIMEOUT], []), ('', [TIMEOUT + 0.1], ['refused: the controller did not answer'])])
+     ['rejected: setpoint not held']),
+    ('', [TIMEOUT], []), ('', [TIMEOUT + 0.1], ['rejected: the controller did not answer'])])
 def test_records_and_statuses_answer_requests(
         words: str, events: list[Any], answers: list[str]) -> None:
     requests = Requests({SETPOINT: ('temperature',), MANUAL: ('coolant_temperature',)},

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models for a running controller: those that do not suit it are refused with the reason."""
+"""Models for a running controller: those that do not suit it are rejected with the reason."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,8 +20,8 @@ from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.model_checks import (
     load_suitable,
     ModelCheckContext,
-    refuse_setpoints,
-    refuse_without_law,
+    reject_setpoints,
+    reject_without_law,
 )
 from koopman_ros.parameters.signal_topics import signals_of
 
@@ -63,7 +63,7 @@ def renamed(state: str, coolant: str) -> LiftedModel:
         SHIPPED.provenance, accepted=False, reasons=('too large an error',))),
      'was rejected (too large an error): train it again, or set load_rejected_model'),
 ])
-def test_unsuitable_model_is_refused_with_the_reason(
+def test_unsuitable_model_is_rejected_with_the_reason(
         tmp_path: Path, model: LiftedModel, words: str) -> None:
     file = tmp_path / 'bad.safetensors'
     save(model, file)
@@ -71,8 +71,8 @@ def test_unsuitable_model_is_refused_with_the_reason(
 
     def try_model() -> None:
         loaded = load_suitable(str(file), signals_of(SHIPPED)).model
-        refuse_setpoints(loaded, situation)
-        refuse_without_law(loaded, situation)
+        reject_setpoints(loaded, situation)
+        reject_without_law(loaded, situation)
 
     with pytest.raises(ModelFileError, match=re.escape(words)):
         try_model()
@@ -86,12 +86,12 @@ def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPa
         return ModelCheckContext(TABLE.snapshot({'fallback_order': levels}), State(),
                                  SHIPPED.states.center, None)
 
-    refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
+    reject_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
     bad = replace(SHIPPED, A=1e300 * SHIPPED.A)
     with pytest.raises(ModelFileError, match='train it again'):
-        refuse_without_law(bad, situation('mpc', 'sdre', 'linear'))
+        reject_without_law(bad, situation('mpc', 'sdre', 'linear'))
     with pytest.raises(ModelFileError, match=r'pip install numba daqp\)$'):
-        refuse_without_law(SHIPPED, situation('mpc'))
+        reject_without_law(SHIPPED, situation('mpc'))
 
 
 def slow(patch: pytest.MonkeyPatch) -> None:
@@ -112,12 +112,12 @@ def failing(patch: pytest.MonkeyPatch) -> None:
     ('x' * 5000 + '.safetensors', lambda _: None, 'most 4096'),
     ('/tmp/\0.safetensors', lambda _: None, 'most 4096'),
 ])
-def test_model_that_cannot_be_used_is_refused_in_a_short_sentence(
+def test_model_that_cannot_be_used_is_rejected_in_a_short_sentence(
         monkeypatch: pytest.MonkeyPatch, name: str,
         prepare: Callable[[pytest.MonkeyPatch], None], words: str) -> None:
     prepare(monkeypatch)
-    with pytest.raises(ModelFileError, match=words) as refused:
+    with pytest.raises(ModelFileError, match=words) as rejected:
         load_suitable(name)
-    assert len(str(refused.value)) < 250
+    assert len(str(rejected.value)) < 250
     # nor does training accept it
     assert name != 'reactor_nz4' or re.search(words, usable.unusable(SHIPPED))

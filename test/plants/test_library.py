@@ -103,7 +103,7 @@ def test_a_pendulum_at_thirty_degrees_is_held_by_half_the_torque_of_its_weight()
         equilibrium_input(plant('pendulum'), [np.pi / 6.0, 0.0]), [-0.25 * 9.81], rtol=1e-12)
 
 
-def test_a_steady_state_is_found_by_some_of_its_states_or_refused():
+def test_a_steady_state_is_found_by_some_of_its_states_or_rejected():
     pendulum = plant('pendulum')
     x, u = steady_state(pendulum, {'angle': 0.3})
     np.testing.assert_allclose(x, [0.3, 0.0], atol=1e-15)

@@ -292,7 +292,7 @@ def test_every_constant_enters_the_rates(changes, rate):
     np.testing.assert_allclose(system.drift(np.array([0.5, 350.0])), rate, rtol=1e-12, atol=1e-12)
 
 
-def test_each_constant_is_refused_outside_its_range_with_its_unit():
+def test_each_constant_is_rejected_outside_its_range_with_its_unit():
     for constant in fields(ReactorParameters):
         unit = re.escape(constant.metadata['unit'])
         for value in (np.nextafter(constant.metadata['upper'], np.inf), np.nan, -np.inf):

@@ -44,7 +44,7 @@ def _messages(index: int, stamp_ns: int) -> dict[str, Any]:
             header=header, temperature=51.95 + 0.1 * index, variance=0.04),
         '/diagnostics': diagnostic.DiagnosticArray(header=header, status=[status] * (index % 3)),
         # No empty sequence of doubles: rmw reserves room to align it and leaves the rest as
-        # trailing bytes, which ROS and mcap ignore and rosbags refuses.
+        # trailing bytes, which ROS and mcap ignore and rosbags rejects.
         '/joint_states': sensor.JointState(
             header=header, name=['valve', 'pump'], position=[0.5, float(index)],
             velocity=[-1e-300], effort=[float('nan')]),

@@ -4,8 +4,8 @@
 """
 Bags that are cut, end in other bytes, or are damaged anywhere.
 
-Complete records before the damage are read, nothing that was not recorded is, and a refusal is one
-line. `BAG_MUTANTS=5000 pytest test/records/test_damage.py` tries that many of each kind.
+Complete records before the damage are read, nothing that was not recorded is, and a rejection is
+one line. `BAG_MUTANTS=5000 pytest test/records/test_damage.py` tries that many of each kind.
 """
 
 from collections.abc import Callable
@@ -188,7 +188,7 @@ def mutated(dice: random.Random, whole: bytes) -> bytes:
 
 
 def attempt(read: Callable[[], Any]) -> Any:
-    """Return the result, or None for a refusal of one line."""
+    """Return the result, or None for a rejection of one line."""
     try:
         return read()
     except records.BagReadError as error:
@@ -200,7 +200,7 @@ def attempt(read: Callable[[], Any]) -> Any:
 @pytest.mark.parametrize('name', [*(name for name in KINDS if 'killed' not in name),
                                   'files compressed by rosbag2'])
 @pytest.mark.filterwarnings('ignore:messages on')
-def test_damaged_bag_is_read_or_refused(
+def test_damaged_bag_is_read_or_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     path, files = written(tmp_path, name if name in KINDS else 'folder')

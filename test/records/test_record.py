@@ -97,7 +97,7 @@ def test_times_may_be_a_period_a_unit_of_the_argument_or_an_index(options):
     ({'time': SECONDS, 'level [m]': np.where(SECONDS < 4.0, LEVEL, np.nan)}, {},
      'no usable segment'),
 ])
-def test_refuses_times_and_columns_that_are_none(columns, options, words):
+def test_rejects_times_and_columns_that_are_none(columns, options, words):
     with pytest.raises(ValueError, match=words):
         read(frame(**columns), 'level', 'pump', **options)
 
@@ -197,7 +197,7 @@ def test_several_tables_are_episodes_of_one_record(tmp_path):
     ((np.zeros((9, 2)), 'level', 'pump'), 'a ndarray is not a record'),
     ((frame(time=SECONDS), 'level', 'pump', 'valve'), 'linear names valve'),
 ])
-def test_refuses_signals_and_sources_that_are_none(arguments, words):
+def test_rejects_signals_and_sources_that_are_none(arguments, words):
     source, states, inputs, *linear = arguments
     with pytest.raises(ValueError, match=words):
         read(source, states, inputs, linear=linear)
@@ -206,13 +206,13 @@ def test_refuses_signals_and_sources_that_are_none(arguments, words):
 @pytest.mark.parametrize(('arguments', 'words'), [
     ((['level'], frame(time=SECONDS), ['pump']), 'states .*DataFrame: .* first argument'),
     (('level', 'pump', {'time': SECONDS}), 'inputs .*dict: .* first argument')])
-def test_a_table_in_the_place_of_names_is_refused(arguments, words):
+def test_a_table_in_the_place_of_names_is_rejected(arguments, words):
     with pytest.raises(TypeError, match=words):
         read(*arguments)
 
 
 @pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
-def test_refuses_other_files(tmp_path, file):
+def test_rejects_other_files(tmp_path, file):
     (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
     with pytest.raises(ValueError, match=r'is not a record|version 7\.3'):
         read(tmp_path / file, 'level', 'pump')

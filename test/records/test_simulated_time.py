@@ -58,7 +58,7 @@ def test_receipts_in_plant_time_count(
     (lambda t: min(t, 60.0), r'60 s on /clock in 99.5 s'),  # a pause
     (lambda t: 20.0 * (t % 50.0), r'1980 s on /clock in 99 s'),  # started again
 ])
-def test_receipts_in_another_time_are_refused(
+def test_receipts_in_another_time_are_rejected(
         tmp_path: Path, clock_time: Clock, words: str) -> None:
     path = write(tmp_path / 'run.mcap', lambda t: WALL + t, clock_time)
     with pytest.raises(records.BagReadError, match=f'{words}.*use_sim_time'):

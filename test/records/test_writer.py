@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is written, when, and what is refused; the readers of mcap and rosbags; definitions."""
+"""What is written, when, and what is rejected; the readers of mcap and rosbags; definitions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -136,7 +136,7 @@ def test_existing_path_is_never_overwritten(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(('arguments', 'kind'), [
     (('/y', b'', 1), KeyError), (('/x', 1.5, 1), TypeError), (('/x', b'', -1, 0), ValueError),
     (('/x', b'', 0, -7), ValueError), (('/x', b'', 2**63, 0), ValueError)])
-def test_refused_message_leaves_no_trace(
+def test_rejected_message_leaves_no_trace(
         tmp_path: Path, arguments: tuple[Any, ...], kind: type[Exception]) -> None:
     with records.BagWriter(tmp_path / 'run.mcap') as writer:
         writer.add_topic('/x', NUMBER)
@@ -145,7 +145,7 @@ def test_refused_message_leaves_no_trace(
     assert list(records.read_messages(writer.path)) == []
 
 
-def test_closed_writer_refuses(tmp_path: Path) -> None:
+def test_closed_writer_rejects(tmp_path: Path) -> None:
     writer = records.BagWriter(tmp_path / 'run')
     writer.add_topic('/x', NUMBER)
     # not before the bag is complete

@@ -49,7 +49,7 @@ def running(shared_ros: Harness) -> Harness:
     ({'temperature.topic': 'elsewhere'}, 'read-only'),
     ({'learned_model_margin': 2.0}, 'learned_model_margin = 2.0 must be at most '),
 ])
-def test_change_that_does_not_fit_is_refused_with_the_reason(
+def test_change_that_does_not_fit_is_rejected_with_the_reason(
         running: Harness, change: dict[str, Any], words: str) -> None:
     (result,) = running.set_parameters(CONTROLLER, **change)
     assert not result.successful
@@ -74,7 +74,7 @@ def test_two_limits_that_cross_on_the_way_change_together(running: Harness) -> N
     # equal in K
     ({'temperature.sensor_min': 20.0, 'temperature.sensor_max': 20.00000000000001},
      'temperature.sensor_min = 20.0 degC must be below temperature.sensor_max = ')])
-def test_atomic_change_is_refused_as_a_whole(
+def test_atomic_change_is_rejected_as_a_whole(
         running: Harness, changes: dict[str, float], words: str) -> None:
     result = running.set_parameters_atomically(CONTROLLER, **changes)
     assert not result.successful

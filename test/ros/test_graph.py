@@ -141,8 +141,8 @@ def test_the_panel_uses_exactly_its_granted_topics_and_services(ros: Harness) ->
         f'/{reactor.SETPOINT}', f'/{reactor.MANUAL_COOLANT_SETPOINT}'}})
 
 
-def test_the_replay_uses_exactly_its_granted_topics_and_services(ros: Harness, monkeypatch: pytest.MonkeyPatch
-                                            ) -> None:
+def test_the_replay_uses_exactly_its_granted_topics_and_services(
+        ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is gone before others have found it, so that it is asked itself, at its end."""
     seen: list[Seen] = []
 

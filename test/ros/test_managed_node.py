@@ -108,7 +108,7 @@ def test_node_that_cannot_leave_all_well_acts_no_more_all_the_same(
     node.failures = {'deactivate': error}
     assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert (state(node), node.active) == ('inactive', False)
-    assert node.refusal == 'failing is not active: activate it first'
+    assert node.rejection == 'failing is not active: activate it first'
 
 
 def test_pending_callbacks_are_rejected_or_dropped_at_shutdown(shared_ros: Harness) -> None:

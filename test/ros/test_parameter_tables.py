@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameter tables: words for ranges and refusals, and the shipped files that they write."""
+"""Parameter tables: words for ranges and rejections, and the shipped files that they write."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -67,13 +67,13 @@ def row(default: Any, **details: Any) -> Specification:
     (row(True), '', [False], {}),
     (row('anything'), '', [''], {}),
 ])
-def test_range_and_refusals_in_words(
+def test_range_and_rejections_in_words(
         specification: Specification, words: str, good: list[Any], bad: dict[Any, str]) -> None:
     assert specification.range_text == words
     for given in good:
         assert specification.check(given) == ''
-    for given, refusal in bad.items():
-        assert specification.check(given) == f'level = {refusal}'
+    for given, rejection in bad.items():
+        assert specification.check(given) == f'level = {rejection}'
 
 
 @pytest.mark.parametrize(('default', 'given', 'words'), [
@@ -187,13 +187,13 @@ def test_names_of_other_nodes_are_ignored_with_one_warning(
 def test_a_start_with_unusable_parameters_is_rejected(
         ros: Harness, node: str, given: tuple[str, ...], words: str) -> None:
     arguments = [part for argument in given for part in ('-p', argument)]
-    with pytest.raises(ConfigurationError) as refusal:
+    with pytest.raises(ConfigurationError) as rejection:
         declared(ros, *arguments, table=TABLES[node])
-    assert str(refusal.value).startswith(words)
-    assert '\n' not in str(refusal.value)
+    assert str(rejection.value).startswith(words)
+    assert '\n' not in str(rejection.value)
 
 
-def test_concentration_too_small_to_integrate_is_refused() -> None:
+def test_concentration_too_small_to_integrate_is_rejected() -> None:
     one, two = PlantTable(), PlantTable({'system': 'two_state'})
 
     def check(table: PlantTable, concentration: float) -> str:
@@ -259,7 +259,7 @@ def test_each_signal_has_rows_of_its_own_in_its_units() -> None:
     ({'constants.gravity': -1.0}, 'constants.gravity = -1.0 m/s^2 must be in [0, 20] m/s^2'),
     ({}, ''),
 ])
-def test_values_of_a_signal_are_refused_by_its_name(given: dict[str, float], words: str) -> None:
+def test_values_of_a_signal_are_rejected_by_its_name(given: dict[str, float], words: str) -> None:
     assert SEVERAL.check(SEVERAL.snapshot(given)) == words
 
 
@@ -345,7 +345,7 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
          'unmeasured_states is 1, must be 0'),
         ({'physical_model': 'two_state', 'input_matrix': [2.0]},
          'input_matrix must be a single 0')))])
-def test_values_that_do_not_fit_together_are_refused(
+def test_values_that_do_not_fit_together_are_rejected(
         node: str, given: dict[str, Any], words: str) -> None:
     table = TABLES[node]
     assert re.search(words, table.check(table.snapshot(given)))

@@ -159,7 +159,7 @@ def test_a_type_that_one_row_adds_is_learned_from(
         '/cell', kind, 'voltage', 'V')
 
 
-def refuse(*_: Any) -> Any:
+def reject(*_: Any) -> Any:
     raise AssertionError('nothing is made for a place that cannot be')
 
 
@@ -170,11 +170,11 @@ def refuse(*_: Any) -> Any:
     ('m/s', {**TWIST, 'field': 'twist.linear.w'}, 'TwistStamped has no twist.linear.w'),
     ('K', {'unit': 'm'}, "'(K|m)' cannot be converted to '(K|m)'"),
 ])
-def test_place_that_cannot_be_is_refused(
+def test_place_that_cannot_be_is_rejected(
         shared_ros: Harness, unit: str, given: dict[str, str], words: str) -> None:
     places, units = {'signal': place('nowhere', 'signal', unit, given)}, {'signal': unit}
-    for make in (lambda: SignalSubscriber(shared_ros.node, refuse, places, units, refuse),
-                 lambda: SignalPublisher(places, units, refuse)):
+    for make in (lambda: SignalSubscriber(shared_ros.node, reject, places, units, reject),
+                 lambda: SignalPublisher(places, units, reject)):
         with pytest.raises(ConfigurationError, match=f'^signal: .*{words}'):
             make()
 
@@ -187,14 +187,14 @@ def test_integer_fields_are_read_and_not_published(
     """A command of 23.7 would be sent as whatever the middleware makes of it."""
     places = {'pump': MessageField('pump', kind, field, '1')}
     with pytest.raises(ConfigurationError, match=r'^pump: data.* holds integers'):
-        SignalPublisher(places, {'pump': '1'}, refuse)
+        SignalPublisher(places, {'pump': '1'}, reject)
     heard: list[str] = []
     SignalSubscriber(shared_ros.node, lambda topic, *_: heard.append(topic), places, {'pump': '1'},
-                     refuse)
+                     reject)
     assert heard == ['pump']
 
 
 def test_signals_of_one_topic_have_one_type() -> None:
     places = {'heat': place('both', 'heat', 'K'), 'angle': place('both', 'angle', 'rad')}
     with pytest.raises(ConfigurationError, match='heat and angle share the topic both'):
-        SignalPublisher(places, {'heat': 'K', 'angle': 'rad'}, refuse)
+        SignalPublisher(places, {'heat': 'K', 'angle': 'rad'}, reject)

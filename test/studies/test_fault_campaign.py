@@ -15,7 +15,7 @@ from koopman_ros.core.status import StatusCode
 from koopman_ros.event_log.records import parse
 from studies.faults.__main__ import main
 from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
-from studies.faults.cases import CASES, refused_values
+from studies.faults.cases import CASES, rejected_values
 from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
 from studies.faults.judge import judge
@@ -128,8 +128,8 @@ def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('on', [REACTOR, TWO_TANKS, QUADRUPLE_TANK, HEATED_LINE])
-def test_refused_values_are_of_parameters_that_exist(on: FaultPlant) -> None:
-    names = {name for change in refused_values(on) for name in change}
+def test_rejected_values_are_of_parameters_that_exist(on: FaultPlant) -> None:
+    names = {name for change in rejected_values(on) for name in change}
     assert names <= set(on.table.rows)
 
 

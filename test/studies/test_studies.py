@@ -75,7 +75,7 @@ def test_a_campaign_keeps_finished_runs_and_reasons() -> None:
 
 
 @pytest.mark.parametrize('args', [['--seeds', '0'], ['teapot']])
-def test_impossible_options_are_refused(args: list[str], capsys: pytest.CaptureFixture[str]
+def test_impossible_options_are_rejected(args: list[str], capsys: pytest.CaptureFixture[str]
                                         ) -> None:
     with pytest.raises(SystemExit):
         general(args)

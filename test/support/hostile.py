@@ -74,7 +74,7 @@ class HostileSource:
         self.asked: list[Action] = []
 
     def ask(self, action: Action) -> Future[Answer]:
-        """Refuse what an operator asks for, in words that are no better."""
+        """Reject what an operator asks for, in words that are no better."""
         self.asked.append(action)
         future: Future[Answer] = Future()
         future.set_result(Answer(False, TEXT))

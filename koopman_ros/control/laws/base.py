@@ -202,7 +202,7 @@ class Law(ABC):
 
     def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
         """
-        Prepare the law; a ValueError refuses the configuration.
+        Prepare the law; a ValueError rejects the configuration.
 
         :param model: the lift.
         :param tuning: with one number for each signal of the model.

@@ -1125,7 +1125,7 @@ static void advance(koopman_state *s, mat state, double seconds) {
     s->active = 1;
 }
 
-/* Request a set-point; returns 1 where it is refused. */
+/* Request a set-point; returns 1 where it is rejected. */
 static int request(koopman_state *s, const double *setpoint) {
     EACH(i, NC) if (setpoint[i] < STATES_LOWER[CONTROLLED[i]]
                     || setpoint[i] > STATES_UPPER[CONTROLLED[i]]) return 1;
@@ -1153,7 +1153,7 @@ void koopman_init(koopman_state *s, const double *applied) {
 void koopman_step(koopman_state *s, const koopman_inputs *inputs, koopman_outputs *outputs) {
     int fault = KOOPMAN_OK, received = inputs->received;
     if (inputs->elapsed_ns > 0) s->now += inputs->elapsed_ns;
-    outputs->setpoint_refused = request(s, inputs->setpoint);
+    outputs->setpoint_rejected = request(s, inputs->setpoint);
     if (received ? !s->commanded || s->measured_at != s->now : s->commanded) {
         double usual = isinf(s->interval) ? 0.0 : s->interval, gap = since(s, s->measured_at);
         double elapsed = since(s, s->commanded_at), outside = NAN, counted = 0.0;

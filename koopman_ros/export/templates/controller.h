@@ -37,7 +37,7 @@ typedef struct {
     double command[KOOPMAN_NU];         /* finite, and within range and rate limit */
     int level;
     int status, cause;                  /* why no better level acts, and the reason behind that */
-    int setpoint_refused;               /* 1: outside the trained range, the one before stays */
+    int setpoint_rejected;               /* 1: outside the trained range, the one before stays */
     double state[KOOPMAN_NX];           /* estimated; NAN before the first measurement */
     double setpoint[KOOPMAN_NC];        /* active, on its ramp; NAN before the first measurement */
 } koopman_outputs;

@@ -64,16 +64,16 @@ class WeakForm(IdentificationMethod):
 
     def estimate(self, problem: DriftProblem) -> Sequence[DriftEstimate]:
         """Return an estimate for each window that the segments are long enough for."""
-        found, refusal = [], ''
+        found, rejection = [], ''
         for window in map(int, self.parameters.windows):
             try:
                 found.append(DriftEstimate(weak_form(
                     problem.episodes, problem.box, problem.degree, problem.B, window,
                     problem.input_degree), f'{window} samples'))
             except (ValueError, np.linalg.LinAlgError) as error:
-                refusal = str(error)
+                rejection = str(error)
         if not found:
-            raise ValueError(refusal)
+            raise ValueError(rejection)
         return found
 
 

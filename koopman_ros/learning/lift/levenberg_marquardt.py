@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-# The damping rises by this when a step is refused, and by twice as much each further time.
+# The damping rises by this when a step is rejected, and by twice as much each further time.
 _FACTOR = 2.0
 _MAX_DAMPING = 1e12
 PATIENCE = 20  # accepted steps over which the decrease of the cost is judged

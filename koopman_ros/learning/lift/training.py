@@ -136,7 +136,7 @@ class _Candidate:
 
 
 def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, seed: int = 0,
-          starts: int = 4, watch: Watch | None = None, refuse: bool = True, loops: int = LOOPS,
+          starts: int = 4, watch: Watch | None = None, reject: bool = True, loops: int = LOOPS,
           device: str = 'cpu', backend: Backend | None = None,
           begin: LiftedModel | None = None, budget: float = math.inf) -> Trained:
     """
@@ -151,8 +151,8 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
     :param starts: number of starts in each round; their seeds are drawn from `seed`.
     :param watch: called with the progress; True ends the training with the best lift so far. By
         default a terminal shows the progress on one line.
-    :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
-        refused.
+    :param reject: whether a lift that is no better than the linear model, or whose law fails, is
+        rejected.
     :param loops: closed loops in which the law is tried before, see
         :func:`~koopman_ros.evaluation.closed_loop_test.evaluate_closed_loops`; 0 for none.
     :param device: that evaluates the residuals, as torch names it, on every worker.
@@ -201,7 +201,7 @@ def train(plant: PlantDescription, samples: DriftSamples, recipe: Recipe, *, see
             watch or (lambda now: bool(report(now.finished / now.total, now.text))),
             starts * len(rounds) - (starts - 1) * (begin is not None))
         path, interrupted = _run_rounds(rounds, tracker, run, judge)
-        return _conclude(prepared, path, interrupted, tracker, loops if refuse else 0, refuse,
+        return _conclude(prepared, path, interrupted, tracker, loops if reject else 0, reject,
                          backend)
 
 
@@ -262,12 +262,12 @@ def _run_rounds(rounds: Sequence[int], tracker: Tracker,
 
 
 def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bool,
-              tracker: Tracker, loops: int, refuse: bool, backend: Backend) -> Trained:
+              tracker: Tracker, loops: int, reject: bool, backend: Backend) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
     winner, test = path[-1], prepared.parts[2]
     linear = prepared.linear()
     rx = prepared.rx(linear)
-    if refuse and not winner.fit.rx + ROUNDING < rx:
+    if reject and not winner.fit.rx + ROUNDING < rx:
         raise TrainingFailed(
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
             f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '

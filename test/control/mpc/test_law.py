@@ -329,7 +329,7 @@ def test_input_outside_a_narrowed_range_returns_at_its_rate():
 @pytest.mark.parametrize('own', [
     MPCParameters(lower=np.array([1.0, 0.0]), upper=np.array([1.0, 1.0])),
     MPCParameters(lower=np.array([2.0, -np.inf]), upper=np.array([1.0, np.inf]))])
-def test_contradictory_limits_of_the_states_are_refused(own):
+def test_contradictory_limits_of_the_states_are_rejected(own):
     with pytest.raises(ValueError, match='min < max'):
         law(OSCILLATOR[1], own)
 

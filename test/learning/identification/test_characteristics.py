@@ -120,7 +120,7 @@ def test_one_that_is_given_is_kept():
     assert len(found.drift.box.inputs.characteristics['valve'].values) == 2
 
 
-def test_an_effect_that_rises_and_falls_is_refused():
+def test_an_effect_that_rises_and_falls_is_rejected():
     with pytest.raises(ValueError, match='valve rises and falls'):
         identified(record(lambda x, u: -x + u * u, -1.0, 1.0))
 

@@ -44,7 +44,7 @@ def record(u: np.ndarray, seed: int, noise: float, *, measured: bool = True,
 @pytest.mark.parametrize('hold', [4, 12, 40])
 @pytest.mark.parametrize('noise', [0.0, 0.05, 0.5])
 @pytest.mark.parametrize('gain', [0.35, -2.0])
-def test_inputs_that_moved_together_are_refused_by_name_also_where_noise_hides_it(
+def test_inputs_that_moved_together_are_rejected_by_name_also_where_noise_hides_it(
         hold: int, noise: float, gain: float) -> None:
     """As with one pump in a fixed ratio to another."""
     for seed in SEEDS:
@@ -100,7 +100,7 @@ def test_no_collinearity_warning_for_known_effects_or_one_input() -> None:
 
 
 @pytest.mark.parametrize('estimate', [identify, lambda *given: identify_unmeasured(*given, 1)])
-def test_estimates_are_refused_before_they_are_made(estimate) -> None:
+def test_estimates_are_rejected_before_they_are_made(estimate) -> None:
     u = steps(0, 12)
     u[:, 1] = 0.5 * u[:, 0]
     with pytest.raises(ValueError, match='pump_1 and pump_2 moved together'):

@@ -266,7 +266,7 @@ class Silent(Constants):
      r'the record has the states depth \[m\]'),
     (description(('level',), ('tap',)), Vessel, {},
      r'the record has the inputs tap \[V\]')])
-def test_what_does_not_fit_is_refused(plant, equations, ranges, words):
+def test_what_does_not_fit_is_rejected(plant, equations, ranges, words):
     with pytest.raises(ValueError, match=words):
         estimate_parameters(plant, [vessel(0)], equations, ranges)
 

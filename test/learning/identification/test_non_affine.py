@@ -79,7 +79,7 @@ def test_with_the_command_as_a_state_it_is_affine_and_simulates_the_same(found):
     assert drift.box.inputs.upper[0] == found.drift.box.inputs.upper[0]
 
 
-def test_a_known_effect_of_the_input_is_refused():
+def test_a_known_effect_of_the_input_is_rejected():
     with pytest.raises(ValueError, match='input_matrix'):
         identify_non_affine(PlantDescription(
             'tank', ('level',), ('m',), ('valve',), ('1',), 's', np.zeros(1), np.zeros(1),

@@ -202,7 +202,7 @@ def test_no_network_that_may_diverge_far_from_the_data_is_offered(grows, beside,
     assert network_candidates.Shared(own, None, True, 1.0).allowed(network) is allowed
 
 
-def test_a_record_whose_simulations_all_diverge_is_refused():
+def test_a_record_whose_simulations_all_diverge_is_rejected():
     with pytest.raises(ValueError, match='no drift fits the episodes: record longer'):
         identify_unmeasured(replace(PLANT, B=np.array([[1.0]])),
                             [record(saddle, samples=200, gain=2.0, size=0.1)], 1, highest_degree=1)
@@ -235,7 +235,7 @@ def test_progress_is_reported_and_a_cancel_request_ends_the_job():
     (PLANT, 100, 100, 'record at least 160'),
     (PLANT, 600, 40, 'too short for a filter'),
     (replace(PLANT, input_matrix_degree=1), 600, 600, 'set input_matrix_degree to 0')])
-def test_unsuitable_records_and_plants_are_refused(plant, samples, length, words):
+def test_unsuitable_records_and_plants_are_rejected(plant, samples, length, words):
     whole = record(oscillator, samples=samples)
     with pytest.raises(ValueError, match=words):
         identify_unmeasured(plant, [whole.part(k, k + length) for k in range(0, samples, length)],

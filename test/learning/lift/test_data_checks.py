@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples whose times or nominal point contradict the plant are refused, noisy ones are not."""
+"""Samples whose times or nominal point contradict the plant are rejected, noisy ones are not."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period
 
 @pytest.mark.parametrize('noise', [0.0, 0.005])
 @pytest.mark.parametrize('factor', [10.0, 1.0 / 60.0, -1.0])
-def test_times_or_rates_in_another_unit_are_refused(factor, noise):
+def test_times_or_rates_in_another_unit_are_rejected(factor, noise):
     samples = decaying(noise)
     # times that are too long, or rates that are too small
     wrong = replace(samples, time=factor * samples.time) if factor > 1.0 else (
@@ -111,6 +111,6 @@ RISING = replace(bent_samples(), dxdt=bent_samples().dxdt + 20.0)
      r'-0\.05 1/s of x1, .* nominal_state = \[0\.0, '),
     (BENT, RISING, '20 m/s of level: excite the plant around a')],
     ids=['known B', 'learned B', 'more states than inputs', 'no steady state'])
-def test_a_nominal_point_where_the_plant_moves_is_refused(plant, samples, words):
+def test_a_nominal_point_where_the_plant_moves_is_rejected(plant, samples, words):
     with pytest.raises(ValueError, match=f'moves with {words}'):
         train(plant, samples, replace(SMALL, n_z=3), starts=1)

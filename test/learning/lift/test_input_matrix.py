@@ -82,7 +82,7 @@ def test_the_input_matrix_is_that_of_the_plant_all_over_the_box(known):
     assert rx[1] < 1e-4 < 0.1 * rx[0]
 
 
-def test_a_function_that_is_no_polynomial_is_refused_and_a_constant_one_is_a_constant():
+def test_a_function_that_is_no_polynomial_is_rejected_and_a_constant_one_is_a_constant():
     box = Box.of(KNOWN, samples().x, samples().u)
     wild = replace(KNOWN, B=lambda x: PLANT.input_matrix(x) * np.sign(x[..., 1:, None] - 324.0))
     with pytest.raises(ValueError, match='differs from a polynomial of degree 5'):

@@ -96,7 +96,7 @@ def test_training_keeps_the_read_out_that_is_better_on_validation_episodes(plant
     noise[~np.isin(samples.episode, training.episode)] = 0.0
     rough = DriftSamples(samples.x[few], (samples.dxdt + noise)[few], samples.u[few],
                          samples.episode[few])
-    assert train(plant, rough, recipe, starts=1, refuse=False).model.readout is None
+    assert train(plant, rough, recipe, starts=1, reject=False).model.readout is None
 
 
 # A network for the drift alone.

@@ -43,7 +43,7 @@ def samples_of(plant, drift, half, count=400):
 
 
 def learned(plant, samples, recipe, starts=1):
-    return train(plant, samples, recipe, starts=starts, refuse=False).model
+    return train(plant, samples, recipe, starts=starts, reject=False).model
 
 
 RECIPE = IncrementalTraining(1, identity=False, hidden_first=6, max_iterations=80,
@@ -164,7 +164,7 @@ def test_of_two_whitening_weights_validation_takes_the_better_one():
     samples = samples_of(GROWING, growing, np.array([0.8]))
     recipe = IncrementalTraining(3, hidden_first=6, max_iterations=30)
     both = train(GROWING, samples, replace(recipe, other_whitenings=(1e6,)), starts=2,
-                 refuse=False)
+                 reject=False)
     assert both.starts == 4
     # nothing is left of the dynamics beside so large a weight
     poor = learned(GROWING, samples, replace(recipe, whitening=1e6))
