@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drifts dx/dt = f(x, u): functions of inputs beside them, with factors that depend on x."""
+"""Drifts dx/dt = f(x, u): additional functions of inputs, with factors that depend on x."""
 
 from __future__ import annotations
 
