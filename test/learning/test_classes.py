@@ -110,6 +110,13 @@ def test_noise_neither_hides_an_error_nor_makes_one(bend, chosen):
     assert evaluate_model(found, comparison, None, GATE, loops=16).accepted
 
 
+@pytest.fixture
+def monomials_judged(monkeypatch):
+    """Judge the condition number of a polynomial, too, so that a simple class is rejected."""
+    monkeypatch.setattr('koopman_ros.learning.acceptance.PolynomialObservables', ())
+
+
+@pytest.mark.usefixtures('monomials_judged')
 def test_a_class_that_the_gate_would_reject_is_not_chosen(found, best):
     # between the coordinates of the neural drift, which are the states, and those of the others
     strict = Thresholds(condition=0.5 * (1.0 + best.contenders[1].figures.fit.cond))
@@ -135,6 +142,7 @@ def test_a_class_that_is_named_is_learned_alone(found, name):
     assert decision.accepted
 
 
+@pytest.mark.usefixtures('monomials_judged')
 def test_a_rejection_advises_to_compare_the_classes_unless_they_were_compared(found, best):
     strict = Thresholds(condition=0.5 * (1.0 + best.figures.fit.cond))
     for learned, advised in ((best, False), (compared(found, 'polynomial'), True)):
