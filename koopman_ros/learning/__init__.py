@@ -25,8 +25,9 @@ from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.neural_drift import NeuralDrift
 from koopman_ros.learning.lift.training import train, Trained, TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison, compare, Judge, ModelCandidate
-from koopman_ros.learning.pipeline import retrain, Retrained
+from koopman_ros.learning.pipeline import retrain
 from koopman_ros.learning.report import write_report
+from koopman_ros.learning.retrained import Retrained
 from koopman_ros.learning.task import TrainingTask
 
 __all__ = [

@@ -16,7 +16,7 @@ from koopman_ros.learning.downsampling import CELLS, visited_cells
 from koopman_ros.learning.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
-from koopman_ros.learning.pipeline import Retrained
+from koopman_ros.learning.retrained import Retrained
 from koopman_ros.model import Coordinates
 from koopman_ros.model_classes import BEST
 

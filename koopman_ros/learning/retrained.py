@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Result of a retraining, and its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.datasets import PlantDescription
+from koopman_ros.core.plots import finite
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.learning.acceptance import AcceptanceResult
+from koopman_ros.learning.free_run import FreeRun
+from koopman_ros.learning.identification import DriftModel, Identified, LaggedDrift
+from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
+from koopman_ros.learning.record import Reduction
+from koopman_ros.learning.task import TrainingTask
+from koopman_ros.model import COMMANDED, LiftedModel
+from koopman_ros.records import ImportReport
+
+
+@dataclass(frozen=True)
+class Retrained:
+    """Result of a retraining."""
+
+    task: TrainingTask  #: the task
+    account: ImportReport  #: counts of used and dropped measurements
+    found: Identified  #: the estimated drift
+    #: the classes that were learned, None when there is no model worth judging
+    learned: ClassComparison | None
+    decision: AcceptanceResult | None  #: its figures, None without a lift
+    reasons: tuple[str, ...]  #: why it was rejected; empty when it was accepted
+    #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
+    coverage: Mapping[tuple[str, str], float]
+    plant: PlantDescription  #: names, units and nominal point; its time unit is that of the drift
+    present: LiftedModel | None  #: the lift that was in use, where there was one
+    model_file: str = ''  #: where the lift was written, or an empty string
+    #: models of other drifts that explain the record equally well
+    alternative_files: tuple[str, ...] = ()
+    reduction: Reduction | None = None  #: the part of a long record that is used
+    #: of the new model, by record: ``'record'`` for that it was learned from, ``'test'``
+    free_runs: Mapping[str, FreeRun] = field(default_factory=dict)
+    #: the same of the estimated drift and of the best linear model, by model and record
+    compared_runs: Mapping[str, Mapping[str, FreeRun]] = field(default_factory=dict)
+
+    __repr__ = short_repr
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the lift may be used."""
+        return not self.reasons
+
+    @property
+    def dead_time(self) -> Array:
+        """Dead times (n_u,) of the inputs, in s."""
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * self.found.dead_time
+
+    @property
+    def lag(self) -> Array:
+        """Lags (n_u,) of the inputs, in s."""
+        drift = self.found.drift
+        if not isinstance(drift, LaggedDrift):
+            return np.zeros(len(drift.box.inputs))
+        own = [COMMANDED + name not in drift.box.states.names for name in drift.box.inputs.names]
+        return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * drift.lag * own
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name, for a JSON file; None is an error that is infinite."""
+        box = self.found.drift.box
+        states, inputs = box.states, box.inputs
+        gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
+
+        def by_state(values: Array) -> dict[str, float]:
+            return dict(zip(states.names, map(float, values), strict=True))
+
+        def of_class(one: ModelCandidate) -> dict[str, object]:
+            about: dict[str, object] = {
+                'chosen': self.learned is not None and one is self.learned.chosen,
+                'rejection': one.rejection, 'limit': one.limit, 'seconds': one.seconds,
+                'steps': one.steps}
+            if one.figures and one.law_check:
+                assert one.figures.rollout_rmse is not None
+                about |= {
+                    'heldout_rx': one.figures.fit.rx,
+                    'heldout_error': by_state(one.figures.rollout_rmse),
+                    'beyond_noise': one.excess,
+                    'closed_loops': one.law_check.loops,
+                    'closed_loops_failed': int(np.sum(one.law_check.failed)),
+                    'closed_loop_cost_over_linear': one.law_check.median_ratio}
+            return about
+
+        figures: dict[str, object] = {
+            'accepted': self.accepted,
+            'model_class': 'none learned' if self.learned is None else self.learned.chosen.name,
+            'reasons': list(self.reasons),
+            'warnings': list(self.decision.warnings) if self.decision else [],
+            'model_file': self.model_file,
+            'alternative_files': list(self.alternative_files),
+            'units': dict(zip((*states.names, *inputs.names), (*states.units, *inputs.units),
+                              strict=True)),
+            'measurements_read': self.account.measurements,
+            'measurements_used': self.account.used,
+            'reduction': None if self.reduction is None else asdict(self.reduction),
+            'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
+            'derivative_method': self.found.method,
+            'drift': self.found.drift.form,
+            'structure_search': list(self.found.steps),
+            'drift_degree': (
+                self.found.drift.degree if isinstance(self.found.drift, DriftModel) else None),
+            'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
+                           for name, row in zip(states.names, gains, strict=True)},
+            'noise': by_state(self.found.noise),
+            'dead_time': dict(zip(inputs.names, self.dead_time.tolist(), strict=True)),
+            'lag': dict(zip(inputs.names, self.lag.tolist(), strict=True)),
+            'characteristics': {name: [one.values.tolist(), one.effects.tolist()]
+                                for name, one in self.found.drift.characteristics.items()},
+            'constants': {one.name: {
+                'value': one.value, 'standard_error': one.standard_error,
+                'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
+                'standing': one.standing.name.lower(), 'text': str(one)}
+                for one in self.found.constants},
+        }
+        if self.decision and self.learned:
+            trained, fit = self.learned.model.states, self.learned.figures.fit
+            check = self.decision.law_check
+            figures |= {
+                'model_class': self.learned.chosen.name,
+                'classes': {one.name: of_class(one) for one in self.learned.contenders},
+                'trained_from': by_state(trained.lower),
+                'trained_to': by_state(trained.upper),
+                'heldout_error': by_state(self.decision.rmse),
+                'heldout_error_of_current_model': None if self.decision.current_rmse is None else (
+                    by_state(self.decision.current_rmse)),
+                'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
+                'heldout_rw': fit.rw,
+                'heldout_rx': fit.rx,
+                'condition': fit.cond,
+                'closed_loops': check.loops,
+                'closed_loop_statement': self.decision.statement,
+                'closed_loops_arrived': check.arrived,
+                'closed_loops_failed': int(np.sum(check.failed)),
+                'closed_loop_cost_over_linear': check.median_ratio,
+                'worst_closed_loop_cost_over_linear': check.worst_ratio,
+            }
+
+        def of_runs(runs: Mapping[str, FreeRun]) -> dict[str, object]:
+            return {name: {'error': dict(zip(run.names, map(float, run.rmse), strict=True)),
+                           'fit_percent': dict(zip(run.names, map(float, run.fit), strict=True))}
+                    for name, run in runs.items()}
+
+        figures['free_runs'] = of_runs(self.free_runs)
+        figures['free_runs_of'] = {name: of_runs(runs)
+                                   for name, runs in self.compared_runs.items()}
+        finite_figures: dict[str, object] = finite(figures)
+        return finite_figures
