@@ -38,15 +38,13 @@ from koopman_ros.learning.identification.identify import (
 from koopman_ros.learning.identification.lag import find_lags, lagged, LaggedDrift, with_lag
 from koopman_ros.learning.identification.non_affine import identify_non_affine
 from koopman_ros.learning.identification.output_error import output_error
+from koopman_ros.learning.identification.structure_search import identify_structure
 from koopman_ros.learning.identification.total_variation import (
     noise_level,
     total_variation,
     TotalVariation,
 )
-from koopman_ros.learning.identification.unmeasured_states import (
-    identify_structure,
-    identify_unmeasured,
-)
+from koopman_ros.learning.identification.unmeasured_states import identify_unmeasured
 from koopman_ros.learning.identification.weak_form import weak_form, WeakForm
 
 __all__ = [

@@ -18,7 +18,7 @@ from koopman_ros.learning.identification.drift import Drift, DriftModel
 from koopman_ros.learning.identification.identify import Identified, identify, usual_degrees
 from koopman_ros.learning.identification.input_functions import Legendre, NonAffineDrift
 from koopman_ros.learning.identification.structure_candidates import compared
-from koopman_ros.learning.identification.unmeasured_states import free_run_errors
+from koopman_ros.learning.identification.structure_search import free_run_errors
 from koopman_ros.model import Box, Coordinates
 
 _HIGHEST_FUNCTION, _MOST_FUNCTIONS = 7, 20  # degree in the inputs, and number

@@ -16,7 +16,7 @@ from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_with_characteristics
 from koopman_ros.learning.identification.characteristics import NotMonotoneError
 from koopman_ros.learning.identification.input_functions import NonAffineDrift
-from koopman_ros.learning.identification.unmeasured_states import _with_characteristics
+from koopman_ros.learning.identification.structure_search import with_characteristics
 from koopman_ros.model import load
 from koopman_ros.records import read, RecordedInput, RecordedState
 from support.known_plants import methods
@@ -105,7 +105,7 @@ def test_one_that_acts_on_a_state_that_is_not_measured_is_found():
     # to the measured state alone the effect seems to rise and fall
     with pytest.raises(NotMonotoneError):
         identified(episode)
-    found = _with_characteristics(PLANT, [episode], ['valve'], dead_times=False
+    found = with_characteristics(PLANT, [episode], ['valve'], dead_times=False
                                   ).characteristics['valve']
     u = np.linspace(found.values[0], found.values[-1], 101)
     true = (30.0 ** u - 30.0 ** u[0]) / (30.0 ** u[-1] - 30.0 ** u[0])
