@@ -130,18 +130,18 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
             return None
         costs[:, hopeless], no_gain[hopeless] = ended
     own, informed, *others = costs
-    ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
+    ratios, excess = _cost_ratios(own, np.min(others, axis=0)), _cost_ratios(own, informed)
     if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
         some = starts[beaten], targets[beaten], inputs[beaten]
         again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, tell,
                      operated=False)
         if again is None:
             return None
-        excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
+        excess[beaten] = np.minimum(excess[beaten], _cost_ratios(own[beaten], again[0][0]))
     return own, ratios, no_gain, excess, hopeless
 
 
-def _beside(cost: Array, other: Array) -> Array:
+def _cost_ratios(cost: Array, other: Array) -> Array:
     """Return ratios (M,) of costs; 0 where the other is infinite."""
     finite = np.isfinite(other)
     return np.where(finite, cost / np.where(finite, other, 1.0), 0.0)

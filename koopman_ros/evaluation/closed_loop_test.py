@@ -39,7 +39,7 @@ CONFIDENCE = 0.99
 
 # A loop starts at least so far from its set-point, in units of the scale.
 _APART = 0.25
-# Slowest time constants of the linear loop that a loop lasts, and the slowest rate beside the
+# Slowest time constants of the linear loop that a loop lasts, and the slowest rate relative to the
 # fastest that is waited for.
 _DURATION = 6.0
 _SLOWEST = 1e-3

@@ -264,9 +264,9 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
-        beside = held_out.exceeded(model, 'the current model', rmse, current_rmse,
+        worse = held_out.exceeded(model, 'the current model', rmse, current_rmse,
                                    'keep that one, or reduce acceptance_margin')
-        reasons = (*filter(None, [beside]), *reasons)
+        reasons = (*filter(None, [worse]), *reasons)
     further = () if reasons else held_out.further_checks(model, loops, watch, backend)
     reasons = (*reasons, *dict.fromkeys(
         held_out.uncontrolled(f'a {drift.form} that explains the record better{words}', check,

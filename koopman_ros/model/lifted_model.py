@@ -37,7 +37,7 @@ from koopman_ros.model_classes import (
 LONGEST_DEAD_TIME = 3600.0  #: s
 #: of the state that is the applied value of an input behind a lag, before the input's name
 APPLIED = 'applied_'
-#: likewise of the state that is the command of an input: a law sets its rate
+#: of the state that is the command of an input, whose rate a law sets
 COMMANDED = 'commanded_'
 
 # Figures on held-out data in words, by their names in files.

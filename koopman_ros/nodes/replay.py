@@ -22,8 +22,8 @@ def _prepare() -> Callable[[], int]:
         given = node.given()
         new_model = str(given.get('new_model', ''))
         # those of a controller with the new model may be given, too
-        beside = tuning(load_suitable(new_model, force=True).model, given) if new_model else ()
-        parameters = node.declare_table(REPLAY_TABLE, beside)
+        further = tuning(load_suitable(new_model, force=True).model, given) if new_model else ()
+        parameters = node.declare_table(REPLAY_TABLE, further)
         topic = node.resolve_topic_name(topics.EVENT_LOG)
     finally:
         node.destroy_node()

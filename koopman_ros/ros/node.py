@@ -104,17 +104,17 @@ class LoopNode(HostedNode):
             descriptor.floating_point_range = [limits]
         return descriptor
 
-    def declare_table(self, table: ParameterTable[T], beside: Collection[str] = ()) -> T:
+    def declare_table(self, table: ParameterTable[T], further: Collection[str] = ()) -> T:
         """
         Declare every parameter of a table, and validate the whole.
 
         Names that no table knows are ignored with a warning: a file may serve several nodes.
 
-        :param beside: further names that count as known.
+        :param further: further names that count as known.
         :raises ConfigurationError: naming the parameter, its value and the allowed range.
         """
         given: dict[str, Any] = dict(self.get_parameters_by_prefix(''))
-        unknown = [name for name in given if name not in table.rows and name not in beside
+        unknown = [name for name in given if name not in table.rows and name not in further
                    and name not in _RCLPY_PARAMETERS and not name.startswith('qos_overrides')]
         # as if they had not been given, like in any node
         for name in [*unknown, *set(given).intersection(table.rows)]:

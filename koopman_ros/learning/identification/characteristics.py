@@ -87,7 +87,7 @@ def characteristic_of(found: Identified, name: str) -> Characteristic | None:
     u = functions.knots[name]
     v = np.tile(inputs.center, (len(u), 1))
     v[:, inputs.names.index(name)] = u
-    effects = better.box.inputs.to_deviation(functions.beside(v)) @ (
+    effects = better.box.inputs.to_deviation(functions.appended(v)) @ (
         better.scaled_input_matrix(np.zeros(len(drift.box.states))).T)
     # the part that all states have in common
     effects -= effects[0]

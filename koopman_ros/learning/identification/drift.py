@@ -290,12 +290,12 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     count = np.maximum(np.sum(segments.measured, axis=0), 1)
     best, least = x0, np.full_like(x0, np.inf)
     # with each segment the same from starts that differ in one state
-    beside = segments.repeated(1 + n_x)
+    shifted = segments.repeated(1 + n_x)
     shifts = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
     for last in (False, False, True):
         tried = x0 + scale * (shifts[:1] if last else shifts)[:, None]
         # errors in units of the scale: states of different units weigh alike
-        found = (segments if last else beside).errors(rate, tried.reshape(-1, n_x)) / scale
+        found = (segments if last else shifted).errors(rate, tried.reshape(-1, n_x)) / scale
         found = found.reshape(len(found), *tried.shape)
         errors = found[:, 0]
         # a model may diverge from any of the starts

@@ -106,7 +106,7 @@ class Equations(Drift):
             return rate, S
         x, u = self._own(xi, v)
         dS = self.scaled_slope(xi, v) @ S
-        for j, (ahead, behind) in enumerate(self._beside):
+        for j, (ahead, behind) in enumerate(self._neighbours):
             change = _rate(ahead, x, u) - _rate(behind, x, u)
             dS[..., j] += change.take(self._back, axis=-1) * (self._pace / (2.0 * _DIFFERENCE))
         return rate, dS
@@ -137,7 +137,7 @@ class Equations(Drift):
         return self._at(self.theta)
 
     @cached_property
-    def _beside(self) -> list[tuple[ControlAffineSystem, ControlAffineSystem]]:
+    def _neighbours(self) -> list[tuple[ControlAffineSystem, ControlAffineSystem]]:
         """The equations with each angle a little larger, and smaller."""
         return [(self._at(self.theta + step), self._at(self.theta - step))
                 for step in _DIFFERENCE * np.eye(len(self.theta))]

@@ -128,9 +128,9 @@ def _refined(record: SplitRecord, start: Predictor[Equations], monitor: Callable
     none = 0.0 * start.gain
     first = _fitted(record, start, none, record.fit, _GROWTHS[0], monitor)
     start = _filter(record, first.model, len(none.T))
-    alone, beside = (_fitted(record, start, gain, record.fit, _GROWTHS[1], monitor)
+    alone, filtered = (_fitted(record, start, gain, record.fit, _GROWTHS[1], monitor)
                      for gain in (none, start.gain))
-    best = beside if beside.cost < alone.cost else alone
+    best = filtered if filtered.cost < alone.cost else alone
     return Predictor(best.model, start.gain), best
 
 

@@ -104,8 +104,8 @@ class Predictor(Generic[_Drift]):
         best, least = best_of(tried if guess is None else np.concatenate((guess[None], tried)))
         steps = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
         for _ in range(_SEARCHES):
-            here, *beside = errors(best + steps[:, None])
-            slopes = np.stack([other - here for other in beside], axis=-1) / _STEP
+            here, *shifted = errors(best + steps[:, None])
+            slopes = np.stack([other - here for other in shifted], axis=-1) / _STEP
             change = gauss_newton_step(slopes, here)
             if change is None:
                 break

@@ -42,14 +42,14 @@ class InputFunctions(ABC):
         some = frozenset[int]().union(*self.arguments)
         return tuple(self.inputs.names[j] for j in sorted(some))
 
-    def beside(self, u: Array) -> Array:
+    def appended(self, u: Array) -> Array:
         """Return inputs (..., n_u) and after them the functions of them."""
         return np.concatenate((u, self.values(u)), axis=-1)
 
     def added(self, episode: Episode) -> Episode:
         """Return an episode with the functions as further inputs."""
         linear = episode.linear or (False,) * len(self.inputs)
-        return replace(episode, u=self.beside(episode.u), linear=(*linear, *(
+        return replace(episode, u=self.appended(episode.u), linear=(*linear, *(
             all(linear[j] for j in some) for some in self.arguments)))
 
     def coordinates(self) -> Coordinates:
@@ -134,7 +134,7 @@ class NonAffineDrift(Drift):
 
     def _with_functions(self, v: Array) -> Array:
         return self.drift.box.inputs.to_deviation(
-            self.functions.beside(self.box.inputs.to_physical(v)))
+            self.functions.appended(self.box.inputs.to_physical(v)))
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations; see :class:`Drift`."""

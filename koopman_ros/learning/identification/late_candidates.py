@@ -47,10 +47,10 @@ def _dead_times(record: SplitRecord, linear: StructureCandidate, manipulated: Se
         return []
     best = LinearModels(data, -(-len(linear.gain) // n_y), n_y).best(
         tuple(longest * own for own in manipulated), monitor)
-    beside = [tuple(np.add(best, sign * row).tolist())
+    neighbours = [tuple(np.add(best, sign * row).tolist())
               for row in np.eye(len(manipulated), dtype=int)[list(manipulated)]
               for sign in (1, -1)]
-    return [late for late in (best, *beside) if any(late) and min(late) >= 0]
+    return [late for late in (best, *neighbours) if any(late) and min(late) >= 0]
 
 
 def late_as_suits(one: StructureCandidate, record: SplitRecord, manipulated: Sequence[bool],

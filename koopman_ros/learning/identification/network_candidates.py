@@ -37,7 +37,7 @@ def network_starts(seed: int) -> dict[str, tuple[int, int]]:
 class Shared:
     """The common data of all networks."""
 
-    linear: StructureCandidate  #: beside which they are
+    linear: StructureCandidate  #: to which they are added
     data: tuple[Segments, Array]  #: pieces that are simulated, and where they start
     learn_input_matrix: bool
     budget: float  #: of each, in s of processor time
@@ -90,7 +90,7 @@ def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[Netwo
     (units, seed), drift = item, shared.linear.model.drift
     assert isinstance(drift, DriftModel)
     found = fitted_by_simulation(
-        NetworkDrift.beside(drift, units, seed, ridge=_RIDGE,
+        NetworkDrift.added_to(drift, units, seed, ridge=_RIDGE,
                             learn_input_matrix=shared.learn_input_matrix),
         shared.linear.gain, *shared.data, monitor)
     return found if shared.allowed(found.model) else None

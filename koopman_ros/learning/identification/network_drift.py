@@ -41,7 +41,7 @@ class NetworkDrift(Drift):
     __repr__ = short_repr
 
     @classmethod
-    def beside(cls, linear: DriftModel, hidden_units: int, seed: int, *, ridge: float,
+    def added_to(cls, linear: DriftModel, hidden_units: int, seed: int, *, ridge: float,
                learn_input_matrix: bool) -> NetworkDrift:
         """Return a linear drift with a network that has almost no weight yet."""
         rng = np.random.default_rng(seed)

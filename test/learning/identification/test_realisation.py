@@ -50,7 +50,7 @@ def test_an_unstable_record_has_no_realisation():
 
 
 @pytest.mark.filterwarnings('error')
-def test_slow_modes_beside_a_short_period_are_realised() -> None:
+def test_slow_modes_with_a_short_period_are_realised() -> None:
     """The Gramians of such a model are singular to rounding as a system of equations."""
     from scipy.signal import lfilter
 

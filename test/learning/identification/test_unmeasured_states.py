@@ -189,16 +189,16 @@ def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
     assert errors[0] < 1.5 * NOISE < 0.5 * errors[1]
 
 
-@pytest.mark.parametrize(('grows', 'beside', 'allowed'), [
+@pytest.mark.parametrize(('grows', 'base_grows', 'allowed'), [
     (-0.2, -0.2, True), (0.2, -0.2, False), (0.2, 0.2, True)])
-def test_no_network_that_may_diverge_far_from_the_data_is_offered(grows, beside, allowed):
-    """Unless the linear model beside it does as well."""
+def test_no_network_that_may_diverge_far_from_the_data_is_offered(grows, base_grows, allowed):
+    """Unless the linear model that it is added to does as well."""
     def linear(slope):
         return DriftModel(box([-1.0], [1.0], [-1.0], [1.0]), 1, np.array([[0.0], [slope]]),
                           np.eye(1))
 
-    network = NetworkDrift.beside(linear(grows), 2, 0, ridge=1e-4, learn_input_matrix=True)
-    own = SimpleNamespace(model=SimpleNamespace(drift=linear(beside)))
+    network = NetworkDrift.added_to(linear(grows), 2, 0, ridge=1e-4, learn_input_matrix=True)
+    own = SimpleNamespace(model=SimpleNamespace(drift=linear(base_grows)))
     assert network_candidates.Shared(own, None, True, 1.0).allowed(network) is allowed
 
 
