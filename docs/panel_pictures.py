@@ -31,7 +31,9 @@ def main() -> None:
         ros.start('controller')
         ros.start('trainer', {**TRAINER, 'output': f'{folder}/run.mcap',
                               'model_output': f'{folder}/new.safetensors'})
-        ros.start('plant', {'speed': 40.0, 'temperature.measurement_noise': 0.01})
+        # a jacket that has fouled since the current model was trained
+        ros.start('plant', {'speed': 40.0, 'temperature.measurement_noise': 0.01,
+                            'constants.heat_transfer_coefficient': 750.0})
         url = ros.wait_until(lambda: ADDRESS.search(panel.output()))[1]
         browser = playwright.chromium.launch(
             executable_path=shutil.which('chromium'), args=['--no-sandbox'])
