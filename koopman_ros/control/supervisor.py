@@ -107,9 +107,10 @@ class Supervisor:
         for law, margin in reversed(tuple(zip(order.laws, order.margins, strict=True))):
             below = order.below(law) if law != order.laws[-1] else SAFE
             entered = order.depth(self.settled) >= order.depth(below)
-            if outside > (_HYSTERESIS * margin if entered else margin):
+            least = _HYSTERESIS * margin if entered else margin
+            if outside > least:
                 return LevelRequest(below, reason(
-                    StatusCode.OUTSIDE_TRAINING, ranges=ranges, margin=margin, level=law))
+                    StatusCode.OUTSIDE_TRAINING, ranges=ranges, margin=least, level=law))
         return LevelRequest(order.laws[0])
 
     def at(self, order: FallbackOrder, requested: LevelRequest, time_ns: int) -> Supervisor:

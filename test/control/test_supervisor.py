@@ -140,16 +140,17 @@ def test_reasons_name_the_awaited_condition():
     assert say(blind[-1].reason) == f'{say(BLIND.reason)}; held for longer than 60 s'
 
 
-@pytest.mark.parametrize(('level', 'outside', 'allowed'), [
-    ('sdre', 0.2, 'sdre'), ('sdre', 0.21, 'linear'),
-    ('sdre', 1.01, 'safe'), ('linear', 0.11, 'linear'),
-    ('linear', 0.1, 'sdre'), ('linear', 0.9, 'linear'),
-    ('safe', 0.51, 'safe'), ('safe', 0.5, 'linear'), ('safe', 0.05, 'sdre'),
+@pytest.mark.parametrize(('level', 'outside', 'allowed', 'named'), [
+    ('sdre', 0.2, 'sdre', None), ('sdre', 0.21, 'linear', 0.2),
+    ('sdre', 1.01, 'safe', 1.0), ('linear', 0.11, 'linear', 0.1),
+    ('linear', 0.1, 'sdre', None), ('linear', 0.9, 'linear', 0.1),
+    ('safe', 0.51, 'safe', 0.5), ('safe', 0.5, 'linear', 0.1), ('safe', 0.05, 'sdre', None),
 ])
-def test_thresholds_have_hysteresis(level, outside, allowed):
+def test_thresholds_have_hysteresis(level, outside, allowed, named):
     request = Supervisor(level).allowed(ORDER, outside, ())
     assert request.level == allowed
-    assert (request.reason is None) is (allowed == 'sdre')
+    # the reason has the threshold that holds at this level
+    assert (request.reason and request.reason.values['margin']) == named
 
 
 # In the loop.
