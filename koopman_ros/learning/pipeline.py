@@ -300,8 +300,8 @@ def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, 
     """Say that a free run diverges, or is clearly worse on the test record than a linear one."""
     for name, own in runs.items():
         linear, test = others[LINEAR_MODEL][name], name == 'test'
-        # that of an unstable plant diverges by any model
-        if own.diverged and (test or not others[DRIFT][name].diverged):
+        # that of an unstable plant leaves the measured range by any model, if not for infinity
+        if own.diverged and (test or np.isnan(others[DRIFT][name].leaves)):
             yield (f'its free run of the {"test " * test}record diverges: from {own.leaves:.4g} '
                    f'{own.plant.time_unit} on it errs by more than the measured range')
         elif test and np.mean(linear.fit) > np.mean(own.fit) + _LESS_FIT:

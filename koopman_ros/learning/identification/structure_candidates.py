@@ -70,7 +70,7 @@ class StructureCandidate:
         form = 'linear drift' if isinstance(drift, DriftModel) and drift.degree == 1 else (
             drift.form)
         more = ', an offset of each episode' * self.offsets
-        if self.late:
+        if any(self.late):
             more += f', dead times of {", ".join(map(str, self.late))} samples'
         return f'{form} with {not_measured(self.hidden)}{more}: ' + ', '.join(
             f'{error:.4g} {unit}' for error, unit in zip(
