@@ -199,6 +199,8 @@ class Law(ABC):
     model_free: ClassVar[bool] = False
     #: whether it acts up to `linear_model_margin`, in place of `learned_model_margin`
     extrapolates: ClassVar[bool] = False
+    #: whether it reads the covariance of an estimate, predicted over a dead time only if so
+    reads_covariance: ClassVar[bool] = False
 
     def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
         """
