@@ -3,11 +3,13 @@
 
 """The files of a training and of a replay, and the words for a model."""
 
+from collections.abc import Mapping
 from datetime import datetime
 import json
 import os
 from pathlib import Path
 import struct
+import threading
 import zlib
 
 import pytest
@@ -121,18 +123,50 @@ def test_a_comparison_counts_the_commands_that_differ(tmp_path: Path) -> None:
     assert '3 of 10' in found.lines[1]
 
 
+class SlowDisk(LearningWatch):
+    """A watch whose files are on a disk that does not answer until it is released."""
+
+    def __init__(self) -> None:
+        given = {'system': 'reactor'}
+        values = {name: row.default for name, row in panel_table(None, given).rows.items()}
+        settings = panel_table(None, given).snapshot(values)
+        super().__init__('reactor', SignalTopics(
+            panel_signals(None, given), settings.states, settings.inputs), '/', str)
+        self.released, self.reads = threading.Event(), 0
+
+    def _follow(self, base: Path, trained: Mapping[str, str]) -> None:
+        self.reads += 1
+        self.released.wait(10.0)
+        super()._follow(base, trained)
+
+    def wait(self) -> None:
+        """Wait for the thread that reads."""
+        assert self._reader is not None
+        self._reader.join()
+
+
+def test_a_disk_that_does_not_answer_does_not_stop_the_panel(base: Path) -> None:
+    watch = SlowDisk()
+    for _ in range(3):
+        watch.training({**TRAINED, 'model_file': f'{base}.safetensors'}, '')
+        assert watch.learning.report is None
+    watch.released.set()
+    watch.wait()
+    assert watch.learning.report is not None
+    assert watch.reads == 1
+    watch.complete()
+
+
 def test_a_report_is_followed(base: Path) -> None:
-    given = {'system': 'reactor'}
-    values = {name: row.default for name, row in panel_table(None, given).rows.items()}
-    settings = panel_table(None, given).snapshot(values)
-    watch = LearningWatch('reactor', SignalTopics(
-        panel_signals(None, given), settings.states, settings.inputs), '/', str)
+    watch = SlowDisk()
+    watch.released.set()
     assert 'train one' in watch.compare('reactor_nz4').text
     trained = {**TRAINED, 'model_file': f'{base}.safetensors'}
     for number, (model, accepted) in enumerate(((trained['model_file'], True), ('other', False))):
         Path(f'{base}.json').write_text(json.dumps({**FIGURES, 'model_file': model}))
         os.utime(f'{base}.json', (2e9 + number, 2e9 + number))
         watch.training(trained, '')
+        watch.wait()
         assert watch.learning.report
         assert watch.learning.report.accepted is accepted
         assert 'record first' in watch.compare('reactor_nz4').text
