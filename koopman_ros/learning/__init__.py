@@ -9,7 +9,6 @@ From records of a plant to an accepted model; in torch, never in a node.
 
 from koopman_ros.learning.acceptance import AcceptanceResult, evaluate_model, Thresholds
 from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
-from koopman_ros.learning.fleet import retrain_fleet, TrainingOutcome
 from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.edmd import Edmd, Linearisation
@@ -48,7 +47,6 @@ __all__ = [
     'Thresholds',
     'Trained',
     'TrainingFailed',
-    'TrainingOutcome',
     'TrainingTask',
     'compare',
     'compare_classes',
@@ -58,7 +56,6 @@ __all__ = [
     'fit',
     'learn_lift',
     'retrain',
-    'retrain_fleet',
     'rollout_rmse',
     'simulate',
     'train',

@@ -51,7 +51,7 @@ from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.learning.record import read_record, RecordSource, reduced, TrainingRecord
 from koopman_ros.learning.retrained import Retrained
-from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
+from koopman_ros.learning.task import resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, LONGEST_DEAD_TIME, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
@@ -325,9 +325,6 @@ def _checked(task: TrainingTask) -> Thresholds:
                          f'{", ".join((*CLASSES, BEST, SAME))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
-    if task.warm_start_model == FIRST:
-        raise ValueError(f'warm_start_model = {FIRST!r} means the first model of a fleet: retrain '
-                         'several plants in one call, or name a model file')
     return Thresholds(task.margin, task.condition)
 
 

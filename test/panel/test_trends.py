@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Trends: order, jumps, the past, bounds, and a decimation that loses no extreme."""
+"""Trends: order, jumps, bounds, and a decimation that loses no extreme."""
 
 import math
 import threading
@@ -24,7 +24,8 @@ def _held(trends: Trends, pen: str = 'x') -> list[tuple[float, float]]:
 
 def _trends(times: Array, values: Array) -> Trends:
     trends = Trends()
-    trends.prepend('x', times, values)
+    for time, value in zip(times.tolist(), values.tolist(), strict=True):
+        trends.add('x', time, value)
     return trends
 
 
@@ -51,8 +52,6 @@ def test_the_number_of_values_is_bounded(points: int) -> None:
         trends.add('x', step, step)
     assert _held(trends) == [(step, step) for step in range(12_000 - points, 12_000)]
     assert len(trends._pens['x']._times) <= points + 1024 + points // 4
-    trends.prepend('x', np.arange(-5000.0, 0.0), np.zeros(5000))
-    assert len(_held(trends)) == points
 
 
 def test_values_older_than_the_span_are_dropped() -> None:
@@ -62,14 +61,6 @@ def test_values_older_than_the_span_are_dropped() -> None:
     times = [time for time, _ in _held(trends)]
     assert times[0] <= 1900.0
     assert len(times) < 4000
-
-
-def test_the_past_is_added_before_the_first_value() -> None:
-    trends = Trends()
-    trends.add('x', 10.0, 1.0)
-    trends.prepend('x', [8.0, 9.0, 10.0, 10.5, 12.0], [3.0, 4.0, 5.0, 6.0, 7.0])
-    trends.add('x', 11.0, 2.0)
-    assert _held(trends) == [(8.0, 3.0), (9.0, 4.0), (10.0, 1.0), (11.0, 2.0)]
 
 
 @pytest.mark.parametrize(('begin', 'end', 'expected'), [
