@@ -126,31 +126,3 @@ def test_a_file_of_something_else_is_rejected_and_stays(tmp_path: Path, content:
     assert path.read_bytes() == content
     assert (os.stat(path).st_ino, os.stat(path).st_mode) == (before.st_ino, before.st_mode)
     assert [one.name for one in tmp_path.iterdir()] == ['other']
-
-
-def test_an_empty_file_becomes_one_of_alarms_and_a_link_stays_one(tmp_path: Path) -> None:
-    (tmp_path / 'target').touch()
-    (tmp_path / 'link').symlink_to(tmp_path / 'target')
-    AlarmStore(Alarms(), tmp_path / 'link', NOW)
-    assert (tmp_path / 'link').is_symlink()
-    assert json.loads((tmp_path / 'target').read_text())['alarms'] == []
-
-
-def test_a_file_that_another_program_has_put_there_since_is_not_replaced(file: Path) -> None:
-    alarms = Alarms(delay_on=0.0)
-    store = AlarmStore(alarms, file, AGAIN)
-    other = file.with_name('other')
-    other.write_text('of another program')
-    os.replace(other, file)
-    alarms.report('another', True, Priority.LOW, '', AGAIN + 10.0)
-    with pytest.raises(FileExistsError, match='another program has changed'):
-        store.save(AGAIN + 10.0)
-    assert file.read_text() == 'of another program'
-    assert [one.name for one in file.parent.iterdir()] == [file.name], 'nothing is left beside'
-
-
-def test_markup_and_control_characters_are_shown_as_text(file: Path) -> None:
-    file.write_text(file.read_text().replace('text of new', 'a\\u0000b' + 'c' * 10_000))
-    (alarm,) = (alarm for alarm in loaded(file).standing if alarm.key == 'new')
-    assert alarm.text.startswith('a�bc')
-    assert len(alarm.text) == 500
