@@ -20,11 +20,8 @@ from koopman_ros.panel.files import read_bounded
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, status_card, training_card, training_ranges
 from koopman_ros.panel.training_report import (
-    Learning,
     read_comparison,
     read_report,
-    report_base,
-    TrainingReport,
 )
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.signal_topics import SignalTopics
@@ -75,23 +72,6 @@ def test_a_report_of_another_training_or_machine_is_a_problem(
     assert (found.accepted, found.text, found.picture) == (False, '', b'')
 
 
-@pytest.mark.parametrize('text', [
-    '[]', '{', '[' * 100_000, '\xff', '{"bags": 1}', '{"bags": [{"recorded_model": []}]}'])
-def test_malformed_figures_are_a_problem_and_no_more(tmp_path: Path, text: str) -> None:
-    for name in ('new.json', 'summary.json'):
-        (tmp_path / name).write_text(text, encoding='latin-1')
-    assert text[:2] == '{"' or 'cannot read' in read_report(tmp_path / 'new').problem
-    found = read_comparison(tmp_path, 'new', 1.0, 'one\n\ntwo: wrong\n')
-    assert found.problem.endswith('one two: wrong')
-
-
-@pytest.mark.parametrize('data', [
-    b'', png()[:-1], b'GIF89a' + png(), b'<svg xmlns="http://www.w3.org/2000/svg"/>'])
-def test_only_a_whole_png_is_a_picture(base: Path, data: bytes) -> None:
-    Path(f'{base}.png').write_bytes(data)
-    assert read_report(base).picture == b''
-
-
 def test_pipes_folders_and_large_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'large').write_bytes(bytes(11))
@@ -99,19 +79,6 @@ def test_pipes_folders_and_large_files_are_not_read(tmp_path: Path) -> None:
                         ('large', 'more than 10 bytes')):
         with pytest.raises(ValueError, match=words):
             read_bounded(tmp_path / name, 10)
-
-
-@pytest.mark.parametrize(('model', 'name'), [
-    ('/a/new.safetensors', '/a/new'), ('/a/new.rejected.safetensors', '/a/new'),
-    ('reactor_nz4', None), ('', None)])
-def test_a_report_is_written_next_to_its_model(model: str, name: str | None) -> None:
-    assert report_base(model) == (None if name is None else Path(name))
-
-
-def test_pictures_have_two_names() -> None:
-    own = Learning(report=TrainingReport(picture=b'one'))
-    assert [own.picture(name) for name in ('training', 'comparison', '../x', '/etc/passwd')] == [
-        b'one', b'', b'', b'']
 
 
 def test_a_comparison_counts_the_commands_that_differ(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -76,22 +75,6 @@ def test_unsuitable_model_is_rejected_with_the_reason(
 
     with pytest.raises(ModelFileError, match=re.escape(words)):
         try_model()
-
-
-def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If a package of the best law is missing, no other model helps."""
-    monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', None)
-
-    def situation(*levels: str) -> ModelCheckContext:
-        return ModelCheckContext(TABLE.snapshot({'fallback_order': levels}), State(),
-                                 SHIPPED.states.center, None)
-
-    reject_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
-    bad = replace(SHIPPED, A=1e300 * SHIPPED.A)
-    with pytest.raises(ModelFileError, match='train it again'):
-        reject_without_law(bad, situation('mpc', 'sdre', 'linear'))
-    with pytest.raises(ModelFileError, match=r'pip install numba daqp\)$'):
-        reject_without_law(SHIPPED, situation('mpc'))
 
 
 def slow(patch: pytest.MonkeyPatch) -> None:
