@@ -5,8 +5,6 @@ BIN := $(VENV)/bin
 # All versions are locked, also those of the build tools (two names, for older and newer pip).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
-# Compile the predictive law ahead (15 s), otherwise the first process does.
-COMPILE := $(BIN)/python -c 'import koopman_ros.control.mpc.planner'
 # With this variable set, Python caches no byte code, and every process compiles the package again.
 unexport PYTHONDONTWRITEBYTECODE
 # Use the packages of .venv, ROS 2 included, not those of a sourced ROS 2.
@@ -35,7 +33,6 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,learn,test,bench]'
-	$(COMPILE)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
@@ -48,12 +45,10 @@ $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 
 $(VENV)/saddle.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,mpc]'
-	$(COMPILE)
 	@touch $@
 
 $(VENV)/mpc.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,mpc]'
-	$(COMPILE)
 	@touch $@
 
 $(VENV)/panel.stamp: setup.py $(LOCK) $(VENV)/run.stamp
@@ -66,7 +61,6 @@ $(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,bench]'
-	$(COMPILE)
 	@touch $@
 
 demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## run a learned controller in closed loop: live table, bag, plot -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: with the browser panel, until Ctrl-C; EXPORT=1: with its exported C code; DISTURBANCE=1: a step of the feed temperature with and without its measurement -> out/demo-disturbance)

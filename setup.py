@@ -52,8 +52,8 @@ setup(
         'demo': ['matplotlib'],
         # the operator's panel, with all that its pages load
         'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
-        # the predictive law: solver of quadratic programs, and compiler
-        'mpc': ['daqp', 'numba'],
+        # the predictive law: solver of quadratic programs
+        'mpc': ['daqp'],
         'train': TRAIN,
         # learning from tables, without ROS
         'learn': [*TRAIN, 'matplotlib', 'pandas', 'pyarrow'],
@@ -61,7 +61,7 @@ setup(
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'nfoursid',
-                  'numba', 'pykoop'],
+                  'pykoop'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'argon2-cffi',
@@ -74,7 +74,6 @@ setup(
             'limits',
             'mypy',
             'nicegui>=3',
-            'numba',
             'packaging',
             'playwright',
             'pytest>=7.4',

@@ -114,8 +114,7 @@ def test_the_manifest_declares_all_imports(control_only: bool) -> None:
     nodes = declared(manifest.exec_depends)
     everything = declared(manifest.exec_depends, manifest.test_depends)
     used = _third_party('koopman_ros') - without
-    # numba is optional: a key of the tests
-    assert {key_of[name] for name in used - learning - {'numba'}} <= nodes
+    assert {key_of[name] for name in used - learning} <= nodes
     assert {key_of[name] for name in _third_party('koopman_ros', 'test', 'studies', 'benchmarks')
             - without - learning} <= everything
     assert not {key_of[name] for name in learning} & everything
@@ -154,7 +153,7 @@ def test_packages_that_messages_and_pages_advise_are_known() -> None:
     assert not [path for path, text in texts.items() if 'koopman_ros[' in text]
     advised = {name for text in texts.values() for name in re.findall(
         r"pip install '?([a-z][\w-]*)", text)}
-    assert {'matplotlib', 'nicegui', 'numba', 'torch'} <= advised
+    assert {'matplotlib', 'nicegui', 'torch'} <= advised
     assert {canonicalize_name(name) for name in advised} <= locked
 
 
@@ -211,14 +210,14 @@ def test_no_class_name_has_two_meanings() -> None:
 
 
 def test_installed_code_imports_only_installed_code_and_few_packages_import_torch() -> None:
-    users, compiled = set(), set()
+    users, planners = set(), set()
     for path in ROOT.glob('koopman_ros/**/*.py'):
         roots = {name.split('.')[0] for name in _imports(path)}
         assert not roots & {'studies', 'benchmarks', 'examples', 'support', 'test'}, path
         room = path.relative_to(ROOT).parts[1]
         users |= {room} if 'torch' in roots else set()
-        compiled |= {path.parent.name} if roots & {'daqp', 'numba'} else set()
+        planners |= {path.parent.name} if 'daqp' in roots else set()
     assert users == {'learning'}
-    assert compiled == {'mpc'}
+    assert planners == {'mpc'}
     # and every package has its rule
     assert {path.parent.name for path in ROOT.glob('koopman_ros/*/__init__.py')} == set(ALLOWED)

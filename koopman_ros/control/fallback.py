@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import itertools
 import math
@@ -57,7 +57,7 @@ class FallbackLevel:
     estimator: Estimator  #: on the same model
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
     #: whether it moves commands that are states of the model by itself, instead of the plant
-    integrates: bool = False
+    integrates: bool = field(default=True, kw_only=True)
 
     @property
     def model(self) -> LiftedModel:
@@ -275,5 +275,5 @@ def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[s
     for law_name in tuning.fallback_order:
         law = plug_in(law_name, 'law', LAWS, Law, model, tuning)
         estimator = plug_in(name, 'estimator', ESTIMATORS, Estimator, law.model, outputs, tuning)
-        levels[law_name] = FallbackLevel(law_name, law, estimator, tuning.controlled, True)
+        levels[law_name] = FallbackLevel(law_name, law, estimator, tuning.controlled)
     return levels

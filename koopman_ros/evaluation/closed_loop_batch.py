@@ -190,7 +190,8 @@ def _operated(law: Law, setpoints: Array, inputs: Array, seconds: float) -> _Fee
     """Return a law's inputs as a controller finds them, from sample to sample of each loop."""
     model, states = law.model, law.model.states
     outputs = Outputs(states.names, states.units, np.eye(model.n_x))
-    level = FallbackLevel('', law, MeasuredState(model, outputs, law.tuning, None), states.names)
+    level = FallbackLevel('', law, MeasuredState(model, outputs, law.tuning, None), states.names,
+                          integrates=False)
     dead_ns = tuple(round(NANOSECONDS * one) for one in law.tuning.dead_times(model).tolist())
     # the input that holds the set-point was applied at all times before
     queues = [AppliedInputs().corrected(u) for u in model.inputs.to_physical(inputs)]

@@ -26,7 +26,7 @@ def loaded(modules: str, absent: tuple[str, ...] = ()) -> set[str]:
 
 def test_runtime_needs_neither_ros_nor_torch() -> None:
     loaded('koopman_ros.model, koopman_ros.control, koopman_ros.plants, koopman_ros.records',
-           ('rclpy', 'torch', 'matplotlib', 'numba'))
+           ('rclpy', 'torch', 'matplotlib', 'daqp'))
 
 
 def test_the_model_loads_no_other_package_of_ours_but_core() -> None:
@@ -38,5 +38,5 @@ def test_the_model_loads_no_other_package_of_ours_but_core() -> None:
 @pytest.mark.parametrize('node', ['controller', 'trainer'])
 def test_nodes_load_nothing_large_that_they_do_not_need(node: str) -> None:
     assert not loaded(f'koopman_ros.nodes.{node}') & {
-        'torch', 'matplotlib', 'pint', 'numba', 'daqp', 'nicegui', 'koopman_ros.plants',
+        'torch', 'matplotlib', 'pint', 'daqp', 'nicegui', 'koopman_ros.plants',
         'koopman_ros.learning'}

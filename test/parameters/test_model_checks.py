@@ -77,6 +77,22 @@ def test_unsuitable_model_is_rejected_with_the_reason(
         try_model()
 
 
+def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a package of the best law is missing, no other model helps."""
+    monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', None)
+
+    def situation(*levels: str) -> ModelCheckContext:
+        return ModelCheckContext(TABLE.snapshot({'fallback_order': levels}), State(),
+                                 SHIPPED.states.center, None)
+
+    reject_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
+    bad = replace(SHIPPED, A=1e300 * SHIPPED.A)
+    with pytest.raises(ModelFileError, match='train it again'):
+        reject_without_law(bad, situation('mpc', 'sdre', 'linear'))
+    with pytest.raises(ModelFileError, match=r'pip install daqp\)$'):
+        reject_without_law(SHIPPED, situation('mpc'))
+
+
 def slow(patch: pytest.MonkeyPatch) -> None:
     # no model within the bounds takes that long, so the limit is moved
     patch.setattr(usable, '_LONGEST_STEP', 1e-7)

@@ -6,7 +6,7 @@
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict, Unpack
 
 import numpy as np
 
@@ -83,8 +83,16 @@ def closed(model: LiftedModel) -> bool:
     return model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes
 
 
-def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, **how: float
-             ) -> Feedback:
+class RiccatiOptions(TypedDict, total=False):
+    """How an equation is solved; see :func:`solve_riccati`."""
+
+    interval: float  #: for which the input will be held, in the model's time unit
+    max_gain: float  #: largest norm of the gain
+    max_residual: float  #: largest relative residual
+
+
+def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights,
+             **how: Unpack[RiccatiOptions]) -> Feedback:
     """
     Evaluate the law that suits the model.
 
@@ -94,8 +102,6 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, **h
     lift, is a poor factorisation of the drift away from its nominal point.
 
     :param x: (n_x,) scaled deviation of the measured state.
-    :param how: `interval` for which the input will be held, in the model's time unit, `max_gain`
-        and `max_residual`; see :func:`solve_riccati`.
     """
     if closed(model):
         result = recentred(model, x, target, weights, **how)
@@ -104,8 +110,8 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, **h
     return averaged(model, x, target, weights, **how)
 
 
-def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, **how: float
-              ) -> Feedback:
+def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights,
+              **how: Unpack[RiccatiOptions]) -> Feedback:
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
 
@@ -144,8 +150,8 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, **
     return Feedback(target.u - K.dot(x - target.x), Form.RECENTRED, riccati, drift, -B.dot(K))
 
 
-def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, **how: float
-             ) -> Feedback:
+def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights,
+             **how: Unpack[RiccatiOptions]) -> Feedback:
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Model predictive control, with the packages daqp and numba (the extra ``mpc``)."""
+"""Model predictive control, with the package daqp (the extra ``mpc``)."""
 
 from koopman_ros.control.mpc.law import MPCParameters, RecedingHorizon
 

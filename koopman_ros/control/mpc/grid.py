@@ -31,17 +31,10 @@ class HorizonGrid:
         """
         Return intervals that grow by a constant factor until they reach a horizon.
 
-        Parameters
-        ----------
-        horizon
-            Their sum, unless `longest` cuts them.
-        first
-            Length of the first one, and the least of all.
-        count
-            Their number.
-        longest
-            Length that none exceeds.
-
+        :param horizon: their sum, unless `longest` cuts them.
+        :param first: length of the first one, and the least of all.
+        :param count: their number.
+        :param longest: length that none exceeds.
         """
         powers, total, factor = np.arange(count), horizon / first, 1.0
         # near 1 the sum does not determine the factor
@@ -71,18 +64,9 @@ class HorizonGrid:
         """
         Move the plan of the sample before to this grid, one sample later.
 
-        Parameters
-        ----------
-        u, x, lengths
-            (M, n_u) inputs, (M + 1, n_x) nodes and (M,) intervals of that plan.
-
-        Returns
-        -------
-        u
-            (N, n_u), the inputs that held in the middle of each interval.
-        x
-            (N + 1, n_x), interpolated linearly. Beyond the end of the plan its last values hold.
-
+        :param u: (M, n_u) inputs, x (M + 1, n_x) nodes and lengths (M,) of that plan.
+        :return: the inputs (N, n_u) that held in the middle of each interval, and nodes
+            (N + 1, n_x), interpolated linearly; beyond the end of the plan its last values hold.
         """
         old, new = np.concatenate(([0.0], np.cumsum(lengths))), self.sample + self.times
         middle = np.searchsorted(old[1:], 0.5 * (new[1:] + new[:-1]))

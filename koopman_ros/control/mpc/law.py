@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The receding-horizon law; numba and the solver are loaded when it is constructed."""
+"""The receding-horizon law; the solver is loaded when it is constructed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from koopman_ros.control.laws.base import LaterInputs, Law, LawResult, SolutionI
 from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
-from koopman_ros.core.plugins import contained
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
@@ -25,7 +24,7 @@ from koopman_ros.tuning import Tuning
 if TYPE_CHECKING:
     from koopman_ros.control.mpc.planner import Planner
 
-_PACKAGES = 'numba daqp'
+_PACKAGE = 'daqp'
 # Largest change of a scaled input after which a plan has converged, and with which it may be used.
 _CONVERGED, _USABLE = 1e-4, 0.05
 _MAX_ITERATIONS = 12
@@ -73,20 +72,15 @@ class RecedingHorizon(Law):
         self.planner: Planner | None = None
         self._unusable: Reason | None = None
         try:
-            # compiles, or loads the code compiled before
             from koopman_ros.control.mpc.planner import Planner
         except ImportError:
-            self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGES)
-            return
-        except RuntimeError as error:
-            # numba finds no folder for the compiled code
-            self._unusable = reason(StatusCode.LAW_RAISED, error=contained(error))
+            self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGE)
             return
         self.planner = Planner(model, tuning, self.weights, *(
             np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
 
     def unusable(self) -> Reason | None:
-        """Return that its packages are not installed, or do not work."""
+        """Return that its package is not installed."""
         return self._unusable
 
     def horizon(self, interval: float) -> float:

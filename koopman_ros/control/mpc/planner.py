@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from koopman_ros.control.laws.base import LaterInputs, Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
-from koopman_ros.control.mpc import own_drift
-from koopman_ros.control.mpc.condensing import condense, drift, roll_out
+from koopman_ros.control.mpc.condensing import condense, roll_out
 from koopman_ros.control.mpc.grid import HorizonGrid
-from koopman_ros.control.mpc.model_arrays import model_arrays
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import (
     RiccatiSolution,
@@ -89,9 +87,6 @@ class Planner:
     def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
                  state_upper: Array) -> None:
         self._model, self._tuning, self._weights = model, tuning, weights
-        self._arrays = model_arrays(model)
-        # of a subclass that computes it in its own way, unknown to the compiled functions
-        self._own_drift = type(model).drift is not LiftedModel.drift
         inputs, limits = model.inputs, tuning.limits
         self._lower = np.maximum(inputs.to_deviation(limits.lower), -_INFINITY)
         self._upper = np.minimum(inputs.to_deviation(limits.upper), _INFINITY)
@@ -105,7 +100,7 @@ class Planner:
                                              (self._state_upper, min, limits.upper[j])):
                 bounds[i] = strictest(
                     bounds[i], (limit - model.states.center[i]) / model.states.scale[i])
-        self._slope = self._jacobian(np.zeros(model.n_x))
+        self._slope = model.drift_jacobian(np.zeros(model.n_x))
         # the same from sample to sample, mostly
         self._grid, self._cost_to_go = lru_cache(8)(self._new_grid), lru_cache(8)(self._new_cost)
 
@@ -137,7 +132,7 @@ class Planner:
             tuple(end.x.tolist()),
             () if model.input_terms is None else tuple(end.u.tolist()),
             grid.sample)
-        rate = max(_fastest(self._slope), fastest, _fastest(self._jacobian(estimate.x)))
+        rate = max(_fastest(self._slope), fastest, _fastest(model.drift_jacobian(estimate.x)))
         steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
         return PlanningProblem(
             estimate.x, estimate.w, target,
@@ -193,7 +188,7 @@ class Planner:
                   ) -> tuple[float, Array]:
         """Return the rate of the fastest mode at a target, and the cost (n_x, n_x) from there."""
         model, x = self._model, np.array(x_ref)
-        A = self._jacobian(x)
+        A = model.drift_jacobian(x)
         fastest = _fastest(A)
         if u_ref:
             A = A + model.forcing_jacobian(x, np.array(u_ref))
@@ -201,12 +196,6 @@ class Planner:
         # without a regulator the horizon alone counts
         return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
             self._weights.Q * float(self._grid(sample, 0.0).lengths[-1]))
-
-    def _jacobian(self, x: Array) -> Array:
-        if self._own_drift:
-            return self._model.drift_jacobian(x)
-        slope: Array = drift(self._arrays, np.array(x, dtype=np.float64, ndmin=2))[1][0]
-        return slope
 
     def _regulator(self, A: Array, B: Array, sample: float) -> RiccatiSolution:
         return solve_riccati(
@@ -263,15 +252,16 @@ class Planner:
 
         :return: the largest change of an input, and the changed plan; or why there is none.
         """
-        start, w, x_ref, u_ref, end = (np.ascontiguousarray(value, dtype=np.float64) for value in (
-            problem.start, problem.w, problem.x_ref, problem.u_ref, problem.end.x))
-        given = (u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps, self._weights.Q,
-                 self._weights.R)
-        ends, cost = (own_drift.roll_out(self._model, *given) if self._own_drift else
-                      roll_out(self._arrays, *given))
+        try:
+            ends, cost = roll_out(
+                self._model, u, x, problem.w, problem.x_ref, problem.u_ref, problem.grid.lengths,
+                problem.steps, self._weights.Q, self._weights.R)
+        except np.linalg.LinAlgError:
+            ends = cost = np.array(np.nan)
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
             return reason(StatusCode.PLAN_NOT_SOLVED, flag='the trajectory is not finite')
-        nodes, by_inputs, H, f = condense(x, start, end, ends, cost, problem.terminal)
+        nodes, by_inputs, H, f = condense(
+            x, problem.start, problem.end.x, ends, cost, problem.terminal)
         free = problem.free.ravel()
         if not free.all():
             by_inputs, H, f = by_inputs[..., free], H[np.ix_(free, free)], f[free]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compiled drift, roll-out and condensing against finite differences and SciPy."""
+"""Roll-out and condensing against finite differences and SciPy."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control.mpc import own_drift
-from koopman_ros.control.mpc.condensing import condense, drift, roll_out
-from koopman_ros.control.mpc.model_arrays import model_arrays
+from koopman_ros.control.mpc.condensing import condense, roll_out
 from koopman_ros.model import InputTerms, LiftedModel, PolynomialObservables
 from support.random_lifts import random_lift
 
@@ -34,7 +32,7 @@ def with_input_terms(model: LiftedModel) -> LiftedModel:
     return replace(model, input_terms=InputTerms(RNG.normal(size=(count, *model.B.shape))))
 
 
-# a model of each kind that the compiled functions distinguish
+# a model of each kind
 MODELS = {
     'identity lift': random_lift(2, n_u=1),
     'identity lift, one state': random_lift(1, n_u=1),
@@ -54,15 +52,6 @@ def differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> 
                      for step in 1e-5 * np.eye(len(x))], axis=-1)
 
 
-@pytest.mark.parametrize('model', MODELS.values(), ids=MODELS)
-def test_drift_and_its_jacobian(model: LiftedModel) -> None:
-    x = 0.5 * RNG.normal(size=(6, model.n_x))
-    f, J = drift(model_arrays(model), x)
-    np.testing.assert_allclose(f, model.drift(x), rtol=1e-9, atol=1e-10)
-    for row, slope in zip(x, J, strict=True):
-        np.testing.assert_allclose(slope, differences(model.drift, row), rtol=1e-6, atol=1e-7)
-
-
 def simulated(model: LiftedModel, x: np.ndarray, u: np.ndarray, w: np.ndarray, length: float,
               rate: Callable[[np.ndarray], float] = lambda _: 0.0) -> np.ndarray:
     """Return the state after an interval, and the integral of a rate of cost."""
@@ -79,7 +68,7 @@ def test_roll_out_with_its_sensitivities_and_cost(model: LiftedModel) -> None:
     u, x = RNG.normal(size=(2, m)), 0.3 * RNG.normal(size=(3, n))
     w, x_ref, u_ref = 0.1 * RNG.normal(size=n), RNG.normal(size=(2, n)), RNG.normal(size=(2, m))
     lengths, Q, R = np.array([0.1, 0.2]), np.diag(1.0 + np.arange(n)), np.diag(2.0 + np.arange(m))
-    ends, cost = roll_out(model_arrays(model), u, x, w, x_ref, u_ref, lengths, 10, Q, R)
+    ends, cost = roll_out(model, u, x, w, x_ref, u_ref, lengths, 10, Q, R)
 
     for k, length in enumerate(lengths):
         def interval(deviation: np.ndarray, k: int = k, length: float = length) -> np.ndarray:
@@ -98,17 +87,6 @@ def test_roll_out_with_its_sensitivities_and_cost(model: LiftedModel) -> None:
         np.testing.assert_allclose(cost[k], cost[k].T)
 
 
-@pytest.mark.parametrize('model', MODELS.values(), ids=MODELS)
-def test_roll_out_by_the_methods_of_a_model_is_the_same(model: LiftedModel) -> None:
-    n, m = model.B.shape
-    given = (RNG.normal(size=(3, m)), 0.3 * RNG.normal(size=(4, n)), RNG.normal(size=n),
-             RNG.normal(size=(3, n)), RNG.normal(size=(3, m)), np.array([0.01, 0.02, 0.03]), 2,
-             np.diag(1.0 + np.arange(n)), np.diag(2.0 + np.arange(m)))
-    for here, there in zip(roll_out(model_arrays(model), *given),
-                           own_drift.roll_out(model, *given), strict=True):
-        np.testing.assert_allclose(here, there, rtol=1e-8, atol=1e-10)
-
-
 def test_condensed_cost_is_that_of_the_simulated_plan() -> None:
     """Of a linear plant the quadratic program is exact."""
     model = MODELS['linear']
@@ -116,7 +94,7 @@ def test_condensed_cost_is_that_of_the_simulated_plan() -> None:
     u, x = RNG.normal(size=(N, m)), RNG.normal(size=(N + 1, n))
     start, w, x_ref, u_ref = (RNG.normal(size=size) for size in (n, n, n, m))
     lengths, terminal = np.array([0.1, 0.15, 0.2, 0.3]), np.array([[2.0, 0.3], [0.3, 1.0]])
-    ends, cost = roll_out(model_arrays(model), u, x, w, np.tile(x_ref, (N, 1)),
+    ends, cost = roll_out(model, u, x, w, np.tile(x_ref, (N, 1)),
                           np.tile(u_ref, (N, 1)), lengths, 20, Q, R)
     nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, terminal)
 
@@ -139,10 +117,3 @@ def test_condensed_cost_is_that_of_the_simulated_plan() -> None:
         after, path = simulate(v)
         np.testing.assert_allclose(v @ H @ v + 2.0 * f @ v, after - before, rtol=1e-6)
         np.testing.assert_allclose(nodes + by_inputs @ v, path, atol=1e-7)
-
-
-def test_nan_stays_nan_in_its_own_row() -> None:
-    f, J = drift(model_arrays(MODELS['free lift']), np.array([[np.nan, 0.0], [0.1, 0.2]]))
-    assert not np.isfinite(f[0]).all()
-    assert not np.isfinite(J[0]).all()
-    assert np.isfinite(f[1]).all()
