@@ -9,7 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.core.datasets import cut, Episode, split_by_episode
+from koopman_ros.core.datasets import cut, DriftSamples, Episode, split_by_episode, within
+from koopman_ros.evaluation import Simulation
 from support.small_plants import BENT, bent_samples, TWO_STATE
 
 
@@ -44,6 +45,19 @@ def test_inputs_that_were_measured_are_linear_between():
         [[2.0, 5.0], [3.0, 7.0]], [[3.0, 5.0], [2.0, 7.0]])
     with pytest.raises(ValueError, match='one entry for each of 2 inputs'):
         replace(episode, linear=(True,))
+
+
+@pytest.mark.parametrize('linear', [(), (True, False)])
+def test_a_part_of_an_episode_keeps_the_applied_inputs(linear):
+    episode = replace(irregular(), linear=linear)
+    part = episode.part(7, 21)
+    assert np.array_equal(part.time, episode.time[7:21])
+    assert np.array_equal(part.x, episode.x[7:21])
+    assert part.input_time[0] <= part.time[0] < part.input_time[1]
+    times = np.linspace(part.time[0], part.time[-1], 500, endpoint=False)
+    assert np.array_equal(part.inputs_at(times), episode.inputs_at(times))
+    whole = episode.input_integral(part.time)
+    assert part.input_integral(part.time) == pytest.approx(whole - whole[0], abs=1e-12)
 
 
 def test_cut_leaves_no_interval_out():
@@ -88,6 +102,14 @@ def test_invalid_arrays_are_no_episode(changes, words):
         Episode(**{name: np.array(value) for name, value in {**good, **changes}.items()})
 
 
+def test_missing_states_are_interpolated():
+    nan = np.nan
+    x = np.array([[nan, 1.0, nan], [2.0, nan, nan], [8.0, 4.0, nan]])
+    episode = Episode(np.array([0.0, 1.0, 4.0]), x, np.zeros(1), np.zeros((1, 1)))
+    assert episode.interpolated().tolist() == [[2.0, 1.0, 0.0], [2.0, 1.75, 0.0], [8.0, 4.0, 0.0]]
+    assert np.isnan(episode.x[0, 0])
+
+
 # Samples.
 
 
@@ -114,6 +136,43 @@ def test_samples_of_unequal_length_or_not_finite(change, message):
         replace(bent_samples(), **change)
 
 
+@pytest.mark.parametrize('value', [0.25, 0.2, math.nan, math.inf])
+def test_times_that_do_not_rise(value):
+    time = np.array(timed().time)
+    # it may start again with each episode
+    assert time[4] == time[5] == 1.0
+    time[2] = value
+    with pytest.raises(ValueError, match='from sample to sample within an'):
+        replace(timed(), time=time)
+    # in episodes side by side, too
+    mixed = {'x': np.zeros((4, 1)), 'dxdt': np.zeros((4, 1)), 'u': np.zeros((4, 1)),
+             'episode': np.array([0, 1, 0, 1])}
+    assert replace(bent_samples(), **mixed, time=np.array([0.0, 5.0, 1.0, 6.0])).time is not None
+    with pytest.raises(ValueError, match='time must increase'):
+        replace(bent_samples(), **mixed, time=np.array([1.0, 5.0, 0.0, 6.0]))
+
+
+def test_take_keeps_whole_episodes():
+    part = timed().take(np.array([3, 1]))
+    assert len(part) == 10
+    np.testing.assert_array_equal(part.episode, np.repeat([1, 3], 5))
+    keep = np.isin(timed().episode, [1, 3])
+    for name in ('x', 'dxdt', 'u', 'time'):
+        np.testing.assert_array_equal(getattr(part, name), getattr(timed(), name)[keep])
+    assert bent_samples().take(np.array([0])).time is None
+
+
+def test_different_samples_have_different_digests():
+    everything = bent_samples()
+    assert everything.digest() == bent_samples().digest()
+    assert len(everything.digest()) == 64
+    for name in ('x', 'dxdt', 'u'):
+        moved = np.array(getattr(everything, name))
+        moved[-1] = np.nextafter(moved[-1], np.inf)
+        assert replace(everything, **{name: moved}).digest() != everything.digest()
+    assert replace(everything, episode=everything.episode + 1).digest() != everything.digest()
+
+
 def test_split_is_disjoint_and_covers_by_its_seed_alone():
     for episodes in (3, 4, 5, 9, 10, 20):
         parts = split_by_episode(timed(episodes, length=7), seed=episodes)
@@ -134,6 +193,20 @@ def test_split_is_disjoint_and_covers_by_its_seed_alone():
 
 # What is given is checked where it is given.
 
+def test_episodes_are_cut_where_a_state_leaves_a_range():
+    x = np.array([[0.0, 5.0], [1.0, 5.0], [2.0, 5.0], [1.0, 9.5], [1.0, 5.0], [0.5, 5.0],
+                  [0.4, -1.0], [0.3, 5.0]])
+    episode = Episode(np.arange(8.0), x, np.array([0.0, 4.5]), np.array([[1.0], [2.0]]))
+    first, second = within([episode], [0.0, 0.0], [2.0, 9.0])
+    assert (first.time.tolist(), second.time.tolist()) == ([0.0, 1.0, 2.0], [4.0, 5.0])
+    # with the inputs that acted
+    assert second.inputs_at(second.time)[:, 0].tolist() == [1.0, 2.0]
+    parts = within([episode, episode], 0.0, 9.0, samples=1)
+    assert [len(part) for part in parts] == [3, 2, 1, 3, 2, 1]
+    assert [len(part) for part in within([episode], -9.0, 99.0)] == [8]
+    with pytest.raises(ValueError, match=r'lie between \[0\. 0\.\] and'):
+        within([episode], [0, 0], [2, 9], samples=4)
+
 
 @pytest.mark.parametrize(('plant', 'change', 'message'), [
     (BENT, {'state_names': 'level'}, "state_names is the string 'level'"),
@@ -150,3 +223,26 @@ def test_split_is_disjoint_and_covers_by_its_seed_alone():
 def test_a_plant_that_contradicts_itself(plant, change, message):
     with pytest.raises(ValueError, match=message):
         replace(plant, **change)
+
+
+def test_lists_are_taken_for_arrays():
+    plant = replace(TWO_STATE, state_names=['a', 'b'], nominal_state=[1, 2], B=[[0], [1]])
+    assert plant.state_names == ('a', 'b')
+    assert (plant.nominal_state.tolist(), plant.B.tolist()) == ([1.0, 2.0], [[0.0], [1.0]])
+    samples = DriftSamples([[1.0], [2.0], [3.0]], [[0.0]] * 3, [[0.5]] * 3, [0, 0, 1], [0, 1, 0])
+    assert samples.take([0]).x.tolist() == [[1.0], [2.0]]
+    assert samples.digest() == replace(samples, episode=np.array([0, 0, 1])).digest()
+    with pytest.raises(ValueError, match='episode must hold one integer'):
+        replace(samples, episode=[0.0, 0.5, 1.0])
+
+
+@pytest.mark.parametrize('described', [
+    bent_samples(), BENT, irregular(), Simulation(
+        *(np.zeros((400, n)) for n in (1, 2, 2, 1, 1, 2)), (None,) * 400, '', None)],
+    ids=lambda value: type(value).__name__)
+def test_the_repr_of_large_objects_is_one_line(described):
+    text = repr(described)
+    assert text.startswith(f'{type(described).__name__}(')
+    assert '\n' not in text
+    assert len(text) < 250
+    assert text == repr(BENT) or '<array (' in text

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from koopman_ros import plants
 from koopman_ros.control.laws import Law
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.plugins import load_plugin, plug_in
+from koopman_ros.core.plugins import load_plugin, own_code, plug_in
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.tuning import Tuning
 
 MODULE = """
@@ -70,6 +72,19 @@ def test_a_rejection_names_the_methods_that_a_class_lacks(
     assert missing in table.check(table.snapshot({parameter: value}))
 
 
+@pytest.mark.usefixtures('modules')
+@pytest.mark.parametrize('name', ['Exits', 'Raises', 'nothing'])
+def test_plant_that_cannot_be_built_is_rejected(name: str) -> None:
+    with pytest.raises(ValueError, match=f'the plant {name} '):
+        plants.build(plants.plant_class(f'own_plugs:{name}'), {})
+
+
+@pytest.mark.usefixtures('modules')
+def test_system_whose_module_exits_is_rejected() -> None:
+    with pytest.raises(ValueError, match=r"'plug_exits:Plant' cannot be loaded \(SystemExit"):
+        PlantTable({'system': 'plug_exits:Plant'})
+
+
 def test_an_interrupt_is_none_of_its_failures(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'plug_interrupted.py').write_text('raise KeyboardInterrupt')
@@ -85,3 +100,8 @@ def test_an_interrupt_is_none_of_its_failures(
 
     with pytest.raises(KeyboardInterrupt):
         plug_in('a', 'law', {'a': Interrupted}, Law, Tuning())
+
+
+def test_names_of_code_in_a_value() -> None:
+    assert own_code('') == own_code('linear') == own_code(('sdre', 'linear')) == []
+    assert own_code(('sdre', 'mine:Law')) == own_code('mine:Law') == ['mine:Law']

@@ -12,6 +12,7 @@ from koopman_ros.core.solvers import (
     RiccatiStatus,
     runge_kutta_step,
     solve_riccati,
+    transition,
 )
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
@@ -54,9 +55,42 @@ def test_random_pairs_against_scipy(seed):
         assert np.linalg.eigvalsh(solution.P)[0] >= -1e-10 * np.linalg.norm(P)
 
 
+@pytest.mark.parametrize(('a', 'b', 'q', 'r'), [
+    (1.0, 2.0, 3.0, 0.5), (-1.0, 2.0, 3.0, 0.5), (0.0, 1.0, 1.0, 1.0), (5.0, 0.5, 1.0, 10.0),
+    (-0.957887316, 2.092050209, 1.0, 0.1), (1e-8, 1e4, 1e8, 1e-4)])
+def test_scalar_plants_in_closed_form(a, b, q, r):
+    solution = solve_riccati(*(np.array([[value]]) for value in (a, b, q, r)))
+    assert solution.status is RiccatiStatus.SOLVED
+    p = r / b ** 2 * (a + np.sqrt(a * a + q * b * b / r))
+    assert solution.P[0, 0] == pytest.approx(p, rel=1e-12)
+    assert solution.K[0, 0] == pytest.approx(p * b / r, rel=1e-12)
+
+
+@pytest.mark.parametrize('h', [0.0, 0.3])
+@pytest.mark.parametrize('factor', [1e-9, 1e9])
+def test_the_unit_of_the_cost_does_not_matter(factor, h):
+    for n, m in SIZES:
+        A, B, Q, R = random_problem(n, m, seed=7)
+        solution = solve_riccati(A, B, Q, R, interval=h)
+        other = solve_riccati(A, B, factor * Q, factor * R, interval=h)
+        assert other.status is RiccatiStatus.SOLVED, (n, m)
+        assert_close(other, factor * solution.P, solution.K)
+
+
 def nearly_uncontrollable(reach):
     """Return a plant whose unstable mode is reached by the input no more than `reach`."""
     return np.diag([1.0, -1.0]), np.array([[reach], [1.0]]), np.eye(2), np.eye(1)
+
+
+@pytest.mark.parametrize('reach', [1e-2, 1e-3, 1e-4])
+def test_the_residual_reported_is_that_of_the_solution_and_bounded(reach):
+    problem = nearly_uncontrollable(reach)
+    solution = solve_riccati(*problem)
+    # how large it is depends on how the processor rounds; its own rounding errors are of 1e-16
+    assert solution.residual == pytest.approx(residual(solution.P, *problem), rel=1e-2, abs=1e-14)
+    strict = solve_riccati(*problem, max_residual=0.5 * solution.residual)
+    assert strict.status is RiccatiStatus.INACCURATE
+    assert strict.residual == solution.residual > 0.0
 
 
 @pytest.mark.parametrize('reach', [0.1, 0.03, 0.01])
@@ -70,6 +104,14 @@ def test_a_bound_on_the_gain(reach):
     rejected = solve_riccati(*problem, max_gain=0.999 * solution.gain)
     assert rejected.status is RiccatiStatus.GAIN_TOO_LARGE
     assert rejected.gain == solution.gain
+
+
+@pytest.mark.parametrize('exponent', range(3, 17))
+def test_a_nearly_uncontrollable_mode_is_never_solved_within_a_bound(exponent):
+    """Closer still, the gain computed is small again: only the residual tells that it is wrong."""
+    solution = solve_riccati(*nearly_uncontrollable(10.0 ** -exponent), max_gain=1e3)
+    assert solution.status in (RiccatiStatus.INACCURATE, RiccatiStatus.GAIN_TOO_LARGE,
+                               RiccatiStatus.NOT_STABILISABLE)
 
 
 OSCILLATOR = np.array([[0.0, 2.0], [-2.0, 0.0]])
@@ -134,6 +176,15 @@ def test_nothing_escapes_at_any_magnitude(h):
     assert solved > 10
 
 
+def test_riccati_without_an_input_gives_its_cost_and_without_an_input_weight_none():
+    solution = solve_riccati(-np.eye(2), np.zeros((2, 1)), np.eye(2), np.eye(1))
+    assert solution.status is RiccatiStatus.SOLVED
+    np.testing.assert_allclose(solution.P, 0.5 * np.eye(2), rtol=1e-14)
+    np.testing.assert_array_equal(solution.K, np.zeros((1, 2)))
+    solution = solve_riccati(-np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1)))
+    assert solution.status is RiccatiStatus.NOT_STABILISABLE
+
+
 # The sampled regulator.
 
 @pytest.mark.parametrize('h', [0.03, 0.3, 2.0])
@@ -176,6 +227,41 @@ def test_the_cost_of_the_sampled_regulator_is_its_solution_and_minimal():
     assert continuous > 1.001 * least
 
 
+def test_the_sampled_gain_tends_to_the_continuous_one():
+    for n, m in SIZES:
+        problem = random_problem(n, m, seed=5)
+        continuous = solve_riccati(*problem).K
+        far, near = (solve_riccati(*problem, interval=h).K for h in (2e-6, 1e-6))
+        assert np.linalg.norm(far - continuous) > 0.0
+        # what remains after the term in h is of its square
+        assert np.linalg.norm(2.0 * near - far - continuous) <= 1e-9 * np.linalg.norm(continuous)
+        # nor is anything lost where samples come in a burst
+        assert solve_riccati(*problem, interval=1e-12).residual <= 1e-9
+
+
+@pytest.mark.parametrize('rate', [1e3, 1e6, 1e9])
+def test_modes_that_decay_within_an_interval(rate):
+    """One that only follows the input counts as weight of the input, but for h rate = inf."""
+    h, slow = 2.0, np.array([[0.5]])
+    A, B = np.diag([-rate, 0.5]), np.array([[rate], [1.0]])
+    found = solve_riccati(A, B, np.diag([0.3, 1.0]), 0.2 * np.eye(1), interval=h)
+    reduced = solve_riccati(slow, np.eye(1), np.eye(1), 0.5 * np.eye(1), interval=h)
+    assert found.status is RiccatiStatus.SOLVED
+    assert found.K[0, 1] == pytest.approx(reduced.K[0, 0], rel=2.0 / (h * rate) + 1e-12)
+    # and one without weight that moves nothing else does not count
+    found = solve_riccati(A, B, np.diag([0.0, 1.0]), 0.5 * np.eye(1), interval=h)
+    np.testing.assert_allclose(found.K, [[0.0, reduced.K[0, 0]]], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize('gain', [1e-2, 1.0, 1e2])
+@pytest.mark.parametrize('periods', [1, 2, 5])
+def test_samples_as_far_apart_as_a_period_do_not_see_an_oscillation(gain, periods):
+    problem = OSCILLATOR, np.array([[0.0], [gain]]), np.eye(2), np.eye(1)
+    assert solve_riccati(*problem, interval=0.9 * np.pi).status is RiccatiStatus.SOLVED
+    found = solve_riccati(*problem, interval=periods * np.pi)
+    assert found.status is not RiccatiStatus.SOLVED
+
+
 # The integrals over an interval, which the sampled regulator is made of.
 
 @pytest.mark.parametrize('h', [1e-9, 1e-3, 0.1, 0.3, 2.0])
@@ -197,6 +283,12 @@ def test_the_interval_against_an_exponential_of_blocks(h):
 
 # Runge-Kutta steps.
 
+def test_linear_decay_is_the_taylor_polynomial_of_fourth_degree():
+    x, h = np.array([[2.0], [-1.0]]), np.array([[0.1], [0.3]])
+    a = -1.5 * h
+    expected = x * (1.0 + a + a ** 2 / 2.0 + a ** 3 / 6.0 + a ** 4 / 24.0)
+    np.testing.assert_allclose(runge_kutta_step(lambda x: -1.5 * x, x, h), expected, rtol=1e-15)
+
 
 def test_error_over_a_time_falls_with_the_fourth_power_of_the_step():
     def end(steps):
@@ -207,3 +299,9 @@ def test_error_over_a_time_falls_with_the_fourth_power_of_the_step():
 
     # dx/dt = x^2 from 1/2 reaches 1 at 1
     assert (end(20) - 1.0) / (end(40) - 1.0) == pytest.approx(16.0, rel=0.1)
+
+
+@pytest.mark.parametrize('interval', [1e-6, 0.3, 20.0])
+def test_transition_is_the_exponential(interval):
+    A = np.random.default_rng(0).normal(size=(5, 5)) - 3.0 * np.eye(5)
+    np.testing.assert_allclose(transition(A, interval), expm(A * interval), rtol=0, atol=1e-12)

@@ -49,6 +49,12 @@ def test_stamps_may_be_apart_by_the_tolerance(apart, found):
     assert taken(assembler, (100, 'level', 1.0), (100 + apart, 'flow', 2.0)) == found
 
 
+def test_a_part_joins_the_nearest_incomplete_sample():
+    assembler = SampleSynchronizer(('level', 'flow', 'heat'), tolerance_ns=10)
+    assert not taken(assembler, (100, 'level', 1.0), (115, 'level', 2.0), (109, 'flow', 3.0))
+    assert taken(assembler, (116, 'heat', 4.0)) == [(116, [2.0, 3.0, 4.0])]
+
+
 def test_a_message_after_its_sample_is_late():
     assembler = SampleSynchronizer(NAMES, tolerance_ns=10)
     assert taken(assembler, (100, 'level', 1.0), (100, 'flow', 2.0)) == [(100, [1.0, 2.0])]
@@ -66,6 +72,13 @@ def test_a_message_not_received_before_a_later_sample_is_missing():
     # and late, if it comes nevertheless
     assert not taken(assembler, (2, 'flow', 5.0))
     assert counts(assembler) == ({'flow': 1}, {'flow': 2}, {})
+
+
+def test_the_later_of_two_messages_with_one_stamp_counts():
+    assembler = SampleSynchronizer(NAMES)
+    assert taken(assembler, (1, 'level', 1.0), (1, 'level', 2.0), (1, 'flow', 3.0)) == [
+        (1, [2.0, 3.0])]
+    assert counts(assembler) == ({}, {}, {'level': 1})
 
 
 def test_time_that_is_set_back_begins_afresh():
@@ -103,3 +116,14 @@ def test_a_clock_that_was_wrong_for_a_while_costs_those_samples_alone(samples, a
     good = range(10 + samples, 200 + samples)
     assert [stamp for stamp, _ in taken(assembler, *(
         (k * SECOND, name, 1.0) for k in good for name in NAMES))] == [k * SECOND for k in good]
+
+
+def test_a_part_with_a_stamp_ahead_is_not_put_together_with_parts_of_that_time():
+    assembler = SampleSynchronizer(NAMES)
+    assert not taken(assembler, (60 * SECOND, 'level', 9.0))
+    for k in range(59):
+        assert taken(assembler, (k * SECOND, 'level', 1.0), (k * SECOND, 'flow', 2.0))
+    # of that time, the other signal comes first
+    assert not taken(assembler, (60 * SECOND, 'flow', 2.0))
+    assert taken(assembler, (60 * SECOND, 'level', 1.0)) == [(60 * SECOND, [1.0, 2.0])]
+    assert counts(assembler) == ({}, {'flow': 1}, {})

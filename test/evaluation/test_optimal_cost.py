@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
 from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
-from koopman_ros.plants import ControlAffineSystem, two_state_example
+from koopman_ros.plants import ControlAffineSystem, plant_class, two_state_example
 
 A = np.array([[0.5, 1.0, 0.0], [-1.0, 0.2, 0.3], [0.0, 0.4, -0.8]])
 B = np.array([[0.0, 0.2], [1.0, 0.0], [0.0, 0.7]])
@@ -53,6 +53,12 @@ def test_optimum_of_a_linear_plant_that_is_unstable_is_that_of_its_riccati_equat
     assert optimum(shifted).cost == pytest.approx(best.cost, rel=1e-8)
 
 
+def test_the_linear_law_has_the_cost_of_its_riccati_solution_when_sampled_fast():
+    P = solve_continuous_are(A, B, np.diag(TASK.Q), np.diag(TASK.R))
+    fast = replace(TASK, period=0.01, samples=3000, substeps=1)
+    assert linear_law(fast).cost == pytest.approx(TASK.x0 @ P @ TASK.x0, rel=1e-3)
+
+
 def test_optimum_and_linear_law_of_the_two_state_example():
     # 990.1798 is the cost of the exact lift's regulator for x1^2 + x2^2 + u^2 in continuous time,
     # and the linear one's is 4.54 times that when sampled every 10 ms
@@ -61,6 +67,15 @@ def test_optimum_and_linear_law_of_the_two_state_example():
     best = optimum(task)
     assert 990.1798 < best.cost < 990.1798 * 1.0001
     assert 4.4 < linear_law(task).cost / best.cost < 4.7
+
+
+def test_linear_law_misses_a_set_point_by_its_feed_forward():
+    system = plant_class('two_tanks')().system()
+    task = Task(system, system.nominal_state, np.array([0.10, 0.15]), np.array([7.5596, 1.6989]),
+                np.full(2, 1e4), np.ones(2), 1.0, 120)
+    miss = np.abs(linear_law(task).states[-1] - task.x_ref)
+    assert 1e-4 < np.max(miss) < 1e-2
+    np.testing.assert_allclose(optimum(task).states[60], task.x_ref, atol=1e-5)
 
 
 def test_a_plant_that_no_law_holds_is_named():

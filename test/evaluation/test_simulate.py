@@ -4,6 +4,7 @@
 """Closed loops, sampled and in continuous time, against references of their own."""
 
 from dataclasses import dataclass, replace
+import itertools
 import math
 
 import numpy as np
@@ -11,16 +12,18 @@ import pytest
 from scipy.linalg import solve_continuous_are
 
 from koopman_ros.control import Controller, InputLimits, Mode, Tuning
-from koopman_ros.control.events import ManualCommand, ModeChange, SetpointRequest
+from koopman_ros.control.events import Initialisation, ManualCommand, ModeChange, SetpointRequest
 from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, Weights
+from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import solve_riccati
-from koopman_ros.evaluation.simulate import at, run_closed_loop, simulate
+from koopman_ros.evaluation.simulate import at, exchange, restart, run_closed_loop, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
     Actuator,
     ControlAffineSystem,
     Process,
     two_state_example,
+    two_state_reactor,
 )
 from studies.paper.optimal_control import exact_two_state_model
 from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
@@ -139,6 +142,30 @@ def test_a_simulation_in_two_parts_is_the_same(case):
 
 # What is measured.
 
+@each_case
+def test_outputs_in_other_units_give_the_same_loop(case):
+    C = np.diag(1.0 + np.arange(float(case.model.n_x))) * 4.0
+    usual = run(case, samples=20)
+    names = tuple(f'y{k}' for k in range(case.model.n_x))
+    found = simulate(
+        replace(controller(case), outputs=Outputs(names, names, C)), process(case),
+        [at(0.0, SetpointRequest(0, case.goal))], period=case.seconds,
+        duration=20 * case.seconds)
+    np.testing.assert_array_equal(found.measured, found.states @ C)
+    np.testing.assert_allclose(found.commands, usual.commands, rtol=1e-9, atol=1e-9)
+
+
+def test_a_plant_with_more_states_than_the_model_needs_the_measured_names():
+    plant = two_state_reactor()
+    there = Process(plant, 0, plant.nominal_state, plant.nominal_input)
+    case = CASES['reactor_nz4']
+    found = simulate(controller(case), there, duration=3.0, C=np.array([[0.0, 1.0]]))
+    np.testing.assert_array_equal(found.measured, found.states[:, 1:])
+    with pytest.raises(ValueError, match=r'plant has 2 states and the model 1: give C \(1, 2\)'):
+        simulate(controller(case), there, duration=3.0)
+    with pytest.raises(ValueError, match=r'incompatible C: expected \(1, 2\) .* got \(2, 2\)'):
+        simulate(controller(case), there, duration=3.0, C=np.eye(2))
+
 
 @each_case
 def test_noise_is_that_of_its_seed(case):
@@ -151,13 +178,66 @@ def test_noise_is_that_of_its_seed(case):
     assert abs(np.corrcoef(added[:-1].ravel(), added[1:].ravel())[0, 1]) < 0.4
 
 
+@each_case
+@pytest.mark.parametrize('fault', [math.nan, None], ids=['NaN', 'silence'])
+def test_a_sensor_that_fails_holds_the_command_until_it_is_back(case, fault):
+    def sensor(y, seconds):
+        blind = 10.0 <= seconds / case.seconds < 15.0
+        return y if not blind else None if fault is None else np.full_like(y, fault)
+
+    found = run(case, sensor=sensor)
+    assert set(found.levels[10:15]) == {'hold'}
+    assert np.all(np.isnan(found.measured[10:15]))
+    np.testing.assert_array_equal(found.commands[10:15], found.commands[[9] * 5])
+    assert found.levels[15] == 'sdre'
+    np.testing.assert_allclose(
+        (found.states[-1] - case.goal) / case.model.states.scale, 0.0, atol=5e-3)
+
+
 def test_silence_from_the_start_commands_nothing():
     found = run(CASES['reactor_nz4'], samples=3, sensor=lambda y, _: None)
     assert np.all(np.isnan(found.commands))
     np.testing.assert_array_equal(found.inputs, [REACTOR.nominal_input] * 4)
 
 
+@pytest.mark.parametrize(('stamp', 'back'), [
+    (lambda time_ns: 10 ** 18 + time_ns, []),
+    # after a minute the clock is set back by half an hour
+    (lambda time_ns: 10 ** 18 + time_ns - (time_ns >= 6 * 10 ** 10) * 18 * 10 ** 11, [12])])
+def test_stamps_are_those_of_the_clock(stamp, back):
+    found = run(CASES['reactor_nz4'], stamp=stamp)
+    assert [n for n, report in enumerate(found.reports)
+            if report.measurement.clock_went_back] == back
+    assert abs(found.states[-1, 0] - SETPOINT) < 0.01
+
+
 # What happens to the controller.
+
+
+def at_rest(case, *events, **others):
+    """Simulate a loop that starts at its goal."""
+    there = Process(case.plant, 0, case.goal, case.held)
+    return run(case, at(0.0, Initialisation(case.held)), *events, plant=there, **others)
+
+
+@each_case
+def test_a_hand_over_at_rest_is_not_felt(case):
+    later = 10.0 * case.seconds
+    heavier = replace(controller(case).tuning, input_weight=np.full(case.model.n_u, 9.0))
+    for what in (exchange(Controller(case.model, heavier)), restart, ModeChange(Mode.MANUAL)):
+        found = at_rest(case, at(later, what), samples=20)
+        assert np.max(np.abs(np.diff(found.commands, axis=0))) < 1e-3 * np.max(
+            case.model.inputs.scale)
+        assert (found.levels[-1] == 'manual') is isinstance(what, ModeChange)
+
+
+@each_case
+def test_the_operator_moves_the_input_of_a_loop(case):
+    by = 0.5 * case.model.inputs.scale
+    found = at_rest(case, at(0.0, ModeChange(Mode.MANUAL)),
+                    at(5.0 * case.seconds, ManualCommand(case.held + by)), samples=10)
+    np.testing.assert_array_equal(found.commands[:5], [case.held] * 5)
+    np.testing.assert_allclose(found.commands[5:], [case.held + by] * 6, rtol=1e-12)
 
 
 def test_a_rejected_request_ends_the_simulation_with_its_reason():
@@ -250,6 +330,12 @@ def drive(start, duration=10.0, *, model=SCALAR, rate=scalar_rate, **others):
                            Weights(np.eye(1), np.eye(1)), duration, **others)
 
 
+def test_distance_from_the_training_box():
+    """The box reaches two scales below and one above the center, three halves as its half."""
+    for start, expected in ((0.5, 0.0), (1.75, 0.5), (-2.5, 1.0 / 3.0)):
+        assert drive(start, 5.0).distance(SCALAR) == pytest.approx(expected, abs=1e-9)
+
+
 # Failures.
 
 def failing(law_input=None, solved=lambda x: True):
@@ -302,6 +388,19 @@ def test_a_loop_that_fails_returns_the_path_up_to_there(start, others, failure, 
         assert np.all(np.isnan(loop.inputs))
 
 
+def test_a_law_without_an_answer_at_a_time_of_the_report():
+    """The integration steps over the state; the inputs to return need the law there."""
+    def limited(calls):
+        return drive(1.0, 5.0, law=failing(solved=lambda _: next(calls) < limit), samples=3)
+
+    limit, calls = math.inf, itertools.count()
+    assert limited(calls).failure == ''
+    limit = next(calls) - 1
+    loop = limited(itertools.count())
+    assert loop.failure.startswith(UNSOLVED)
+    assert len(loop.times) == len(loop.states) == len(loop.inputs)
+
+
 # What does not fit.
 
 SHAFT = linear_model()
@@ -324,6 +423,20 @@ def test_a_loop_of_mismatched_arguments_is_an_error(change, message):
     usual = {'x0': STATES.center, 'x_ref': STATES.center, 'weights': WEIGHTS, 'duration': 1.0}
     with pytest.raises(ValueError, match=message):
         run_closed_loop(SHAFT, rate, **{**usual, **change})
+
+
+@pytest.mark.parametrize(('Q', 'R', 'message'), [
+    (1.0, [[1.0]], r'incompatible Q: expected a square matrix, got \(\); Weights.physical takes'),
+    ([[1.0, 2.0]], [[1.0]], r'incompatible Q: expected a square matrix, got \(1, 2\)'),
+    ([[1.0, 2.0], [0.0, 1.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
+    ([[1.0, 2.0], [2.0, 1.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
+    ([[0.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
+    ([[np.nan]], [[1.0]], r'Q must be finite, but entry \[0, 0\] is nan'),
+    ([[1.0]], [[0.0]], r'R must be symmetric, positive definite, got \[\[0\.0\]\]'),
+    ([[1.0]], [[-1.0]], 'R must be symmetric, positive definite')])
+def test_weights_that_are_none(Q, R, message):
+    with pytest.raises(ValueError, match=message):
+        Weights(Q, R)
 
 
 def test_weights_in_the_units_of_the_signals():

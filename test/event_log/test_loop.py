@@ -7,8 +7,10 @@ Records of any sequence of events give the same commands again, from any snapsho
 Values go through JSON bit-identical, and nothing but data comes back.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+import json
 from pathlib import Path
+import re
 from typing import Any
 
 from hypothesis import given, settings
@@ -149,6 +151,15 @@ def test_lost_records_are_reported_and_replay_continues_at_the_next_snapshot() -
     assert all(right[28:])
 
 
+def test_controllers_on_one_topic_and_one_that_is_started_again() -> None:
+    one, two = day(run='a'), day(run='b', name='reactor_nz3')
+    both = [text for pair in zip(one.texts, two.texts, strict=True) for text in pair]
+    found = replayed([*both, *day(run='c').texts])
+    assert all(identical(found))
+    assert (found.runs, found.begins_late) == (3, 0)
+    assert found.models == ['reactor_nz4', 'reactor_nz3']
+
+
 def test_same_model_under_the_same_parameters_commands_the_same() -> None:
     controller = Recorded(**{'temperature.setpoint_ramp': 0.1})
     for k in range(40):
@@ -168,6 +179,12 @@ def test_same_model_under_the_same_parameters_commands_the_same() -> None:
         model, digest, {'coolant_temperature.weight': 0.1}))
     assert not all(identical(found, 'alternative'))
     assert all(identical(found))
+
+
+def test_a_model_that_rejects_the_setpoint_tracks_the_previous_one() -> None:
+    found = replayed(day().texts, Alternative(*MODELS['reactor_linear']))
+    assert all(sample.alternative is not None for sample in found.samples)
+    assert not all(identical(found, 'alternative'))
 
 
 def test_a_model_file_is_found_after_its_folder_moved(tmp_path: Path) -> None:
@@ -233,8 +250,41 @@ def test_record_that_does_not_fit(place: int, change: Any, words: str) -> None:
 # Values.
 
 
+@dataclass(frozen=True)
+class Leaf:
+    mode: Mode
+    weights: np.ndarray
+    note: object = None
+
+
 class Plain:
     pass
+
+
+FLOATS = st.floats() | st.sampled_from([-0.0, 5e-324, 1.7976931348623157e308, 0.1])
+ARRAYS = st.lists(FLOATS, max_size=4).map(np.array) | st.lists(
+    FLOATS, min_size=6, max_size=6).map(lambda values: np.array(values).reshape(2, 3)) | (
+    st.lists(st.integers(-9, 9), max_size=3).map(lambda values: np.array(values, dtype=int))) | (
+    st.just(np.zeros((0, 3))))
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | FLOATS | st.text(max_size=5) | ARRAYS
+    | st.sampled_from(Mode) | FLOATS.map(np.float64),
+    lambda inner: st.lists(inner, max_size=3).map(tuple) | st.dictionaries(
+        st.text(max_size=3).filter(lambda key: key != '@'), inner, max_size=3) | st.builds(
+        Leaf, st.sampled_from(Mode), ARRAYS, inner), max_leaves=12)
+
+
+def exact(value: object) -> str:
+    """Return a text that tells all values apart: of types, of bits, but not of several NaN."""
+    with np.printoptions(floatmode='unique'):
+        return re.sub(r'np\.float64\(([^)]*)\)', r'\1', repr(value))
+
+
+@settings(max_examples=25, deadline=None)
+@given(VALUES)
+def test_values_survive_bit_identical(value: object) -> None:
+    text = json.dumps(records.encoded(value), allow_nan=False)
+    assert exact(records.decoded(json.loads(text))) == exact(value)
 
 
 @pytest.mark.parametrize(('text', 'error'), [

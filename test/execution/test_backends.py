@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from koopman_ros.execution import backend_of, SchedulerLost, Serial, WorkerLost
-from koopman_ros.execution.pools import Cluster
+from koopman_ros.execution.pools import Cluster, Processes
+from koopman_ros.parameters.trainer import trainer_table
 
 KINDS = ('', 'process', 'joblib:2', 'dask')
 
@@ -132,6 +133,15 @@ def test_a_task_that_does_not_end_is_abandoned(places, monkeypatch):
     assert list(places['process'].run(lambda *_: 5, {'next': None})) == [('next', 5)]
 
 
+def test_a_process_has_one_thread_and_ignores_an_interrupt(monkeypatch):
+    def probe(*_):
+        return os.environ['OMP_NUM_THREADS'], signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+    monkeypatch.delenv('OMP_NUM_THREADS', raising=False)
+    with Processes(1) as own:
+        assert list(own.run(probe, {'probe': None})) == [('probe', ('1', True))]
+
+
 def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
     monkeypatch.setattr('koopman_ros.execution.pools._CONNECT', 0.3)
     monkeypatch.setattr('koopman_ros.execution.pools._JOIN', 0.1)
@@ -154,3 +164,14 @@ def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
         work = place.run(until_lost, {'a': 0}, watch=lambda name, _: bool(name) and lost.close())
         with pytest.raises(SchedulerLost, match='lost the connection'):
             list(work)
+
+
+@pytest.mark.parametrize('text', [
+    'joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
+def test_other_names_are_rejected(text):
+    with pytest.raises(ValueError, match=f'executor is {text!r}, must be empty'):
+        backend_of(text)
+    table = trainer_table(None, {
+        'system': 'own', 'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})
+    assert table.check(table.snapshot({'executor': text})).startswith('executor is ')
+    assert 'executor' not in table.check(table.snapshot({'executor': 'joblib:2'}))

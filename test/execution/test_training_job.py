@@ -5,7 +5,10 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
+import itertools
+import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +16,7 @@ import time
 import pytest
 
 from koopman_ros.core.paths import model_path
+from koopman_ros.execution import job as job_module
 from koopman_ros.execution import training
 from koopman_ros.execution.training import JobState, TrainingJob
 from support.nodes import TIMEOUT, wait_until_ended
@@ -42,6 +46,27 @@ def follow(job: TrainingJob) -> Iterator[JobState]:
         else:
             # or the process that is waited for would have one core less
             time.sleep(0.01)
+
+
+@pytest.mark.parametrize(('step', 'number', 'code', 'words'), [
+    ('starting', signal.SIGKILL, -signal.SIGKILL,
+     'the training process was killed by SIGKILL: check the free memory, and train again'),
+    ('estimating', signal.SIGTERM, 1, 'cancelled; nothing was written')])
+def test_process_that_gets_a_signal(
+        task: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str,
+        number: int, code: int, words: str) -> None:
+    # its libraries may take their time to end on a busy machine
+    monkeypatch.setattr(job_module, '_PATIENCE', TIMEOUT)
+    job = TrainingJob(task)
+    assert any(state.text.startswith(step) for state in itertools.chain([job.state], follow(job)))
+    os.kill(job.process.pid, number)
+    *_, state = follow(job)
+    assert (state.text, state.ended) == (words, True)
+    assert (state.accepted, state.rejected) == (False, False)
+    assert state.share < 1.0
+    job.close()
+    assert job.process.returncode == code
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(('program', 'share', 'words'), [
@@ -81,6 +106,17 @@ def test_process_ends_with_its_parent_that_is_killed(
         parent.kill()
     wait_until_ended(child)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TrainingJob, 'command', lambda *_: (
+        'sh', '-c', 'echo \'{"progress": 0.5, "text": "x"}\'; exec sleep 3600'))
+    monkeypatch.setattr(job_module, '_PATIENCE', 0.2)
+    job = TrainingJob({})
+    next(follow(job))
+    job.close()
+    assert job.process.returncode == -signal.SIGKILL
+    assert job.poll().text == 'cancelled; nothing was written'
 
 
 def test_figures_are_reported_for_each_signal() -> None:

@@ -5,20 +5,28 @@
 
 from dataclasses import replace
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import PlantDescription
+from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.model import (
     Box,
+    Coordinates,
+    InputTerms,
+    linearised_model,
     NetworkObservables,
     PolynomialObservables,
+    Provenance,
     TrainingStates,
 )
+from koopman_ros.plants import two_state_reactor
+from studies.paper.optimal_control import exact_two_state_model
 from support.random_lifts import coordinates, random_lift, random_network
-from support.small_plants import BENT, bent_samples
+from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
 
 def states(n_x, count=20, seed=1):
@@ -44,6 +52,24 @@ def test_rates_of_z_are_brought_to_the_nearest_rate_of_the_state(n_x, identity):
             assert found.shape == (n_x, *columns)
             expected = np.linalg.lstsq(J, rate, rcond=None)[0]
             np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-13)
+
+
+def test_a_lift_at_rest_moves_no_state():
+    model = random_lift(1, identity=False)
+    np.testing.assert_array_equal(
+        model.onto_states(np.zeros((model.n_z, 1))) @ np.ones(model.n_z), [0.0])
+
+
+def test_drift_of_a_dictionary_by_hand():
+    """With z = (x, x^2) the first row of A z is the rate of x, whatever the second one says."""
+    A = np.array([[-1.0, 0.25], [0.5, -3.0]])
+    model = replace(random_lift(1), observables=PolynomialObservables.total_degree(1, 2),
+                    A=A, readout=A[:1])
+    x = np.linspace(-2.0, 2.0, 9)[:, None]
+    expected = -x + 0.25 * x ** 2
+    np.testing.assert_allclose(model.drift(x), expected, rtol=1e-13)
+    np.testing.assert_allclose([model.drift(v) for v in x], expected, rtol=1e-13)
+    np.testing.assert_array_equal(model.linearised.A, [[-1.0]])
 
 
 def test_the_mismatch_of_a_lift_is_how_far_its_coordinates_go_another_way():
@@ -101,6 +127,28 @@ def test_the_slope_of_the_drift_is_that_of_differences(n_x, identity):
                                atol=1e-7 * np.max(np.abs(differences)))
 
 
+@pytest.mark.parametrize('n_x', [1, 2, 3])
+def test_averaged_jacobian_makes_the_difference_of_the_drift(n_x):
+    model = random_lift(n_x)
+    for x, x_ref in zip(0.5 * states(n_x), 0.5 * states(n_x, seed=2), strict=True):
+        A = model.averaged_drift_jacobian(x, x_ref)
+        np.testing.assert_allclose(A @ (x - x_ref), model.drift(x) - model.drift(x_ref),
+                                   rtol=0, atol=1e-5)
+        # at the reference it is the slope there
+        np.testing.assert_allclose(model.averaged_drift_jacobian(x, x), model.drift_jacobian(x),
+                                   rtol=0, atol=1e-9)
+    batch = states(n_x, 6).reshape(2, 3, n_x)
+    for x, of_batch in zip(batch.reshape(6, n_x), model.drift_jacobian(batch).reshape(
+            6, n_x, n_x), strict=True):
+        np.testing.assert_allclose(of_batch, model.drift_jacobian(x), rtol=0, atol=1e-9)
+
+
+def read_out(n_x=2, units=5, **options):
+    """Return a random lift with a random read-out of its hidden units."""
+    weights = np.random.default_rng(0).normal(size=(n_x, n_x + units))
+    return replace(random_lift(n_x, units, **options), readout=weights)
+
+
 def test_a_read_out_by_hand():
     """Of f = 3 x - 2 (tanh(2 x + 1) - tanh(1)), beside whatever z and A are."""
     model = replace(random_lift(1, 1), observables=NetworkObservables(
@@ -142,6 +190,78 @@ def test_a_pre_feedback_is_taken_out_of_the_drift(identity):
     np.testing.assert_allclose(linear.drift(step), step @ linear.A.T, rtol=0, atol=1e-20)
 
 
+def under_pre_feedback(model, K):
+    """Return the model of the same plant whose A is that of the plant under u = K x."""
+    push = model.jacobian(np.zeros(model.n_x)) @ model.B
+    A = np.array(model.A)
+    A[:, :model.n_x] += push @ K
+    return replace(model, A=A, pre_feedback=K)
+
+
+def test_a_plant_is_the_same_with_and_without_pre_feedback():
+    """The exact lift of the two-state example, whose J B is constant: drift, modes, mismatch."""
+    exact, x = exact_two_state_model(), states(2)
+    for model in (exact, replace(exact, readout=None)):
+        closed = under_pre_feedback(model, np.array([[0.3, -3.0]]))
+        np.testing.assert_allclose(closed.drift(x), model.drift(x), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(closed.linearised.A, model.linearised.A, rtol=0, atol=1e-14)
+        assert closed.mismatch < 1e-25
+        # the eigenvalues are those of the closed loop
+        assert (model.is_hurwitz, closed.is_hurwitz) == (False, True)
+        assert not closed.adds_unstable_modes
+    assert under_pre_feedback(exact, np.array([[0.0, 2.0]])).adds_unstable_modes is False
+    grows = replace(exact, A=exact.A + np.diag([0.0, 0.0, 1.0]))
+    assert under_pre_feedback(grows, np.array([[0.0, -3.0]])).adds_unstable_modes
+
+
+@pytest.mark.parametrize('model', [
+    read_out(), read_out(3, 6, identity=False), read_out(1, 4),
+    replace(random_lift(n_free=7), observables=PolynomialObservables.total_degree(2, 3),
+            readout=np.random.default_rng(0).normal(size=(2, 9)))],
+    ids=['identity', 'free', 'one state', 'monomials'])
+def test_the_drift_of_a_read_out_and_its_slope(model):
+    """At rest at the nominal point exactly; its slope is that of differences."""
+    np.testing.assert_array_equal(model.drift(np.zeros(model.n_x)), 0.0)
+    batch = states(model.n_x, 6)
+    np.testing.assert_allclose(model.drift(batch), [model.drift(x) for x in batch],
+                               rtol=0, atol=1e-13)
+    for x in batch:
+        step = 1e-6 * np.eye(model.n_x)
+        slope = (model.drift(x + step) - model.drift(x - step)).T / 2e-6
+        np.testing.assert_allclose(model.drift_jacobian(x), slope, rtol=0, atol=2e-8)
+        difference = model.drift(x) - model.drift(batch[0])
+        np.testing.assert_allclose(model.averaged_drift_jacobian(x, batch[0]) @ (x - batch[0]),
+                                   difference, rtol=0, atol=1e-12)
+
+
+def linear_reactor():
+    system = two_state_reactor()
+    below, above = np.array([0.1, 9.0]), np.array([0.1, 5.0])
+    return system, linearised_model(
+        system.drift_jacobian(system.nominal_state), system.B,
+        Coordinates(system.state_names, system.state_units, system.nominal_state,
+                    np.array([0.1, 10.0]), system.nominal_state - below,
+                    system.nominal_state + above),
+        Coordinates(system.input_names, system.input_units, system.nominal_input,
+                    np.array([7.0]), np.array([290.0]), np.array([310.0])),
+        system.time_unit, Provenance(system.name))
+
+
+def test_linearisation_in_units_has_the_eigenvalues_of_the_plant():
+    system, model = linear_reactor()
+    assert model.is_hurwitz
+    assert model.seconds_per_time_unit == 60.0
+    x = system.nominal_state + np.array([0.02, -3.0])
+    u = system.nominal_input + 4.0
+    rate = model.states.scale * (
+        model.drift(model.states.to_deviation(x)) + model.B @ model.inputs.to_deviation(u))
+    jacobian = system.drift_jacobian(system.nominal_state)
+    expected = jacobian @ (x - system.nominal_state) + system.B @ (u - system.nominal_input)
+    np.testing.assert_allclose(rate, expected, rtol=1e-13)
+    np.testing.assert_allclose(np.sort_complex(model.eigenvalues),
+                               np.sort_complex(np.linalg.eigvals(jacobian)), rtol=1e-12)
+
+
 @pytest.mark.parametrize(('A', 'slowest_first', 'hurwitz'), [
     ([[-3.0, 1.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -7.0]], [-0.5, -3.0, -7.0], True),
     ([[-1.0, 5.0], [0.0, -1e-9]], [-1e-9, -1.0], True),
@@ -153,6 +273,37 @@ def test_eigenvalues_come_slowest_first_and_every_mode_has_to_decay(A, slowest_f
     model = replace(random_lift(n_x=1, n_free=len(A) - 1), A=np.array(A))
     np.testing.assert_allclose(model.eigenvalues, slowest_first, rtol=1e-14, atol=1e-16)
     assert model.is_hurwitz is hurwitz
+
+
+def test_a_printed_model_shows_its_ranges_rates_and_verdict():
+    model = exact_two_state_model()
+    model = replace(model, provenance=replace(
+        model.provenance, metrics={'rx': 0.25, f'free_run_{model.states.names[0]}': 0.5},
+        accepted=False, reasons=('too few loops',)),
+        dead_time=np.array([7.5]))
+    lines = str(model).splitlines()
+    for name, unit in zip(model.states.names, model.states.units, strict=True):
+        assert sum(f'state {name}: trained from' in line and line.endswith(unit)
+                   for line in lines) == 1
+    assert f'{model.eigenvalues.real[0]:.4g} per {model.time_unit}' in str(model)
+    assert '  held-out residual of the drift, relative: 0.25' in lines
+    assert any(line.startswith('  free-run error (RMS)') and line.endswith(': 0.5')
+               for line in lines)
+    assert f'  dead time of {model.inputs.names[0]}: 7.5 s' in lines
+    assert lines[-1] == '  acceptance: rejected (too few loops)'
+    in_notebook = []
+    model._repr_pretty_(SimpleNamespace(text=in_notebook.append), False)
+    assert in_notebook == [str(model)]
+
+
+def test_a_model_cannot_be_changed():
+    A = -np.eye(5)
+    model = replace(random_lift(), A=A)
+    A[0, 0] = 9.0
+    assert model.A[0, 0] == -1.0
+    for array in (model.A, model.B, model.E, model.states.center):
+        with pytest.raises(ValueError, match='read-only'):
+            array[0] = 1.0
 
 
 @pytest.mark.parametrize(('change', 'message'), [
@@ -207,6 +358,17 @@ def test_a_measured_disturbance_acts_as_the_input_that_it_was():
     assert joined.with_disturbances(()) is joined is joined.joined
 
 
+@pytest.mark.parametrize(('changes', 'names', 'message'), [
+    ({}, ('x',), 'unknown names x: choose from u0, u1'),
+    ({'input_terms': InputTerms(np.ones((2, 2, 2)))}, ('u1',), 'must not depend on the state'),
+    ({'pre_feedback': np.ones((2, 2))}, ('u1',), 'must not depend on the state'),
+    ({'dead_time': np.array([0.0, 3.0])}, ('u1',), 'has no dead time'),
+])
+def test_an_input_that_cannot_be_a_disturbance_is_rejected(changes, names, message):
+    with pytest.raises(ValueError, match=message):
+        replace(random_lift(n_u=2), **changes).with_disturbances(names)
+
+
 @pytest.mark.parametrize(('change', 'message'), [
     ({'units': ('K',)}, 'incompatible units: expected 2, got 1'),
     ({'center': np.zeros(3)}, r'incompatible center: expected \(2,\), got \(3,\)'),
@@ -223,6 +385,14 @@ def test_coordinates_that_do_not_fit_are_rejected(change, message):
         replace(coordinates('x', 2), **change)
 
 
+def test_coordinates_scale_both_ways():
+    c = coordinates('x', 2)
+    np.testing.assert_array_equal(c.to_deviation(np.array([4.0, -0.5])), [2.0, -1.0])
+    np.testing.assert_array_equal(c.to_physical(np.array([2.0, -1.0])), [4.0, -0.5])
+    batch = states(2)
+    np.testing.assert_allclose(c.to_deviation(c.to_physical(batch)), batch, rtol=0, atol=1e-15)
+
+
 # The box is [2, 3.5] x [-2, 2.5], with half-ranges 0.75 and 2.25.
 @pytest.mark.parametrize(('value', 'violation'), [
     ([3.0, 0.0], 0.0), ([2.0, 2.5], 0.0), ([3.5, -2.0], 0.0), ([4.25, 0.0], 1.0),
@@ -232,6 +402,13 @@ def test_coordinates_that_do_not_fit_are_rejected(change, message):
 ])
 def test_violation_counts_half_widths(value, violation):
     assert coordinates('x', 2).violation(np.array(value)) == pytest.approx(violation, rel=1e-15)
+
+
+def test_model_without_inputs():
+    model = replace(random_lift(), inputs=coordinates('u', 0), B=np.zeros((2, 0)),
+                    dead_time=np.zeros(0))
+    assert model.n_u == 0
+    assert model.inputs.violation(np.zeros(0)) == 0.0
 
 
 # Boxes, from the range of samples.
@@ -261,6 +438,18 @@ def test_box_scales_by_half_the_range_from_the_nominal_point():
     assert deviations(box, samples)[2].shape == (180, 0)
 
 
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'u': np.full((180, 1), 0.5)}, '0.5 m/s: excite the plant'),
+    ({'x': np.full((180, 1), 3.0)}, '3.0 m: excite the plant'),
+    ({'u': np.zeros((180, 2))}, 'values of 2 signals for 1 names: flow')])
+def test_constant_or_mismatched_signals_have_no_box(changes, message):
+    samples = bent_samples()
+    with pytest.raises(ValueError, match=message):
+        Box.of(BENT, changes.get('x', samples.x), changes.get('u', samples.u))
+    with pytest.raises(ValueError, match=r'incompatible B: expected \(1, 1\), got \(2, 1\)'):
+        Box.of(BENT, samples.x, samples.u).input_matrix(np.ones((2, 1)))
+
+
 # Representative states of the training data.
 
 # an L along two sides of the box [-1, 1] x [-1, 1]
@@ -277,6 +466,19 @@ def test_few_states_are_all_kept_once_and_fill_completely():
     # the corner of the box that holds no data
     assert found.distance(ONES, ONES) == pytest.approx(2.0)
     assert found.distance(np.array([-1.0, -1.0]), ONES) == 0.0
+
+
+def test_many_states_are_thinned_and_none_is_outside():
+    states = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 2))
+    states = states[states.min(axis=1) < 0.0]
+    found = TrainingStates.of(states, ONES)
+    assert found.states.shape == (256, 2)
+    nearest = [np.min(np.max(np.abs(found.states - x), axis=1)) for x in states]
+    assert found.fill_distance == max(nearest)
+    # 256 squares of this half side would cover three quarters of the box
+    assert 0.5 * math.sqrt(3.0 / 256.0) <= found.fill_distance < 2.0 * math.sqrt(3.0 / 256.0)
+    assert max(found.distance(x, ONES) for x in states) == 0.0
+    assert found.distance(np.array([0.6, 0.6]), ONES) == pytest.approx(0.6, abs=0.15)
 
 
 def test_distance_of_a_model_is_the_larger_of_box_and_data():
@@ -301,3 +503,31 @@ def test_distance_of_a_model_is_the_larger_of_box_and_data():
 def test_what_does_not_fit_is_rejected(states, fill, words):
     with pytest.raises(ValueError, match=words):
         TrainingStates(states, fill)
+
+
+def test_training_on_several_states_notes_them_and_on_one_does_not():
+    recipe = IncrementalTraining(3, hidden_first=3, max_iterations=2)
+    samples = two_state_samples()
+    model = train(TWO_STATE, samples, recipe, starts=1, reject=False).model
+    known = model.training_states
+    assert known is not None
+    assert known.states.shape == (256, 2)
+    # but for rounding on the way to scaled deviations and back
+    assert all(model.distance(x) < 1e-12 for x in samples.x)
+    assert model.distance(np.array([-6.0, 12.0])) > 0.5
+    assert train(BENT, bent_samples(), IncrementalTraining(2, hidden_first=3, max_iterations=2),
+                 starts=1, reject=False).model.training_states is None
+
+
+def test_lists_do_as_arrays_do_and_another_size_is_rejected():
+    model, x = random_lift(), [0.3, -0.2]
+    for act in (model.lift, model.jacobian, model.drift, model.distance):
+        np.testing.assert_array_equal(act(x), act(np.array(x)))
+        with pytest.raises(ValueError, match=r'incompatible state: expected one number for each '
+                                             r'of x0, x1 in the last axis, got \(3,\)'):
+            act(np.zeros(3))
+    with pytest.raises(ValueError, match='level: choose from x0, x1'):
+        model.states.only(['level'])
+    plant = replace(model.plant, nominal_state=[1.0, 1.0])
+    with pytest.raises(ValueError, match='incompatible x: expected one row'):
+        Box.of(plant, [1.0, 2.0], [[1.0]])

@@ -4,11 +4,13 @@
 """The model file: bit for bit there and back, and a rejection for everything else."""
 
 from dataclasses import replace
+import hashlib
 import json
 import os
 from pathlib import Path
 import resource
 import stat
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from koopman_ros.model import (
     InputTerms,
     linearised_model,
     load,
+    load_with_digest,
     model_file,
     ModelFileError,
     PolynomialObservables,
@@ -30,6 +33,7 @@ from koopman_ros.model import (
 from support.closed_loops import content
 from support.random_lifts import random_lift
 
+SHIPPED = Path(__file__).parents[2] / 'config' / 'models'
 RNG = np.random.default_rng(0)
 
 
@@ -107,6 +111,16 @@ def test_round_trip_is_exact(model, path):
     usual = path.with_name('usual')
     usual.touch()
     assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(usual.stat().st_mode)
+
+
+def test_a_shipped_file_is_written_again_bit_for_bit(path):
+    for shipped in SHIPPED.glob('*.safetensors'):
+        save(load(shipped), path)
+        assert path.read_bytes() == shipped.read_bytes(), shipped
+
+
+def test_the_digest_is_that_of_the_file(path, sound):
+    assert load_with_digest(path)[1] == hashlib.sha256(sound).hexdigest()
 
 
 # What is no model file.
@@ -231,10 +245,30 @@ def test_a_description_that_does_not_fit_is_rejected(path, sound, part, changes,
         about[part] if part else about).update(changes)))
 
 
+@pytest.mark.parametrize('name', ['identity', 'inputs', 'provenance', 'states', 'time_unit'])
+def test_a_description_without_an_entry_is_rejected(path, sound, name):
+    assert f'{name!r} is missing' in rejection(path, changed(sound, lambda about: about.pop(name)))
+
+
+@pytest.mark.parametrize('fill', [-0.5, np.nan, '0', None])
+def test_a_fill_distance_that_does_not_fit_is_rejected(path, fill):
+    save(MODELS['training states'], path)
+    assert 'fill_distance' in rejection(path, changed(
+        path.read_bytes(), lambda about: about.update(fill_distance=fill)))
+
+
 @pytest.mark.parametrize(('name', 'arrays', 'words'), ARRAYS)
 def test_arrays_that_do_not_fit_are_rejected(path, name, arrays, words):
     save(MODELS[name], path)
     assert words in rejection(path, changed(path.read_bytes(), **arrays))
+
+
+@pytest.mark.parametrize(('metadata', 'words'), [
+    ('{"format_version": 2}', 'format version 2, this package reads 1'),
+    ('{}', "'format_version' is missing"), ('[1]', ''), ('{n_x', ''), ('[' * 100_000, '')])
+def test_metadata_of_another_format_is_rejected(path, sound, metadata, words):
+    assert words in rejection(path, safetensors.numpy.save(
+        safetensors.numpy.load(sound), metadata={model_file._KEY: metadata}))
 
 
 LARGE = {
@@ -257,6 +291,13 @@ def test_a_model_beyond_the_limits_is_neither_written_nor_read(path, words, monk
             careless.setattr(model_file, 'check', lambda _: None)
             save(LARGE[words], path)
         assert words in rejection(path, path.read_bytes())
+
+
+def test_a_lift_of_another_kind_is_not_written(path):
+    other = SimpleNamespace(n_x=2, n_z=5, identity=True, features=SimpleNamespace(n_z=5))
+    with pytest.raises(TypeError, match='only lifts of networks and of monomials'):
+        save(replace(PLAIN, observables=other), path)
+    assert not path.exists()
 
 
 # Writing.
@@ -289,3 +330,16 @@ def test_a_reader_sees_the_old_file_or_the_new_one(path, sound, monkeypatch):
     assert seen == [content(large), content(PLAIN)]
     assert content(load(path)) == content(large)
     assert os.listdir(path.parent) == [path.name]
+
+
+@pytest.mark.parametrize(('model', 'kind', 'acceptance'), [
+    (with_origin(model_class='neural drift'), 'neural drift', 'not tested'),
+    (MODELS['network'], 'identity lift, n_z = 5', 'not tested'),
+    (MODELS['free'], 'free lift, n_z = 2', 'not tested'),
+    (MODELS['monomials'], 'polynomial', 'not tested'),
+    (MODELS['linear'], 'linear', 'not tested'),
+    (MODELS['accepted'], 'identity lift, n_z = 5', 'accepted (error 0.2 K)'),
+    (MODELS['rejected'], 'neural drift', 'rejected (too large; too few)')])
+def test_class_and_acceptance_are_named(model, kind, acceptance, path):
+    save(model, path)
+    assert (load(path).kind, load(path).provenance.acceptance) == (kind, acceptance)

@@ -3,8 +3,9 @@
 
 """Lifts of networks and of monomials: Jacobians and secants against independent derivatives."""
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from fractions import Fraction
+from itertools import product
 from math import prod
 
 import numpy as np
@@ -104,6 +105,42 @@ def test_secants_are_exact(lift):
             H @ e, J @ w - J_ref @ w, rtol=1e-12, atol=2e-14 * size(J, J_ref))
 
 
+@pytest.mark.parametrize('network', NETWORKS.values(), ids=NETWORKS)
+def test_secants_of_a_network_are_means_along_the_segment(network):
+    """At small separations only M and H themselves show whether digits cancelled."""
+    for reference, x, w in pairs(network.n_x):
+        M, H = network.secants(x, reference, w)[1:]
+        points = reference + 0.5 * (1.0 + NODES[:, None]) * (x - reference)
+        _, J, bend = network.lift_and_derivatives(points)
+        for found, along in ((M, J), (H, bend @ w)):
+            np.testing.assert_allclose(found, np.tensordot(0.5 * WEIGHTS, along, 1), rtol=0,
+                                       atol=1e-13)
+
+
+@pytest.mark.parametrize('far', [40.0, 1e4])
+def test_a_network_saturates_without_a_warning(far):
+    lift = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
+    x = np.array([far])
+    J, M, H = lift.secants(x, -x, np.ones(1))
+    np.testing.assert_allclose([lift.lift(x)[0], J[0, 0], M[0, 0], H[0, 0]],
+                               [1.0, 0.0, 1.0 / far, 0.0], rtol=1e-14, atol=1e-30)
+
+
+@every_lift
+def test_neither_a_lift_nor_its_results_share_memory(lift):
+    x, x_ref, w = states(lift.n_x, 3, seed=5)
+    before = lift.secants(x.copy(), x_ref, w)
+    for array in (*lift.lift_and_jacobian(x.copy()), *lift.secants(x.copy(), x_ref, w)):
+        array[...] = 7.0
+    for a, b in zip(before, lift.secants(x, x_ref, w), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(FrozenInstanceError):
+        lift.identity = not lift.identity
+    for array in ((lift.exponents,) if isinstance(lift, PolynomialObservables)
+                  else (lift.W, lift.b, lift.V)):
+        assert not array.flags.writeable
+
+
 @pytest.mark.parametrize(('change', 'message'), [
     ({'V': np.zeros((3, 4))}, r'incompatible V: expected \(any, 5\), got \(3, 4\)'),
     ({'V': np.zeros(5)}, r'incompatible V: expected \(any, 5\), got \(5,\)'),
@@ -153,6 +190,42 @@ def test_monomials_against_fractions(lift):
                 for k in range(n_x):
                     assert bend[i, j, k] == pytest.approx(
                         float(partial(x, row, j, k)), rel=1e-14, abs=0)
+
+
+@every_dictionary
+def test_secants_of_monomials_against_fractions(lift):
+    """In rational numbers the differences are exact, at the smallest separations as well."""
+    n_x = lift.n_x
+    rng = np.random.default_rng(4)
+    for separation, reference in product(SEPARATIONS, corners(n_x)):
+        x = reference + separation * rng.normal(size=n_x)
+        w = rng.normal(size=n_x)
+        M, H = lift.secants(x, reference, w)[1:]
+        e = [Fraction(a) - Fraction(b) for a, b in zip(x, reference, strict=True)]
+        scale = float(max(map(abs, e)))
+        for i, row in enumerate(lift.exponents):
+            found = sum(Fraction(M[i, j]) * e[j] for j in range(n_x))
+            exact = monomial(x, row) - monomial(reference, row)
+            assert abs(found - exact) <= 1e-14 * scale * size(M)
+            found = sum(Fraction(H[i, j]) * e[j] for j in range(n_x))
+            exact = sum((partial(x, row, k) - partial(reference, row, k)) * Fraction(w[k])
+                        for k in range(n_x))
+            assert abs(found - exact) <= 1e-14 * scale * size(H)
+
+
+@pytest.mark.parametrize(('n_x', 'degree', 'exponents'), [
+    (1, 4, [[1], [2], [3], [4]]),
+    (2, 3, [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [3, 0], [2, 1], [1, 2], [0, 3]]),
+    (3, 2, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0],
+            [0, 1, 1], [0, 0, 2]]),
+])
+def test_monomials_of_a_total_degree(n_x, degree, exponents):
+    dictionary = PolynomialObservables.total_degree(n_x, degree)
+    np.testing.assert_array_equal(dictionary.exponents, exponents)
+    assert (dictionary.n_x, dictionary.n_z, dictionary.degree) == (n_x, len(exponents), degree)
+    for nothing in ((0, degree), (n_x, 0), (-1, degree)):
+        with pytest.raises(ValueError, match='must be at least 1'):
+            PolynomialObservables.total_degree(*nothing)
 
 
 @pytest.mark.parametrize(('exponents', 'error', 'message'), [

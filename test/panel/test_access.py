@@ -50,6 +50,12 @@ def test_a_hash_is_argon2id_at_its_recommended_cost(monkeypatch: pytest.MonkeyPa
     assert secret != hashed(PASSWORD)
 
 
+@pytest.mark.parametrize('password', ['', '1234567', 'x' * 1025])
+def test_the_length_of_a_password_is_bounded(password: str) -> None:
+    with pytest.raises(ValueError, match='8 to 1024 characters'):
+        hashed(password)
+
+
 @pytest.mark.parametrize(('name', 'password', 'role'), [
     ('ada', PASSWORD, Role.OPERATOR), ('bob', PASSWORD, Role.VIEWER),
     # the same characters in another form
@@ -104,6 +110,18 @@ def test_a_file_that_cannot_be_trusted_is_rejected(
         Users.read(_write(file, content, mode))
 
 
+@pytest.mark.parametrize('kind', ['pipe', 'folder', 'device'])
+def test_another_kind_of_file_is_rejected_at_once(file: Path, kind: str) -> None:
+    if kind == 'pipe':
+        os.mkfifo(file)
+    elif kind == 'folder':
+        file.mkdir()
+    else:
+        file.symlink_to('/dev/zero')
+    with pytest.raises(ValueError, match='not a regular file'):
+        Users.read(file)
+
+
 @pytest.fixture
 def typed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the answers to the questions for a password."""
@@ -127,6 +145,17 @@ def test_the_command_writes_users(file: Path, typed: list[str]) -> None:
     assert os.listdir(file.parent) == ['users']
 
 
+def test_other_lines_and_links_stay(file: Path) -> None:
+    _write(file, f'# who may\n\nada:operator:{SECRET}\n# and\nbob:viewer:{SECRET}\n', 0o644)
+    link = file.with_name('link')
+    link.symlink_to(file)
+    write_user(link, 'ada', Role.VIEWER, OTHER)
+    assert link.is_symlink()
+    assert file.read_text() == (
+        f'# who may\n\n# and\nbob:viewer:{SECRET}\nada:viewer:{OTHER}\n')
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+
+
 @pytest.mark.parametrize(('name', 'answers', 'text', 'mode', 'words'), [
     ('ada', [PASSWORD, 'correct hors'], None, 0, 'the two passwords differ'),
     ('ada', ['short', 'short'], None, 0, '8 to 1024 characters'),
@@ -143,6 +172,24 @@ def test_the_command_rejects_and_writes_nothing(
     assert words in capsys.readouterr().err
     assert (file.read_text() if file.exists() else None) == text
     assert not typed
+
+
+@pytest.mark.parametrize('error', [KeyboardInterrupt, EOFError])
+def test_the_command_may_be_cancelled(file: Path, error: type[BaseException],
+                                      monkeypatch: pytest.MonkeyPatch) -> None:
+    def cancel(prompt: str) -> str:
+        raise error
+
+    monkeypatch.setattr(getpass, 'getpass', cancel)
+    assert main([str(file), 'ada', 'viewer']) == 1
+    assert not file.exists()
+
+
+@pytest.mark.parametrize('secret', ['plain', SECRET + '\nmallory:operator:' + SECRET + 'x'])
+def test_only_a_hash_is_written(file: Path, secret: str) -> None:
+    with pytest.raises(ValueError, match=r'must (not contain spaces|be a hash)'):
+        write_user(file, 'ada', Role.VIEWER, secret)
+    assert not file.exists()
 
 
 def test_a_write_that_fails_leaves_the_old_file(

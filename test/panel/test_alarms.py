@@ -5,12 +5,14 @@
 
 from itertools import pairwise
 import math
+import threading
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
 from koopman_ros.panel.alarms import Alarms, AlarmState, MAX_TEXT, MAX_WHO, Priority
+from koopman_ros.panel.files import sanitize_text
 
 LOW, MEDIUM, HIGH = Priority
 RANKS = {'-': None, 'l': LOW, 'm': MEDIUM, 'h': HIGH}
@@ -88,6 +90,33 @@ def test_states_follow_the_standard(steps: str, state: AlarmState | None,
             (state, priority, 'Ada' if state is AlarmState.ACKNOWLEDGED else '')])
 
 
+@pytest.mark.parametrize('key', ['y', '', 'X', 'x '])
+@pytest.mark.parametrize('what', ['acknowledge', 'shelve', 'unshelve'])
+def test_an_unknown_alarm_cannot_be_changed(key: str, what: str) -> None:
+    alarms = _raised()
+    arguments = (60.0, 'Ada', NOW + 2.0) if what == 'shelve' else ('Ada', NOW + 2.0)
+    assert not getattr(alarms, what)(key, *arguments)
+    assert _states(alarms) == {'x': AlarmState.UNACKNOWLEDGED}
+    assert _events(alarms) == ['raised']
+
+
+def test_the_first_acknowledgement_counts() -> None:
+    alarms = _raised()
+    assert alarms.acknowledge('x', 'Ada', NOW + 2.0)
+    assert not alarms.acknowledge('x', 'Bob', NOW + 3.0)
+    assert [(entry.what, entry.who) for entry in alarms.journal(0.0)] == [
+        ('acknowledged', 'Ada'), ('raised', '')]
+
+
+def test_a_text_changes_at_once_and_stays_after_the_return() -> None:
+    alarms = _raised()
+    alarms.report('x', True, MEDIUM, '71 degC', NOW + 2.0)
+    assert alarms.standing[0].text == '71 degC'
+    alarms.report('x', False, MEDIUM, '', NOW + 3.0)
+    alarms.advance(NOW + 10.0)
+    assert alarms.standing[0].text == '71 degC'
+
+
 def test_alarms_are_sorted_by_priority_then_age() -> None:
     alarms = Alarms(delay_on=0.0)
     for offset, (key, priority) in enumerate(
@@ -126,6 +155,16 @@ def test_a_shelved_alarm_may_come_and_go_and_be_unshelved() -> None:
     assert alarms.journal(0.0)[0].who == 'Bob'
 
 
+def test_the_journal_is_bounded_in_entries_and_time_with_the_newest_first() -> None:
+    alarms = Alarms(delay_on=0.0, delay_off=0.0, kept=10, day=100.0)
+    for step in range(20):
+        alarms.report('x', step % 2 == 0, LOW, str(step), NOW + step)
+    assert [entry.time - NOW for entry in alarms.journal(0.0)] == list(range(19, 9, -1))
+    assert [entry.time - NOW for entry in alarms.journal(NOW + 18.0)] == [19, 18]
+    alarms.advance(NOW + 115.0)
+    assert [entry.time - NOW for entry in alarms.journal(0.0)] == [19, 18, 17, 16, 15]
+
+
 def test_a_clock_that_is_set_back_leaves_the_remaining_times() -> None:
     alarms = _raised()
     alarms.shelve('x', 600.0, 'Ada', NOW + 2.0)
@@ -147,6 +186,15 @@ def test_hostile_texts_are_bounded_and_printable(hostile: str) -> None:
             (entry.who, MAX_WHO) for entry in alarms.journal(0.0))):
         assert text.isprintable()
         assert len(text) <= most
+
+
+@given(st.lists(st.sampled_from('aä.…\n \t\0\ud800\u202e\u3000\U0001f600'), max_size=120)
+       .map(''.join), st.integers(1, 20))
+def test_sanitized_text_is_stable(text: str, longest: int) -> None:
+    shown = sanitize_text(text, longest)
+    assert len(shown) <= longest
+    assert shown.isprintable()
+    assert sanitize_text(shown, longest) == shown.strip()
 
 
 @settings(max_examples=60, deadline=None)
@@ -174,3 +222,24 @@ def test_changes_of_an_alarm_are_apart(
     assert all(not record.idle for record in alarms._records.values())
     assert alarms._running == {record.key for record in alarms._records.values()
                                if record.pending or record.shelved_until is not None}
+
+
+def test_threads_do_not_disturb_each_other() -> None:
+    alarms, failed = Alarms(delay_on=0.0, delay_off=0.0, kept=100_000), []
+
+    def report(key: str) -> None:
+        try:
+            for step in range(300):
+                alarms.report(key, step % 2 == 0, HIGH, '', NOW)
+                for alarm in alarms.standing:
+                    alarms.acknowledge(alarm.key, 'Ada', NOW)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=report, args=(key,)) for key in 'abc']
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed
+    assert sum(entry.what == 'raised' for entry in alarms.journal(0.0)) == 3 * 150

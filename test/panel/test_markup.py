@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from koopman_ros.panel.alarm_page import alarm_page
-from koopman_ros.panel.layout import PageLayout, Visitor
+from koopman_ros.panel.layout import attribute, PageLayout, Visitor
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.overview import overview
 from koopman_ros.panel.requests import Answer
@@ -99,6 +99,18 @@ def test_the_tasks_of_a_closed_page_end(client: Client, monkeypatch: pytest.Monk
 
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(closed())
+
+
+@pytest.mark.parametrize('name', [':aria-label', 'onclick', 'style', 'class', 'innerHTML', 'a b'])
+def test_other_attributes_are_not_set(client: Client, name: str) -> None:
+    with pytest.raises(ValueError, match='cannot be set'):
+        attribute(ui.element('div'), name, 'text')
+
+
+@pytest.mark.parametrize('address', ['javascript:1', '//elsewhere', 'https://elsewhere', 'data:,'])
+def test_addresses_are_those_of_the_panel(client: Client, address: str) -> None:
+    with pytest.raises(ValueError, match='cannot be set'):
+        attribute(ui.element('a'), 'href', address)
 
 
 def test_exported_parameters_are_yaml_of_the_same_names_whatever_these_are() -> None:

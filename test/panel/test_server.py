@@ -8,23 +8,29 @@ import contextlib
 from email.message import Message
 import http.client
 import json
+import logging
 import math
 import os
 from pathlib import Path
 import re
+import resource
 import socket
 import time
 from typing import NamedTuple
 from urllib.parse import urlencode
 
 from nicegui import Client
+import numpy as np
 from playwright.sync_api import expect, Page
 import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from koopman_ros.panel import trend_chart
+from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
+from koopman_ros.panel.trend_chart import axis_ends, ink, legend_rows, zoomed
+from koopman_ros.panel.trend_page import time_of_day
 from support.browser import opened_browser, Pages
 from support.hostile import HostileSource, NOW, TEXTS
 from support.users import PASSWORDS, write_users
@@ -120,6 +126,18 @@ def test_headers_of_a_proxy_are_believed_from_its_address_alone(site: Site) -> N
     assert 'trusted_proxy' in answer.content
     assert site.log_in('anna', source=PROXY, **{
         **forwarded('10.1.0.2'), 'Origin': 'https://elsewhere'}).status == 403
+
+
+def test_wrong_log_ins_through_a_proxy_delay_their_own_address_alone(site: Site) -> None:
+    def wrong(client: str) -> list[int]:
+        return [site.log_in('olga', 'wrong', source=PROXY, **forwarded(client)).status
+                for _ in range(6)]
+
+    assert wrong('10.2.0.1') == [401] * 5 + [429]
+    # a browser may send the header as well: what the proxy adds to it counts
+    assert wrong('1.2.3.4, 10.2.0.1') == [429] * 6
+    assert site.log_in('olga', source=PROXY, **forwarded('10.2.0.2')).status == 303
+    assert site.log_in('olga').status == 303
 
 
 # Several panels.
@@ -277,6 +295,54 @@ def test_unfinished_requests_do_not_block_others(site: Site, said: bytes) -> Non
         until(lambda: len(os.listdir('/proc/self/fd')) - before <= 400 + 256)
 
 
+def test_the_oldest_unused_connection_is_closed_and_a_used_one_never() -> None:
+    with Listener(socket.AF_INET, socket.SOCK_STREAM, most=2) as own, \
+            contextlib.ExitStack() as stack:
+        own.bind(('127.0.0.1', 0))
+        own.listen(8)
+
+        def connected() -> socket.socket:
+            client = stack.enter_context(socket.create_connection(own.getsockname(), TIMEOUT))
+            accepted, address = own.accept()
+            stack.enter_context(accepted)
+            served.append(address)
+            return client
+
+        served: list[tuple[str, int]] = []
+        used = connected()
+        with own.serving(served[0]):
+            first = connected()
+            connected()
+            assert first.recv(1) == b''
+            used.settimeout(0.0)
+            with pytest.raises(BlockingIOError):
+                used.recv(1)
+            # all are used
+            with own.serving(served[2]), socket.create_connection(
+                    own.getsockname(), TIMEOUT) as late:
+                with pytest.raises(ConnectionAbortedError):
+                    own.accept()
+                assert late.recv(1) == b''
+
+
+def test_a_process_that_may_open_few_files_has_fewer_connections(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, 'getrlimit', lambda _: (256, 256))
+    with Listener(socket.AF_INET, socket.SOCK_STREAM) as own:
+        assert own.most == 64
+
+
+def test_a_log_has_so_many_lines_in_a_period(caplog: pytest.LogCaptureFixture) -> None:
+    log = logging.getLogger('test.seldom')
+    log.addFilter(RateLimiter())
+    for number in range(100):
+        log.error('line %d', number)
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages[:19] == [f'line {number}' for number in range(19)]
+    assert len(messages) == 20
+    assert 'further lines are dropped' in messages[-1]
+
+
 # In a browser.
 
 
@@ -345,3 +411,52 @@ def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
         page.evaluate(ZOOM)
         until(lambda: len(drawn(0.2)) > 30)
         browser.forgive()
+
+
+@pytest.mark.parametrize(('event', 'window'), [
+    ({'start': 25.0, 'end': 50}, (0.25, 0.5)), ({'batch': [{'start': 0, 'end': 100}]}, (0.0, 1.0)),
+    ({'start': 50.0, 'end': 25.0}, None), ({'start': -1, 'end': 5}, None), ({}, None),
+    ({'start': 'nan', 'end': 5}, None), ({'batch': 1}, None), (None, None), ([], None)])
+def test_the_zoom_of_a_browser_is_checked(
+        event: object, window: tuple[float, float] | None) -> None:
+    assert zoomed(event) == window
+
+
+@pytest.mark.parametrize(('values', 'ends'), [
+    ([], None), ([math.nan], None), ([0.0, 3.0], None),
+    # noise of a tenth of a degree does not fill the chart of a range of twenty
+    ([46.03, 46.1, math.nan], (45.0, 47.2))])
+def test_an_axis_shows_a_share_of_the_range_of_its_signals(
+        values: list[float], ends: tuple[float, float] | None) -> None:
+    shown = axis_ends([(30.0, 40.0), (35.0, 50.0)], [np.array(values), np.array([])])
+    if ends is None:
+        assert shown == {'min': None, 'max': None}
+        return
+    low, high = shown['min'], shown['max']
+    assert low is not None
+    assert high is not None
+    assert ends[0] <= low <= 46.03 < 46.1 <= high <= ends[1]
+    assert high - low >= 2.0
+    assert axis_ends([(30.0, 40.0), (35.0, 50.0)], ()) == {'min': 30.0, 'max': 50.0}
+
+
+@pytest.mark.parametrize(('lengths', 'rows'), [((), 1), ((11, 21), 1), ((11, 21, 21), 2),
+                                               ((27, 19), 2), ((40,) * 5, 5), ((60,), 2)])
+def test_names_of_pens_have_rows_in_a_narrow_chart(lengths: tuple[int, ...], rows: int) -> None:
+    assert legend_rows(['x' * length for length in lengths], 330) == rows
+
+
+def test_pens_of_a_chart_have_colours_of_their_own() -> None:
+    assert len({ink(number) for number in range(40)}) == 40
+
+
+@pytest.mark.parametrize(('text', 'latest', 'found'), [
+    ('0:03:20', 500.0, 200.0), ('1:00', 500.0, 3600.0), ('30:00:01', 500.0, 108_001.0),
+    ('', 500.0, None), ('now', 500.0, None), ('1', 500.0, None)])
+def test_times_are_those_of_the_plant(text: str, latest: float, found: float | None) -> None:
+    assert time_of_day(text, latest) == found
+
+
+def test_a_wall_time_is_the_last_before_now() -> None:
+    for seconds in (NOW - 60.0, NOW - 80_000.0):
+        assert time_of_day(time.strftime('%H:%M:%S', time.localtime(seconds)), NOW) == seconds

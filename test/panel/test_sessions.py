@@ -9,8 +9,8 @@ import time
 import pytest
 
 from koopman_ros.panel.access import Role
-from koopman_ros.panel.origins import rejection
-from koopman_ros.panel.sessions import Sessions, Throttle
+from koopman_ros.panel.origins import is_loopback, rejection
+from koopman_ros.panel.sessions import MAX_SESSIONS_OF_A_USER, Sessions, Throttle
 
 
 class Clock:
@@ -75,6 +75,28 @@ def test_a_right_password_frees_the_name_and_not_the_address(
     assert attempts(throttle, 10) == 5
 
 
+def test_an_account_of_ones_own_does_not_free_guesses(throttle: Throttle, clock: Clock) -> None:
+    passed = 0
+    for second in range(3600):
+        clock.now += 1.0
+        if throttle.attempt('10.0.0.1', 'mallory') == 0.0:
+            throttle.succeeded('10.0.0.1', 'mallory')
+        passed += throttle.attempt('10.0.0.1', f'victim {second}') == 0.0
+    assert passed <= 200
+
+
+@pytest.mark.parametrize(('addresses', 'together'), [
+    (['2001:db8::1', '2001:db8::2', '2001:db8:0:0:ffff::3'], True),
+    (['2001:db8::1', '2001:db8:0:1::1'], False), (['10.0.0.1', '::ffff:10.0.0.1'], True),
+    (['fe80::1%eth0', 'fe80::2%eth0'], True), (['nonsense', 'nonsense2'], False),
+    (['x' * 100_000, 'x' * 100_001], True)])
+def test_addresses_of_one_network_count_together(
+        throttle: Throttle, addresses: list[str], together: bool) -> None:
+    assert attempts(throttle, 5, addresses[0], 'b' * 100_000) == 5
+    for address in addresses[1:]:
+        assert (throttle.attempt(address, 'b' * 100_000) > 0.0) is together
+
+
 def test_none_passes_while_others_are_verified(throttle: Throttle) -> None:
     passed, start = [], threading.Barrier(20)
 
@@ -119,6 +141,14 @@ def test_a_session_ends_without_use_and_after_half_a_day(
     assert open_until <= clock.now - begin < open_until + steps
 
 
+def test_the_sessions_of_a_user_are_bounded(sessions: Sessions) -> None:
+    other = sessions.open('bob', Role.VIEWER)
+    own = [sessions.open('ada', Role.OPERATOR) for _ in range(MAX_SESSIONS_OF_A_USER + 10)]
+    assert [bool(sessions.find(key)) for key in own] == [False] * 10 + [
+        True] * MAX_SESSIONS_OF_A_USER
+    assert sessions.find(other)
+
+
 @pytest.mark.parametrize(('kind', 'host', 'origin', 'scheme', 'users', 'word'), [
     ('http', '127.0.0.1:8080', None, 'http', False, ''),
     ('http', '127.0.0.1:8080', 'http://127.0.0.1:8080', 'http', False, ''),
@@ -143,3 +173,12 @@ def test_requests_of_other_hosts_and_origins_are_rejected(
     found = rejection(kind, host, origin, scheme, users=users)
     assert word in found
     assert bool(word) is bool(found)
+
+
+@pytest.mark.parametrize(('host', 'loopback'), [
+    ('127.0.0.1', True), ('127.8.9.1', True), ('LocalHost', True), ('::1', True),
+    ('::ffff:127.0.0.1', True), ('0.0.0.0', False), ('::', False), ('', False),
+    ('10.0.0.1', False), ('::ffff:10.0.0.1', False), ('127.1', False),
+    ('localhost.evil.example', False), ('127.0.0.1 ', False), ('0x7f000001', False)])
+def test_loopback(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback

@@ -13,7 +13,7 @@ import pytest
 
 from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
-from koopman_ros.panel.faceplates import pen
+from koopman_ros.panel.faceplates import pen, span_text
 from koopman_ros.panel.model_page import experiment_obstacle, experiment_running
 from koopman_ros.panel.requests import (
     Action,
@@ -43,6 +43,8 @@ from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.signal_topics import Signals
 
 REACTOR = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
+TANKS = Signals({'level_1': 'm', 'level_2': 'm'}, {'pump_1': 'V', 'pump_2': 'V'},
+                ('level_1', 'level_2'))
 NOW = 1_790_000_000.0  # s of Unix time
 
 
@@ -116,6 +118,27 @@ def test_values_are_in_the_units_that_people_read() -> None:
     assert own.snapshot(NOW + 1.2).estimates == (('latent 1', '0.25 ± 0.012 1'),)
 
 
+def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
+    own = view(temperature='degF')
+    own.take_model({'temperature': (to_kelvin(40.0), to_kelvin(60.0))}, {})
+    measure(own, 50.0, 1.0)
+    own.take_record('setpoint', {'accepted': True, 'signals': ['temperature'],
+                                 'value': [to_kelvin(45.0)], 'reason': []}, NOW)
+    face = own.snapshot(NOW).states[0]
+    assert face.unit == '°F'
+    assert [face.measured, face.target, *face.training] == pytest.approx(
+        [122.0, 113.0, 104.0, 140.0])
+    assert face.abnormal == ''
+    bare = view(temperature='degF')
+    bare.take_parameters('controller', {
+        name: parameter(name, value, unit='degC') for name, value in (
+            ('temperature.sensor_min', 0.0), ('temperature.sensor_max', 100.0))})
+    low, high = bare.snapshot(NOW).states[0].span
+    assert (low, high) == pytest.approx((32.0 - 18.0, 212.0 + 18.0))
+    # of the others nothing changes
+    assert bare.snapshot(NOW).inputs[0].unit == '°C'
+
+
 def test_a_plan_is_shown_until_it_is_empty() -> None:
     own = view(temperature='degF')
     own.take_plan(['temperature [degC]', 'coolant_temperature [degC]'], 100.0, [0.0, 1.0, 3.0],
@@ -138,6 +161,103 @@ def test_a_plan_is_shown_until_it_is_empty() -> None:
     assert own.snapshot(NOW).states[0].plan == own.snapshot(NOW).inputs[0].plan == ()
 
 
+@pytest.mark.parametrize(('names', 'rows'), [
+    (['temperature [degC]'], [[1.0], [1.0, 2.0]]), (['temperature [m]'], [[1.0], [2.0]]),
+    (['temperature [degC]', 'coolant_temperature [degC]'], [[1.0], [2.0]]),
+    (['temperature'], [[1.0], [2.0]]), (['level [m]'], [[1.0], [2.0]])])
+def test_a_malformed_plan_is_ignored(
+        names: list[str], rows: list[list[float]]) -> None:
+    own = view()
+    own.take_plan(names, 100.0, [0.0, 1.0], rows)
+    assert own.snapshot(NOW).states[0].plan == own.snapshot(NOW).inputs[0].plan == ()
+
+
+def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
+    own = view(coolant_temperature='degC')
+    own.take_parameters('controller', {name: parameter(
+        name, value, unit='degC', lower=-273.15, upper=1e9) for name, value in (
+        ('mpc.temperature.min', -273.15), ('mpc.temperature.max', 60.0),
+        ('coolant_temperature.min', 5.0), ('coolant_temperature.max', 40.0))})
+    measure(own, 50.0, 1.0)
+    now = own.snapshot(NOW)
+    assert now.states[0].limits == (-math.inf, 60.0)
+    assert now.inputs[0].limits == (5.0, 40.0)
+    # and the bar is long enough for it
+    assert now.states[0].span[1] >= 60.0
+
+
+def test_the_model_before_is_offered_and_the_predecessor_of_a_file_that_was_replaced() -> None:
+    own = view()
+
+    def model(event: str, name: str, digest: str) -> str:
+        own.take_record(event, {
+            'model': {'name': name, 'digest': digest}, 'parameters': {'model': name},
+            'state': {'mode': {'name': 'AUTOMATIC'}}}, NOW)
+        return own.snapshot(NOW).previous_model
+
+    assert model('snapshot', 'runs/new.safetensors', 'a') == ''
+    # the same file once more
+    assert model('model', 'runs/new.safetensors', 'a') == ''
+    assert model('model', 'runs/new.safetensors', 'b') == 'runs/new.previous.safetensors'
+    # as a parameter of the same name, which the controller reads again
+    assert model('parameters', 'runs/new.safetensors', 'c') == 'runs/new.previous.safetensors'
+    assert model('parameters', 'reactor', 'd') == 'runs/new.safetensors'
+    assert model('parameters', 'runs/new.safetensors', 'c') == 'reactor'
+
+
+def test_bars_hold_ranges_and_values() -> None:
+    own = view()
+    own.take_model({'temperature': (to_kelvin(32.0), to_kelvin(54.0)),
+                    'coolant_temperature': (to_kelvin(8.0), to_kelvin(28.0))}, {})
+    own.take_parameters(CONTROLLER, {name: parameter(name, value) for name, value in {
+        'coolant_temperature.min': 5.0, 'coolant_temperature.max': 32.0}.items()})
+    measure(own, 43.0, 1.0)
+    own.take_signals('commands', {'coolant_temperature': to_kelvin(32.0)}, 1.0, NOW + 1.0)
+    now = own.snapshot(NOW + 1.0)
+    (state,), (given,) = now.states, now.inputs
+    assert state.training == pytest.approx((32.0, 54.0))
+    assert state.span == pytest.approx((29.8, 56.2))
+    assert state.share(43.0) == pytest.approx(0.5)
+    assert [state.share(value) for value in (0.0, 99.0, math.nan)] == [0.0, 1.0, 0.0]
+    assert (state.decimals, state.text(43.0)) == (1, '43.0')
+    assert given.limits == (5.0, 32.0)
+    assert given.abnormal == 'at its upper limit'
+    # a value that left the range is on the bar, and said to be out
+    measure(own, 80.0, 2.0)
+    (state,) = own.snapshot(NOW + 2.0).states
+    assert state.span[1] == pytest.approx(80.0)
+    assert state.abnormal == 'above the trained range'
+
+
+@pytest.mark.parametrize(('bounds', 'text'), [
+    ((31.85, 53.85), '31.9 to 53.8'), ((5.0 + 1e-9, 32.0 - 1e-9), '5.0 to 32.0'),
+    ((-1.23, math.inf), '-1.2 to –')])
+def test_limits_are_written_within_the_limits(bounds: tuple[float, float], text: str) -> None:
+    assert span_text(bounds, 1) == text
+
+
+def test_the_scale_of_an_input_without_negative_values_begins_at_zero() -> None:
+    own = view(TANKS)
+    own.take_parameters(CONTROLLER, {f'pump_1.{end}': parameter(f'pump_1.{end}', value)
+                                     for end, value in (('min', 0.0), ('max', 12.0))})
+    assert own.snapshot(NOW).inputs[0].span == pytest.approx((0.0, 13.2))
+
+
+def test_the_target_of_a_ramp_is_shown() -> None:
+    own = view(TANKS)
+    for name, value in (('level_1', 0.10), ('level_2', 0.15)):
+        own.take_signals('active_setpoints', {name: value}, 1.0, NOW)
+    own.take_record('setpoint', {'value': [0.2], 'signals': ['level_2'], 'accepted': True,
+                                 'reason': []}, NOW)
+    own.take_record('setpoint', {'value': [9.9], 'signals': ['level_1'], 'accepted': False,
+                                 'reason': ['setpoint_outside']}, NOW)
+    first, second = own.snapshot(NOW).states
+    assert (first.setpoint, first.target, second.setpoint, second.target) == (0.1, 0.1, 0.15, 0.2)
+    # a controller that starts again has no target
+    own.take_record('start', {'state': {'mode': {'name': 'AUTOMATIC'}}, 'model': {}}, NOW)
+    assert own.snapshot(NOW).states[1].target == 0.15
+
+
 def test_a_manual_command_is_shown_within_the_limits_until_the_mode_changes() -> None:
     own = view()
     own.take_parameters(CONTROLLER, {f'coolant_temperature.{end}': parameter(
@@ -147,6 +267,19 @@ def test_a_manual_command_is_shown_within_the_limits_until_the_mode_changes() ->
     assert own.snapshot(NOW).inputs[0].manual == 32.0
     own.take_record('mode', {'mode': 'automatic'}, NOW)
     assert own.snapshot(NOW).inputs[0].manual == pytest.approx(20.0)
+
+
+def test_a_snapshot_does_not_change() -> None:
+    own = view()
+    measure(own, 50.0, 1.0)
+    before = own.snapshot(NOW)
+    held = repr(before)
+    measure(own, 60.0, 2.0)
+    status(own, CONTROL, ERROR, 'broken', {'a': 'b'}, NOW)
+    own.take_parameters(CONTROLLER, {'a': parameter('a', 1.0)})
+    assert repr(before) == held
+    with pytest.raises(TypeError):
+        before.statuses['x'] = before.status('x')  # type: ignore[index]
 
 
 # Levels, silences, alarms and marks.
@@ -193,6 +326,17 @@ def test_a_silence_has_its_node_and_time() -> None:
     assert own.snapshot(NOW + 20.0).silences == ()
     (silence,) = (one for one in own.snapshot(NOW + 30.0).silences if one.role == PLANT)
     assert (silence.since, silence.ever) == (NOW + 19.0, True)
+
+
+def test_a_slow_plant_is_not_silent_between_its_measurements() -> None:
+    own = view()
+    for minute in range(1, 5):
+        measure(own, 50.0, 60.0 * minute)
+    assert PLANT not in [one.role for one in own.snapshot(NOW + 240.0 + 59.0).silences]
+    assert PLANT in [one.role for one in own.snapshot(NOW + 240.0 + 400.0).silences]
+    # nor one of which the controller knows that it has not changed
+    answered(own, wall=NOW + 600.0)
+    assert PLANT not in [one.role for one in own.snapshot(NOW + 240.0 + 400.0).silences]
 
 
 def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
@@ -246,6 +390,18 @@ def test_nodes_of_another_loop_are_ignored() -> None:
     now = own.snapshot(NOW + 10.0)
     assert (now.mode, now.status(CONTROL).message) == ('automatic', 'automatic')
     assert now.inputs[0].abnormal == ''
+
+
+def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
+    own = view()
+    for i in range(200):
+        status(own, f'driver_{i}: io', OK, 'ok', {}, NOW)
+    status(own, CONTROL, ERROR, 'held', {}, NOW)
+    status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
+    own.advance(NOW + 2.0)
+    now = own.snapshot(NOW + 2.0)
+    assert {alarm.key for alarm in now.standing} == {f'{CONTROL}: held', 'controller: actuators'}
+    assert len(now.statuses) < 100
 
 
 def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
@@ -304,6 +460,23 @@ def test_a_condition_has_one_alarm(
                 f'{alarm.key}: {alarm.text}' + (
                     ' (returned)' if alarm.state is AlarmState.RETURNED else '')
                 for alarm in own.snapshot(NOW).standing) == expected[moment]
+
+
+def test_many_short_errors_are_an_alarm() -> None:
+    def alarmed(seconds: float, errors: int) -> bool:
+        own = view()
+        for k in range(2 * errors):
+            now = NOW + seconds * k / 2
+            measure(own, 50.0, seconds * k / 2 + 1.0, now)
+            status(own, CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
+            own.advance(now)
+        own.advance(now + 1.5)
+        return any('repeated' in alarm.key and alarm.text.endswith('the last: held')
+                   for alarm in own.snapshot(now).standing)
+
+    assert alarmed(0.5, 20)
+    assert not alarmed(0.5, 3)
+    assert not alarmed(30.0, 20)
 
 
 def test_a_manual_command_is_limited_as_the_controller_does() -> None:
@@ -383,6 +556,15 @@ def test_pens_and_marks_are_in_the_time_of_the_plant() -> None:
     assert found['temperature set-point'][1].tolist() == pytest.approx([45.0] * 3)
     assert [(mark.time, mark.text) for mark in own.trends.marks(0.0, 10.0)] == [
         (3.0, 'manual mode')]
+
+
+def test_time_that_begins_again_begins_the_trends_again() -> None:
+    own = view()
+    for second in (100.0, 101.0, 1.0):
+        measure(own, 50.0, second, NOW)
+    times, _ = own.trends.window(['temperature'], 0.0, 200.0)['temperature']
+    assert times.tolist() == [1.0]
+    assert own.snapshot(NOW).time == 1.0
 
 
 # Parameters and requests.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 import re
+import sys
 
 import numpy as np
 import pytest

@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import eigvals
 
 from koopman_ros.plants import (
+    equilibrium_input,
     EquilibriumError,
     plant_class,
     simulate,
@@ -37,6 +38,16 @@ def test_quadruple_tank_has_the_published_operating_point():
     np.testing.assert_allclose(np.sort_complex(finite), [-0.060, -0.018], rtol=0, atol=6e-4)
 
 
+def test_quadruple_tank_of_the_other_setting_is_of_nonminimum_phase():
+    # P+: levels and zeros of the same table
+    system = plant('quadruple_tank', pump_gain_1=3.14e-6, pump_gain_2=3.29e-6, split_1=0.43,
+                   split_2=0.34)
+    slope = system.drift_jacobian(system.nominal_state)
+    pencil = np.block([[slope, system.B], [np.eye(2, 4), np.zeros((2, 2))]])
+    zeros = eigvals(pencil, np.diag([1.0] * 4 + [0.0] * 2))
+    assert sum(0.0 < zero.real < 1.0 for zero in zeros) == 1
+
+
 @pytest.mark.parametrize('name', ['two_tanks', 'quadruple_tank'])
 def test_tanks_run_empty_and_conserve_volume(name):
     system = plant(name)
@@ -53,6 +64,14 @@ def test_a_tank_drains_in_the_time_of_torricelli():
     end = simulate(system, [start, 0.1], [[0.0, 0.0]], seconds).x[-1, 0]
     fallen = 0.1781 / 15.52 * np.sqrt(9.81 / 2.0) * seconds
     assert end == pytest.approx((np.sqrt(start) - fallen) ** 2, rel=1e-8)
+
+
+def test_two_tanks_are_held_by_the_pumps_that_make_up_for_their_outflow():
+    system = plant('two_tanks')
+    # 3.3 cm^3/s a volt; cm^2 sqrt(2 * 981 cm/s^2 * cm)
+    flow = 0.1781 * np.sqrt(2.0 * 981.0 * np.array([10.0, 15.0]))
+    np.testing.assert_allclose(equilibrium_input(system, [0.10, 0.15]),
+                               [flow[0] / 3.3, (flow[1] - flow[0]) / 3.3], rtol=1e-12)
 
 
 def test_the_heated_line_conserves_energy_and_matter_at_rest():
@@ -76,6 +95,12 @@ def test_a_pendulum_without_friction_keeps_its_energy_and_with_friction_stops():
     assert np.max(run.x[:, 0]) > 5.0
     hanging = simulate(plant('pendulum'), [1.0, 0.0], np.zeros((800, 1)), 0.05).x[-1]
     np.testing.assert_allclose(hanging, [np.pi, 0.0], atol=1e-2)
+
+
+def test_a_pendulum_at_thirty_degrees_is_held_by_half_the_torque_of_its_weight():
+    # m g l sin 30 degrees
+    np.testing.assert_allclose(
+        equilibrium_input(plant('pendulum'), [np.pi / 6.0, 0.0]), [-0.25 * 9.81], rtol=1e-12)
 
 
 def test_a_steady_state_is_found_by_some_of_its_states_or_rejected():

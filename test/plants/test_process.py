@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from koopman_ros.core.units import in_steps
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.plants import (
     Actuator,
@@ -86,6 +87,22 @@ def test_a_lag_is_that_of_the_analytic_solution(lag: float) -> None:
     assert (plant.x[0], plant.u[0]) == pytest.approx(expected, abs=1e-9)
 
 
+def test_a_lag_is_in_the_seconds_of_a_plant_in_minutes() -> None:
+    system = one_state_reactor()
+    late, at_once = (given(actuated(Actuator(lag=lag), system), 310.0).until(60 * SECOND)
+                     for lag in (30.0, 0.0))
+    assert late.u[0] == pytest.approx(310.0 - 10.0 * np.exp(-2.0), abs=1e-7)
+    assert system.nominal_state[0] < late.x[0] < at_once.x[0] - 1.0
+
+
+def test_a_lag_that_is_over_or_taken_away_leaves_the_command_itself() -> None:
+    plant = given(actuated(Actuator(lag=1e-3)), 2.0).until(3600 * SECOND)
+    assert plant.u[0] == 2.0
+    assert plant.x[0] == pytest.approx(-2.0 * GAIN / SLOPE, rel=1e-9)
+    plant = given(actuated(Actuator(lag=10.0)), 2.0).until(1 * SECOND)
+    assert replace(plant, actuator=Actuator()).until(2 * SECOND).u[0] == 2.0
+
+
 # The delay.
 
 @pytest.mark.parametrize('samples', [0, 1, 3])
@@ -98,6 +115,14 @@ def test_a_delay_of_samples_shifts_the_commands(samples: int) -> None:
         plant = given(plant, value).until(n * SECOND // 10)
         acted.append(plant.u[0])
     assert acted == [0.0] * samples + values[:len(values) - samples]
+
+
+@pytest.mark.parametrize(('delay', 'lag'), [(0.4, 0.0), (0.5, 0.3)])
+def test_a_delay_takes_effect_in_the_middle_of_a_hold_and_the_lag_follows(
+        delay: float, lag: float) -> None:
+    plant = given(actuated(Actuator(delay=delay, lag=lag)), 2.0).until(SECOND)
+    assert (plant.x[0], plant.u[0]) == pytest.approx(
+        analytic(0.0, 0.0, 2.0, max(lag, 1e-12), 1.0 - delay), abs=1e-9)
 
 
 @pytest.mark.parametrize(('delay', 'lag', 'dead_time'), [
@@ -172,3 +197,11 @@ def test_noise_repeats_by_seed_and_sample() -> None:
     # that of another signal is its own
     other = [sensor_noise(0.1, 7, n, 1) for n in range(1000)]
     assert abs(np.corrcoef(values[:1000], other)[0, 1]) < 0.15
+
+
+@pytest.mark.parametrize(('value', 'resolution', 'shown'), [
+    (25.34, 0.1, 25.3), (25.36, 0.1, 25.4), (-0.3, 0.25, -0.25), (7.0, 10.0, 10.0),
+    (3.0, 10.0, 0.0), (51.3, 5e-324, 51.3), (1.0 / 3.0, 0.0, 1.0 / 3.0)])
+def test_a_sensor_shows_multiples_of_its_resolution(
+        value: float, resolution: float, shown: float) -> None:
+    assert in_steps(value, resolution) == pytest.approx(shown, abs=1e-14)

@@ -4,6 +4,7 @@
 """States from which a limited input can bring a plant back, against what is known by hand."""
 
 import numpy as np
+import pytest
 
 from koopman_ros.plants import (
     box_episodes,
@@ -44,6 +45,11 @@ def test_a_mass_that_cannot_stop_within_its_box_is_lost():
     assert 0.3 < np.mean(found) < 0.9
 
 
+def test_states_outside_the_box_or_not_finite_are_lost():
+    x = np.array([[2.1], [np.nan], [0.0]])
+    np.testing.assert_array_equal(recoverable(UNSTABLE, x, **BOX), [False, False, True])
+
+
 def test_episodes_stay_where_the_input_outweighs_the_plant():
     design = RandomStepDesign(-1.0, 1.0, -1.5, 1.5, (0.1, 0.2), 0.1, max_redraws=2)
     kept, plain = (box_episodes(UNSTABLE, design, 40, 0.5, 0, keep_recoverable=keep)
@@ -52,3 +58,14 @@ def test_episodes_stay_where_the_input_outweighs_the_plant():
     # and reach nearly as far
     assert np.max(np.abs(kept.x)) > 0.9
     assert len(kept) == len(plain)
+
+
+@pytest.mark.parametrize(('system', 'change', 'message'), [
+    (UNSTABLE, {'state_upper': -1.0}, r'state_lower \[-2\.\] and state_upper \[-1\.\] must lie on '
+                                      'both sides of the nominal state'),
+    (UNSTABLE, {'input_lower': 0.0}, 'must lie on both sides of the nominal input'),
+    (UNSTABLE, {'state_lower': -np.inf}, 'state_lower'),
+    (linear([[1.0]], [[0.0]]), {}, 'no state feedback stabilises')])
+def test_ranges_and_plants_without_recoverable_states_are_errors(system, change, message):
+    with pytest.raises(ValueError, match=message):
+        recoverable(system, np.zeros((1, 1)), **{**BOX, **change})

@@ -135,6 +135,22 @@ def test_episodes_of_a_bag(
     assert noted(account, *note) if note else not account.notes
 
 
+def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> None:
+    # 120 ms later than its measurement, by the recorder's clock
+    messages = loop(20, late=0.02, answer=0.14)
+    (episode,), _ = read(write(messages, wall=True))
+    # the first measurement was taken before any command
+    assert episode.x[:, 0].tolist() == list(range(2, 21))
+    assert [t for t, _ in inputs(episode)[:3]] == pytest.approx([1.12, 2.12, 3.12])
+    # one stray receipt does not hide the wall clock
+    messages[-2] = replace(messages[-2], received=29.0)
+    (episode,), _ = read(write(sorted(messages, key=lambda s: s.received), 'stray', wall=True))
+    assert inputs(episode)[0][0] == pytest.approx(1.12)
+    # a short delay counts as none
+    (episode,), _ = read(write(loop(20, late=0.02, answer=0.025), 'short', wall=True))
+    assert [t for t, _ in inputs(episode)] == list(range(1, 20))
+
+
 def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
     (episode,), account = records.loop_episodes(
         [write(loop(20))], [STATE], [replace(INPUT, delay=2.000000001)])
@@ -160,6 +176,19 @@ def test_commands_without_a_stamp_act_when_received(write: Callable[..., Path], 
     assert (account.used, account.dropped) == (29, {'before the first input': 1})
 
 
+def test_a_repeated_finding_is_reported_once(write: Callable[..., Path]) -> None:
+    set_back = [part for k in range(500) for part in (
+        Sent(MEASURED, 10.0 + 0.01 * k, 50.0, float(k)), Sent(COMMAND, 5.0, 20.0, float(k)),
+        Sent(MEASURED, 5.0, 50.0, k + 0.5))]
+    gaps = [Sent(topic, 100.0 + 40.0 * k + (k > 6) + t, 20.0, 5000.0 + 40.0 * k + t)
+            for k in range(9) for t in range(12) for topic in (COMMAND, MEASURED)]
+    episodes, account = read(write([*set_back, *gaps]))
+    assert len(episodes) == 9
+    back, gap = account.notes
+    assert all(words in back for words in ('set back', '5.000 s', '500', '9.990 s'))
+    assert all(words in gap for words in ('gap', '95.000 s at 5.000 s', 'of 9'))
+
+
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, -1e13])
 @pytest.mark.parametrize('topic', [MEASURED, COMMAND])
 def test_values_that_are_no_measurement(write: Callable[..., Path], topic: str, value: float
@@ -174,6 +203,16 @@ def test_values_that_are_no_measurement(write: Callable[..., Path], topic: str, 
         # the plant holds the last good one, too
         assert 107.0 not in episode.u
         assert len(episode.u) == 18
+
+
+def test_each_of_several_bags_is_read_once(write: Callable[..., Path], tmp_path: Path) -> None:
+    # a bag named twice would put the same episodes into training and test
+    bags = write(loop(15), 'a.mcap'), write(loop(12, 3), 'b')
+    (tmp_path / 'link.mcap').symlink_to(bags[0])
+    (first, second), account = read(*bags, tmp_path / 'link.mcap')
+    assert (len(first), len(second)) == (15, 12)
+    assert account.lines()[0] == '27 of 27 measurements used'
+    assert noted(account, 'link.mcap', 'twice')
 
 
 def test_damage_in_a_closed_bag_is_reported(write: Callable[..., Path]) -> None:
@@ -206,6 +245,13 @@ def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -
         records.read_series(bag, replace(INPUT.command, topic='/valve_2'))
 
 
+def test_episodes_are_converted_to_the_requested_units(write: Callable[..., Path]) -> None:
+    (episode,), _ = records.loop_episodes(
+        [write(loop(15))], [replace(STATE, unit='kPa')], [replace(INPUT, unit='mbar')])
+    assert episode.x[0, 0] == pytest.approx(0.001)
+    assert episode.u[0, 0] == pytest.approx(1.01)
+
+
 # Signals as arrays.
 
 
@@ -226,6 +272,12 @@ def test_signal_as_arrays(
     with pytest.raises(records.BagReadError, match='was not closed'):
         records.read_series(file, TEMPERATURES)
     assert len(records.read_series(file, TEMPERATURES, recover=True).values) == len(sent)
+
+
+def test_topic_without_messages_gives_empty_arrays(write: Callable[..., Path]) -> None:
+    series = records.read_series(write([]), STATE.place)
+    assert series.stamp_ns.shape == series.values.shape == (0,)
+    assert series.stamp_ns.dtype == np.int64
 
 
 @pytest.mark.parametrize(('field', 'other'), [
@@ -268,9 +320,29 @@ def found(values: np.ndarray) -> list[list[int]]:
     return [np.flatnonzero(kind).tolist() for kind in outliers_and_steps(values, 1.0)]
 
 
+@pytest.mark.parametrize('noise', [0.0, 0.1, 1.0])
+def test_motion_under_steps_is_neither(motion: np.ndarray, noise: float) -> None:
+    for stride in (1, 10, 30):
+        values = motion[::stride]
+        values = values + noise * np.random.default_rng(1).standard_normal(len(values))
+        assert found(values) == [[], []]
+
+
 @pytest.mark.parametrize('noise', [0.0, 0.1])
 def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
     values = motion + noise * np.random.default_rng(2).standard_normal(len(motion))
     values[[100, 700]] += [40.0, -35.0]
     values[900:] += 30.0
     assert found(values) == [[100, 700], [900]]
+
+
+@pytest.mark.parametrize(('values', 'jumps'), [
+    # a step of the input after a long rest
+    (51.0 - 10.0 * (1.0 - np.exp(-np.maximum(np.arange(3000.0) - 2950.0, 0.0) / 25.0)), []),
+    # a reset while all rests, and one that is too small
+    (np.r_[np.full(200, 40.0), np.full(200, 51.0)], [200]),
+    (np.r_[np.full(200, 40.0), np.full(200, 40.9)], []),
+    # few samples tell nothing
+    (np.r_[np.zeros(20), 100.0, np.zeros(20)], [])])
+def test_jumps_after_a_rest(values: np.ndarray, jumps: list[int]) -> None:
+    assert found(values) == [[], jumps]

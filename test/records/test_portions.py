@@ -89,6 +89,17 @@ def test_command_of_an_earlier_portion_is_held(tmp_path: Path) -> None:
         assert one.u[:, 0].tolist() == [3.0]
 
 
+def test_state_that_falls_silent_does_not_hold_up_the_others(tmp_path: Path) -> None:
+    time = np.arange(20_000) * PERIOD
+    both = tmp_path / 'both'
+    both.mkdir()
+    write(both / 'both_0.mcap', ['/valve', '/cold'], np.ones((30, 2)), PERIOD)
+    write(both / 'both_1.mcap', ['/warm'], time[:, None], PERIOD)
+    _, account = records.loop_episodes([both], STATES, [COMMANDED])
+    assert account.used == 60
+    assert account.dropped == {'measurement without cold': 20_000 - 30}
+
+
 def test_memory_does_not_grow_with_the_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

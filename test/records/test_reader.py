@@ -6,17 +6,24 @@
 from collections.abc import Callable
 import importlib
 from pathlib import Path
+import re
+import shutil
 from typing import Any
 
 from mcap.writer import Writer
 import pytest
+from rosbags.interfaces import QosDurability, QosHistory, QosReliability, QosTime
 import yaml
+import zstandard
 
 from koopman_ros import records
+from koopman_ros.core import message_fields
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
+from koopman_ros.records.metadata import dump_offered_qos, parse_offered_qos
 from support.bag_samples import (
     compressed_files,
+    DEFAULT_QOS,
     number,
     OFFERED_QOS,
     record,
@@ -106,6 +113,14 @@ def test_order_is_that_of_recording_across_a_clock_reset(tmp_path: Path) -> None
     assert [m.message.data for m in records.read_messages(path)] == [5, 6, 7, 1, 2, 6]
     content = records.summary(path)
     assert (content.start_ns, content.end_ns) == (1, 7)
+
+
+@FORMS
+def test_bag_without_messages(tmp_path: Path, name: str) -> None:
+    path = record(tmp_path / name)
+    assert list(records.read_messages(path)) == []
+    assert records.summary(path) == records.BagSummary(
+        {'/x': 0}, {'/x': 'std_msgs/msg/Float64'}, {}, None, None, complete=True)
 
 
 def test_split_bag_is_read_in_the_order_of_its_metadata(tmp_path: Path) -> None:
@@ -269,7 +284,116 @@ def test_order_of_receipt(recorded: tuple[float, ...], order: list[float]) -> No
     assert len(set(recorded)) > 1 or places == sorted(places)
 
 
+def test_messages_are_passed_on_before_the_last_is_read() -> None:
+    recorded = (records.BagMessage('/x', '', k * SECOND, k, None, b'') for k in range(100))
+    assert next(records.in_log_order(recorded)).log_time_ns == 0
+    assert next(recorded).publish_time_ns < 10
+
+
 # Offers.
+
+# As rosbag2 (Jazzy) writes a discovered publisher of the default profile.
+NEVER = '\n    sec: 9223372036\n    nsec: 854775807\n'
+DISCOVERED = (
+    '- history: unknown\n  depth: 0\n  reliability: reliable\n  durability: volatile\n'
+    f'  deadline:{NEVER}  lifespan:{NEVER}  liveliness: automatic\n'
+    f'  liveliness_lease_duration:{NEVER}  avoid_ros_namespace_conventions: false')
+
+
+def test_offers_as_text_of_this_version_and_of_older_ones() -> None:
+    discovered = DEFAULT_QOS._replace(history=QosHistory.UNKNOWN, depth=0)
+    assert dump_offered_qos([]) == '[]'
+    assert dump_offered_qos([discovered]) == DISCOVERED
+    # equal ones are written out each
+    assert parse_offered_qos(dump_offered_qos([discovered] * 2)) == (discovered, discovered)
+    assert not {'&', '*'}.intersection(dump_offered_qos([discovered] * 2))
+    assert parse_offered_qos(HUMBLE_OFFER) == (discovered._replace(
+        reliability=QosReliability.BEST_EFFORT, durability=QosDurability.TRANSIENT_LOCAL,
+        liveliness_lease_duration=QosTime(1, 500_000_000)),)
+    for text in ('', 'x', '- 3', '- history: 1', '['):
+        assert parse_offered_qos(text) == ()
+
+
+@pytest.mark.parametrize(('ending', 'identifier'), [
+    ('', ''), ('', None), ('.zstd', ''), ('.bag', '')])
+def test_metadata_without_an_identifier_of_the_storage(
+        tmp_path: Path, ending: str, identifier: str | None) -> None:
+    """As `ros2 bag reindex` of Humble leaves it, whatever the files are called."""
+    path = record(tmp_path / 'run', range(5))
+    name = f'run_0.mcap{ending}' if ending != '.bag' else 'run.bag'
+    content = (path / 'run_0.mcap').read_bytes()
+    (path / 'run_0.mcap').unlink()
+    (path / name).write_bytes(zstandard.compress(content) if ending == '.zstd' else content)
+    change(path, lambda information: information.update(
+        storage_identifier=identifier, relative_file_paths=[name],
+        compression_format='zstd' if ending == '.zstd' else ''))
+    assert [m.message.data for m in records.read_messages(path)] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert records.summary(path).complete
+
+
+@pytest.mark.parametrize('name', [
+    'run_{}.mcap', '{}_run_2025_12_17-10_{:02}_00.mcap',
+    '{}_run_2025_12_17-10_{:02}_00.mcap.zstd'])
+def test_files_that_no_metadata_lists_are_read_by_their_numbers(tmp_path: Path, name: str) -> None:
+    path = tmp_path / 'run'
+    path.mkdir()
+    names = [name.format(k, k) for k in range(13)]
+    for k, own in enumerate(names[:12]):
+        content = record(tmp_path / f'{k}.mcap', [k]).read_bytes()
+        (path / own).write_bytes(zstandard.compress(content) if own.endswith('.zstd') else content)
+    (path / names[12]).touch()
+    numbers = [float(k) for k in range(12)]
+    assert [m.message.data for m in records.read_messages(path, recover=True)] == numbers
+    # of another recording, and of none
+    for other in ('other_3.mcap', 'notes.mcap'):
+        shutil.copy(path / names[0], path / other)
+    # as left by a recorder whose disk was full when it completed the second file
+    (path / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': {
+        'storage_identifier': 'mcap', 'relative_file_paths': [names[0], *names[2:10]],
+        'compression_format': 'zstd' if name.endswith('.zstd') else ''}}))
+    with pytest.raises(records.BagReadError, match=(
+            rf"{re.escape(names[1])}' is not listed in metadata\.yaml, .*: set recover to true")):
+        records.read_messages(path)
+    assert not records.summary(path).complete
+    assert [m.message.data for m in records.read_messages(path, recover=True)] == numbers
+
+
+@pytest.mark.parametrize('schema', ['std_msgs/Float64', 'std_msgs/msg/Float64'])
+@pytest.mark.parametrize('named', ['std_msgs/Float64', 'std_msgs/msg/Float64'])
+def test_short_and_full_names_are_one_type(tmp_path: Path, schema: str, named: str) -> None:
+    path = foreign(tmp_path / 'run.mcap', name=schema)
+    for place in (MessageField('/x', named, 'data', '1'),
+                  message_fields.place('/x', 'x', '1', {'type': named})):
+        assert records.read_series(path, place).values.tolist() == [1.0]
+    assert records.summary(path).types == {'/x': 'std_msgs/msg/Float64'}
+    assert next(records.read_messages(path)).type_name == 'std_msgs/msg/Float64'
+
+
+def test_topics_that_are_not_decoded_come_as_bytes_in_a_whole_bag(tmp_path: Path) -> None:
+    """Of a service event, rosbag2 stores the text of the .srv file."""
+    path = tmp_path / 'run.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        channels = [writer.register_channel(topic, encoding, writer.register_schema(
+            kind, 'ros2msg', text)) for topic, encoding, kind, text in (
+                ('/x', 'cdr', 'std_msgs/msg/Float64', b'float64 data\n'),
+                ('/ask/_service_event', 'cdr', 'my_srvs/srv/Ask_Event', b'bool a\n---\nbool b\n'),
+                ('/json', 'json', 'std_msgs/msg/Float64', b'float64 data\n'))]
+        for k in range(9):
+            writer.add_message(channels[k % 3], k, number(k), k)
+        writer.finish()
+    with pytest.warns(UserWarning, match='are returned as raw bytes') as said:
+        found = list(records.read_messages(path))
+    # once for each topic
+    assert ['/_service_event' in str(one.message) for one in said] == [True, False]
+    assert [m.data for m in found] == [number(k) for k in range(9)]
+    assert [m.message and m.message.data for m in found] == [0.0, None, None, 3.0, None, None,
+                                                             6.0, None, None]
+    assert found[1].type_name == 'my_srvs/srv/Ask_Event'
+    assert len(list(records.read_messages(path, ['/x']))) == 3
+    with pytest.raises(records.BagReadError, match='is invalid'):
+        list(records.read_messages(path, ['/ask/_service_event']))
 
 
 @pytest.mark.parametrize(('kind', 'field'), [
@@ -292,3 +416,10 @@ def test_small_integers_are_the_same_live_and_from_a_bag(
             writer.write('/x', serialize(message), k + 128)
     assert live == [float(k) for k in values]
     assert records.read_series(path, place).values.tolist() == live
+
+
+def test_arrays_of_char_are_of_unsigned_numbers(tmp_path: Path) -> None:
+    path = foreign(tmp_path / 'run.mcap', schema=b'char[<=3] a\nchar[2] b\nchar[] c\nchar D=7\n',
+                   data=number(1.0)[:4] + b'\x02\0\0\0\xc8\xc9' + b'\xca\xcb' + b'\x01\0\0\0\xcc')
+    found = next(records.read_messages(path)).message
+    assert [list(found.a), list(found.b), list(found.c)] == [[200, 201], [202, 203], [204]]

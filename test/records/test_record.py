@@ -144,6 +144,18 @@ def test_a_missing_value_leaves_the_other_signals():
     assert 'pump has no value in 1 rows' in words
 
 
+def test_signals_with_rows_of_their_own_share_their_times():
+    rows = pd.DataFrame({'time': SECONDS, 'level': LEVEL, 'pump': np.nan})
+    rows = pd.concat([pd.DataFrame({'time': SECONDS[::20], 'level': np.nan, 'pump': PUMP[::20]}),
+                      rows]).sort_values('time', kind='stable')
+    assert levels(rows).x[:, 0] == pytest.approx(LEVEL)
+    repeated = pd.concat([rows, rows.iloc[-1:]])
+    assert read(repeated, 'level', 'pump').report.dropped == {
+        'measurement with a repeated time': 1}
+    # the newest first, as historians export
+    assert levels(rows[::-1]).x[:, 0] == pytest.approx(LEVEL)
+
+
 @pytest.mark.parametrize(('change', 'words', 'lengths'), [
     (lambda t, x: t.__setitem__(slice(30, None), t[30:] + 60.0), 'gap of 60.500 s', [30, 30]),
     (lambda t, x: t.__setitem__(slice(30, None), t[30:] - 60.0), 'set back by 59.500', [30, 30]),
@@ -171,6 +183,13 @@ def test_inputs_are_held_or_linear_and_count_from_the_first_row_that_has_all():
     assert episode.inputs_at(np.array([0.25])).tolist() == [[2.25, PUMP[4]]]
 
 
+def test_several_tables_are_episodes_of_one_record(tmp_path):
+    frame(time=SECONDS).to_csv(tmp_path / 'a.csv')
+    record = read([tmp_path / 'a.csv', frame(time=SECONDS)], 'level', 'pump', name='tank')
+    assert list(map(len, record.episodes)) == [N, N]
+    assert (record.plant.name, record.sources) == ('tank', (str(tmp_path / 'a.csv'),))
+
+
 @pytest.mark.parametrize(('arguments', 'words'), [
     ((frame(time=SECONDS), [], 'pump'), 'at least one of each'),
     ((frame(time=SECONDS), 'level', ['pump', 'level']), 'level is named twice'),
@@ -182,6 +201,21 @@ def test_rejects_signals_and_sources_that_are_none(arguments, words):
     source, states, inputs, *linear = arguments
     with pytest.raises(ValueError, match=words):
         read(source, states, inputs, linear=linear)
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    ((['level'], frame(time=SECONDS), ['pump']), 'states .*DataFrame: .* first argument'),
+    (('level', 'pump', {'time': SECONDS}), 'inputs .*dict: .* first argument')])
+def test_a_table_in_the_place_of_names_is_rejected(arguments, words):
+    with pytest.raises(TypeError, match=words):
+        read(*arguments)
+
+
+@pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
+def test_rejects_other_files(tmp_path, file):
+    (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
+    with pytest.raises(ValueError, match=r'is not a record|version 7\.3'):
+        read(tmp_path / file, 'level', 'pump')
 
 
 @pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')

@@ -18,7 +18,7 @@ import yaml
 
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import BagReadError, BagWriter, read_messages, summary
-from support.bag_samples import NUMBER, number, Sample, write_numbers
+from support.bag_samples import NUMBER, number, record, Sample, write_numbers
 
 WriteBag = Callable[..., Path]
 
@@ -116,6 +116,29 @@ def test_damage_after_the_first_chunk_keeps_the_first_chunk(
     assert summary(path).message_count == len(samples)
 
 
+def test_damaged_end_is_counted_by_scanning(path: Path, samples: list[Sample]) -> None:
+    content = path.read_bytes()
+    (_, summary_start), = records(content, Opcode.DATA_END)
+    (statistics, _), = records(content, Opcode.STATISTICS)
+    # the length of the first record of the summary, and the number of messages
+    for place, damage in ((summary_start + 1, b'\xff' * 8), (statistics + 9, b'\xff')):
+        path.write_bytes(content)
+        changed(path, place, damage)
+        assert summary(path).message_count == len(samples)
+        assert len(list(read_messages(path))) == len(samples)
+
+
+def test_lost_chunk_is_noticed_without_checksums(path: Path, samples: list[Sample]) -> None:
+    """A damaged record type makes a chunk an unknown record, which readers skip."""
+    content = path.read_bytes()
+    (data_end, _), = records(content, Opcode.DATA_END)
+    changed(path, data_end + 9, bytes(4))  # no checksum of the data section
+    changed(path, records(content, Opcode.CHUNK)[1][0], b'\x46')
+    with pytest.raises(BagReadError, match=f'of the {len(samples)} expected messages'):
+        list(read_messages(path))
+    assert 0 < len(list(read_messages(path, recover=True))) < len(samples)
+
+
 # Killed recorders.
 
 
@@ -208,3 +231,22 @@ def test_splits_by_duration_into_files_complete_in_themselves(tmp_path: Path) ->
         found = yaml.safe_load(own.metadata['serialized_metadata'])
         assert found['relative_file_paths'] == [name]
     assert sequence == list(range(75))
+
+
+def test_splits_by_size(tmp_path: Path) -> None:
+    path = record(tmp_path / 'run', range(2000), max_file_bytes=20_000, max_chunk_bytes=1000)
+    files = sorted(path.glob('*.mcap'), key=lambda file: int(file.stem.split('_')[1]))
+    assert len(files) > 5
+    # at the end of a file come its indexes, which grow with its messages
+    sizes = [file.stat().st_size for file in files]
+    assert all(20_000 <= size < 32_000 for size in sizes[:-1]), sizes
+    assert numbers(path) == list(range(2000))
+    path = record(tmp_path / 'whole', range(2000), max_chunk_bytes=1000)
+    assert [file.name for file in path.glob('*.mcap')] == ['whole_0.mcap']
+
+
+def test_clock_that_is_set_back_does_not_stop_the_splitting(tmp_path: Path) -> None:
+    sent = [*range(1000, 1010), *range(40)]
+    path = record(tmp_path / 'run', sent, PERIOD, max_file_duration_s=3.0)
+    assert len(list(path.glob('*.mcap'))) == 2
+    assert numbers(path) == sent

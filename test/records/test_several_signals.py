@@ -14,6 +14,7 @@ from koopman_ros import records
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import RecordedInput, RecordedState
+from koopman_ros.records.applied_inputs import follows_command
 from support.bag_samples import FLOAT, JOINTS, noted, Sent, TEMPERATURE
 
 WARM = RecordedState('warm', 'K', MessageField('/warm', TEMPERATURE, 'temperature', 'degC'))
@@ -55,6 +56,15 @@ def test_an_input_without_commands_is_taken_from_its_measurements(
         records.read(path, 'warm', 'jacket [K]')
 
 
+def test_an_input_without_commands_that_is_not_measured_throughout(write: Callable[..., Path]
+                                                                   ) -> None:
+    path = write([*(Sent('/warm', k, 50.0 + k) for k in range(1, 31)),
+                  *(Sent('/jacket', k, 20.0) for k in range(1, 16))])
+    episodes, account = records.loop_episodes([path], [WARM], [JACKET])
+    assert not episodes
+    assert 'jacket was not always measured, and has no commands' in account.notes[-1]
+
+
 def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., Path]) -> None:
     path = write([s for k in range(1, 16) for s in (
         # the order of the names changes, as joint states may
@@ -68,6 +78,15 @@ def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., 
     assert episode.input_time.tolist() == [0.0, 5.0]
     assert (account.measurements, account.used) == (30, 30)
     assert noted(account, '/pump_setpoint', 'no stamp')
+
+
+def test_message_without_an_element_is_counted(write: Callable[..., Path]) -> None:
+    path = write([s for k in range(1, 16) for s in (
+        Sent('/tanks', k, {'low': 1.0, **({} if k == 4 else {'high': 2.0})}), *jacket(1.0))])
+    (episode,), account = records.loop_episodes([path], TANKS, [COMMANDED])
+    assert len(episode) == 14
+    assert account.dropped == {'without position[high]': 1, 'measurement without high': 1}
+    assert (account.measurements, account.used) == (30, 28)
 
 
 @pytest.mark.parametrize(('tolerance', 'shift', 'left', 'dropped'), [
@@ -107,6 +126,44 @@ def test_missing_and_doubled_parts_are_named(write: Callable[..., Path]) -> None
         'measurement without cold': 2, 'one of several within 0.05 s (warm)': 1,
         'measurement with a repeated stamp (warm)': 1}
     assert (account.measurements, account.used) == (40, 36)
+
+
+def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
+    path = write([*jacket(1.0), *(s for k in range(1, 121) for s in (
+        Sent('/warm', k, 50.0 + 0.1 * k + 30.0 * (k == 40)),
+        Sent('/cold', k, 10.0 + 0.1 * k + 25.0 * (k > 70))))])
+    recorded = [path], [WARM, COLD], [COMMANDED]
+    episodes, account = records.loop_episodes(*recorded)
+    assert [len(episode) for episode in episodes] == [69, 50]
+    assert account.dropped == {'spike of a single sample (warm)': 1, 'in a sample with a spike': 1}
+    assert noted(account, 'jump', '42.1 degC', 'cold', '70.000 s')
+    # a change of 25 K may not be one
+    (episode,), _ = records.loop_episodes(*recorded, least_jumps=[1.0, 26.0])
+    assert len(episode) == 119
+
+
+@pytest.mark.parametrize(('least', 'count'), [(0.024, 2), (0.026, 1)])
+def test_the_smallest_jump_is_in_the_unit_of_the_signal(
+        write: Callable[..., Path], least: float, count: int) -> None:
+    """Levels in m, whose messages are in mm, one of which changes by 25 mm."""
+    path = write([s for k in range(1, 121) for s in (
+        Sent('/tanks', k, {'low': 100.0 + 0.1 * k, 'high': 500.0 + 0.1 * k + 25.0 * (k > 70)}),
+        Sent('/pump_setpoint', None, 2.0, k))])
+    episodes, _ = records.loop_episodes([path], TANKS, [PUMP], least_jumps=[least] * 2)
+    assert len(episodes) == count
+
+
+def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path]) -> None:
+    level = RecordedState('level', 'm', MessageField('/level', FLOAT, 'data', 'm'))
+    # the stamps are simulated, ten times as fast as the recorder's clock
+    path = write([Sent('/jacket_setpoint', 1, 1.0, 100.05), *(s for k in range(1, 21) for s in (
+        Sent('/warm', k, 50.0 + k, 100.0 + 0.1 * k),
+        Sent('/level', None, float(k), 100.001 + 0.1 * k)))])
+    (episode,), account = records.loop_episodes(
+        [path], [WARM, level], [COMMANDED], tolerance_ns=SECOND // 50)
+    assert episode.x[:, 1].tolist() == list(range(1, 21))
+    assert episode.time.tolist() == list(range(20))
+    assert noted(account, '/level', 'no stamp')
 
 
 # Inputs as they were measured.
@@ -159,6 +216,28 @@ def test_input_that_follows_at_once_changes_with_its_command(
     assert episode.u[:, 0] == pytest.approx(np.array(values) + 273.15)
     # to the time, which no measurement tells
     assert episode.input_time.tolist() == [0.0, 4.5, 14.0]
+
+
+def test_input_that_is_measured_at_a_change_shows_it_before_or_after() -> None:
+    times, held = SECOND * np.arange(6), np.array([1.0, 2.0, 1.0, 3.0, 2.0, 5.0])
+    assert [follows_command(times, held, times[1:], measured) for measured in (
+        held[:-1], held[1:], held[1:] + 1.5)] == [True, True, False]
+
+
+def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callable[..., Path]
+                                                                   ) -> None:
+    u = lagging(np.arange(1.0, 31.0), 4.0)
+    run = jacket_run(u)
+    path = write([s for s in run if s.topic != '/jacket' or not 10 < (s.stamp or 0) < 20])
+    (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
+    assert episode.linear == ()
+    assert episode.u[:, 0] == pytest.approx(np.array([293.15, 303.15, 283.15]))
+    assert noted(account, 'jacket', 'not always measured')
+    path.unlink()
+    write([s for s in run if s.topic != '/jacket'])
+    (again,), account = records.loop_episodes([path], [WARM], [JACKET])
+    assert np.array_equal(again.u, episode.u)
+    assert noted(account, "no topic '/jacket'")
 
 
 def test_one_input_measured_and_one_commanded(write: Callable[..., Path]) -> None:

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+import sys
 from typing import Any
 
 from mcap.reader import make_reader
@@ -132,6 +133,46 @@ def test_existing_path_is_never_overwritten(tmp_path: Path, name: str) -> None:
     assert {f: f.read_bytes() for f in tmp_path.rglob('*') if f.is_file()} == before
 
 
+@pytest.mark.parametrize(('arguments', 'kind'), [
+    (('/y', b'', 1), KeyError), (('/x', 1.5, 1), TypeError), (('/x', b'', -1, 0), ValueError),
+    (('/x', b'', 0, -7), ValueError), (('/x', b'', 2**63, 0), ValueError)])
+def test_rejected_message_leaves_no_trace(
+        tmp_path: Path, arguments: tuple[Any, ...], kind: type[Exception]) -> None:
+    with records.BagWriter(tmp_path / 'run.mcap') as writer:
+        writer.add_topic('/x', NUMBER)
+        with pytest.raises(kind):
+            writer.write(*arguments)
+    assert list(records.read_messages(writer.path)) == []
+
+
+def test_closed_writer_rejects(tmp_path: Path) -> None:
+    writer = records.BagWriter(tmp_path / 'run')
+    writer.add_topic('/x', NUMBER)
+    # not before the bag is complete
+    assert not (writer.path / 'metadata.yaml').exists()
+    writer.close()
+    before = (writer.path / 'run_0.mcap').read_bytes()
+    for method, arguments in ((writer.write, ('/x', number(1.5), 3)),
+                              (writer.add_topic, ('/y', NUMBER)), (writer.flush, ())):
+        with pytest.raises(ValueError, match='is closed'):
+            method(*arguments)
+    writer.close()
+    assert (writer.path / 'run_0.mcap').read_bytes() == before
+
+
+def test_exception_inside_with_keeps_the_recording(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), records.BagWriter(tmp_path / 'run') as writer:
+        write_numbers(writer, (1 // value for value in (1, 0)))
+    assert [m.log_time_ns for m in records.read_messages(tmp_path / 'run')] == [1]
+
+
+@pytest.mark.parametrize('options', [{'max_file_bytes': 1}, {'max_file_duration_s': 1.0}])
+def test_one_file_is_not_split(tmp_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match='cannot be split'):
+        records.BagWriter(tmp_path / 'run.mcap', **options)
+    assert list(tmp_path.iterdir()) == []
+
+
 # The independent reader.
 
 
@@ -167,6 +208,7 @@ def test_rosbags_reads_messages_offers_and_metadata(
 
 # Message definitions.
 
+RULE = '=' * 80
 ZEROS = 'RIHS01_' + '0' * 64
 
 
@@ -183,6 +225,35 @@ def _install(prefix: Path, type_name: str, text: str, *, description: str | None
     (folder / f'{name}.msg').write_bytes(text.encode('utf-8'))
     (folder / f'{name}.json').write_text(description or (
         f'{{"type_hashes": [{{"type_name": "{type_name}", "hash_string": "{ZEROS}"}}]}}'))
+
+
+@pytest.mark.usefixtures('prefix')
+def test_dependencies_follow_depth_first_and_sorted(tmp_path: Path) -> None:
+    _install(tmp_path, 'a_msgs/msg/Top', 'b_msgs/Mid mid\nLeaf[] leaves\nuint8 X=1\n')
+    _install(tmp_path, 'a_msgs/msg/Leaf', 'string<=4[<=2] names\n')
+    _install(tmp_path, 'b_msgs/msg/Mid', '# Leaf is no field here\na_msgs/Leaf leaf\nLow low\n')
+    _install(tmp_path, 'b_msgs/msg/Low', 'float64 x  # °C\n')
+    definition = records.message_definition('a_msgs/msg/Top')
+    assert definition.type_hash == ZEROS
+    assert definition.text == (
+        'b_msgs/Mid mid\nLeaf[] leaves\nuint8 X=1\n'
+        f'\n{RULE}\nMSG: a_msgs/Leaf\nstring<=4[<=2] names\n'
+        f'\n{RULE}\nMSG: b_msgs/Mid\n# Leaf is no field here\na_msgs/Leaf leaf\nLow low\n'
+        f'\n{RULE}\nMSG: b_msgs/Low\nfloat64 x  # °C\n')
+
+
+def test_first_prefix_wins_and_line_ends_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the interpreter's own comes last
+    monkeypatch.setattr(sys, 'prefix', str(tmp_path / 'python'))
+    for prefix, text in (('overlay', 'float64 x\r\nfloat64 over\r\n'),
+                         ('underlay', 'float64 under\n'), ('python', 'float64 own\n')):
+        _install(tmp_path / prefix, 'a_msgs/msg/X', text)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "overlay"}::{tmp_path / "underlay"}')
+    assert records.message_definition('a_msgs/msg/X').text == 'float64 x\r\nfloat64 over\r\n'
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    assert records.message_definition('a_msgs/msg/X').text == 'float64 own\n'
 
 
 @pytest.mark.parametrize(('type_name', 'words'), [

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
+from koopman_ros.event_log.records import parse
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
@@ -109,6 +111,28 @@ def measured(bench: Bench, first: int, count: int) -> list[float]:
 def own_commands(bench: Bench, after: float) -> list[Temperature]:
     """Return what was commanded later than the last measurement."""
     return [message for message in bench.commands if seconds(message) > after]
+
+
+def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros: Harness) -> None:
+    bench = Bench(ros, first=0.0)
+    assert seconds(bench.commands[0]) == 0.0
+    commands = [bench.commands[0].temperature]
+    for first in (1, 3621, 26):
+        commands += measured(bench, first, 5)
+    assert np.max(np.abs(np.diff(commands))) < 0.05
+    assert np.ptp(commands) > 0.0
+    ros.wait_until(lambda: 'controller time is reset' in bench.process.output())
+    status = bench.status()
+    assert value(status, 'measurements') == '16'
+    assert status.level == DiagnosticStatus.OK
+
+    ros.set_parameters('controller', measurement_timeout=0.1)
+    last = float(LAST_STAMP_SECONDS)
+    bench.measure(STEADY, last)
+    ros.wait_until(lambda: len(own_commands(bench, last)) >= 2)
+    assert {message.header.stamp.sec for message in own_commands(bench, last)} == {
+        LAST_STAMP_SECONDS}
+    assert all(math.isfinite(message.temperature) for message in bench.commands)
 
 
 def test_missing_simulated_time_is_reported_and_its_silence_leads_to_the_safe_coolant(
@@ -295,3 +319,61 @@ def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: 
         DiagnosticStatus.ERROR, 'no measurement of temperature for more than 5 s'), 2.0)
     # it was received before the first /clock, and waited for by a clock of 0.5 s
     assert now >= 60.0 + 5.0 - 0.5
+
+
+def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(
+        ros: Harness) -> None:
+    ros.start('controller', {
+        'system': 'two_tanks', 'level_1.report_on_change': 100.0,
+        'estimator': 'extended_kalman_filter', 'level_2.analysis_topic': 'laboratory',
+        'level_2.analysis_delay': 60.0})
+    records = ros.listen(String, topics.EVENT_LOG)
+    commands = ros.listen(JointState, 'pump_1_setpoint')
+    sensors = {name: ros.speak(JointState, name, to='controller')
+               for name in ('level_1', 'level_2', 'laboratory')}
+
+    def send(name: str, metres: float, time: float) -> None:
+        message = JointState(name=['level_2' if name == 'laboratory' else name],
+                             position=[metres])
+        message.header.stamp = temperature(0.0, time).header.stamp
+        sensors[name].publish(message)
+
+    send('level_2', 0.15, 1.0)
+    ros.wait_for_status(STATUS, lambda s: 'first measurement of level_1' in s.message)
+    send('level_1', 0.12, 0.5)
+    ros.meet('controller')
+    for time in (2.0, 3.0, 4.0):
+        send('level_2', 0.15, time)
+    ros.wait_until(lambda: [seconds(message) for message in commands] == [2.0, 3.0, 4.0])
+    for time in (2.5, 1.0):
+        send('laboratory', 0.16, time)
+    ros.wait_until(lambda: [record.fields['accepted'] for record in map(
+        parse, (message.data for message in records)) if record.event == 'analysis'] == [
+            True, False])
+
+
+def test_manual_commands_before_a_measurement_and_commands_without_a_subscriber(
+        running: Harness) -> None:
+    running.set_bool('controller/set_automatic', False)
+    manual = running.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
+    manual.publish(temperature(20.0))
+    running.wait_for_status('controller: control', lambda s: (
+        'the applied coolant is unknown' in s.message))
+    # before the first measurement, from what is applied
+    commands = running.listen(Temperature, reactor.COOLANT_SETPOINT)
+    coolant = running.speak(
+        Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS, to='controller')
+    coolant.publish(temperature(20.5, 1.0))
+    running.meet('controller')
+    manual.publish(temperature(20.0))
+    running.wait_until(lambda: commands and (
+        commands[-1].temperature == pytest.approx(20.0)))
+    assert commands[0].temperature == pytest.approx(20.5)
+    running.set_bool('controller/set_automatic', True)
+    running.node.destroy_subscription(next(
+        own for own in running.node.subscriptions if own.topic_name == '/coolant_setpoint'))
+    thermometer = running.speak(Temperature, reactor.TEMPERATURE, to='controller')
+    thermometer.publish(temperature(STEADY, 1.0))
+    status = running.wait_for_status('controller: control', lambda s: (
+        'no subscriber on /coolant_setpoint' in s.message))
+    assert status.level == DiagnosticStatus.WARN

@@ -10,6 +10,7 @@ import pytest
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -91,6 +92,15 @@ def test_start_that_fails_leaves_nothing_half_made(
     assert all(len(now) == len(then) + 1 for now, then in zip(parts(node), before, strict=True))
 
 
+@pytest.mark.parametrize('where', ['configure', 'activate'])
+def test_code_that_exits_in_a_transition_does_not_end_the_process(
+        node: Failing, where: str) -> None:
+    node.failures = {where: SystemExit(3)}
+    with pytest.raises(RuntimeError, match='SystemExit: 3'):
+        node.start()
+    assert not node.active
+
+
 @pytest.mark.parametrize('error', [OSError('the disk is full'), SystemExit(3)])
 def test_node_that_cannot_leave_all_well_acts_no_more_all_the_same(
         node: Failing, error: BaseException) -> None:
@@ -153,6 +163,14 @@ def test_pending_callbacks_are_rejected_or_dropped_at_shutdown(shared_ros: Harne
     # no callback of what was taken down
     assert all(heard)
     assert all('not configured' in future.result().message for future in asked)
+
+
+def test_time_that_is_simulated_meanwhile_stays_so(node: Failing) -> None:
+    node.start()
+    node.set_parameters([Parameter('use_sim_time', value=True)])
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    assert [heard.topic_name for heard in node.subscriptions] == ['/clock']
 
 
 def test_the_process_does_not_end_before_the_answer_to_a_shutdown_is_out(

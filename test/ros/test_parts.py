@@ -178,6 +178,27 @@ def context(own: Controller, state: State, report: StepReport, silence: float = 
                                no_news=lambda _: None))
 
 
+@pytest.mark.parametrize(('silence', 'warned'), [(0.6, False), (1.4, False), (2.5, True)])
+def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
+        silence: float, warned: bool) -> None:
+    own, state, _ = measured(Mode.MANUAL)
+    state = own.request_manual_input(state, own.model.inputs.center + 1.0)[0]
+    state, _, report = own.hold(state, int((3.0 + silence) * 1e9), None)
+    found = statuses(context(own, state, report, silence))['measurements']
+    assert (found.level is Severity.WARN) is warned
+
+
+def test_the_inputs_assumed_before_the_start_are_reported() -> None:
+    model = load(model_path('reactor_nz4'))
+    own = built(table_of(model, {'system': 'reactor'}).snapshot({
+        'coolant_temperature.dead_time': 2.5}), model)
+    state, messages = State(), []
+    for k in range(1, 5):
+        state, _, report = own.step(state, model.states.center, k * NANOSECONDS)
+        messages.append(statuses(context(own, state, report))['control'].message)
+    assert ['before the start is assumed' in text for text in messages] == [True] * 3 + [False]
+
+
 def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
     model = load(model_path('reactor_feed'))
     signals = signals_of(model)
@@ -223,3 +244,12 @@ def test_a_state_within_the_ranges_is_far_from_the_data_beyond_the_margin(
     found = statuses(now)['model']
     assert found.level is (Severity.WARN if words else Severity.OK)
     assert words in found.message
+
+
+def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
+    own, state, report = measured(Mode.AUTOMATIC)
+    assert statuses(context(own, state, report))['model'].level is Severity.OK
+    found = statuses(context(own, state, replace(
+        report, estimate=replace(report.estimate, at_bound=True))))
+    assert (found['model'].level, found['control'].level) == (Severity.WARN,) * 2
+    assert 'at its bound' in found['model'].message

@@ -9,20 +9,26 @@ import os
 from pathlib import Path
 import re
 import signal
+import subprocess
 import sys
 from types import ModuleType
 
 import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
+from rosgraph_msgs.msg import Clock
 
 from koopman_ros import __version__
 from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.nodes import controller, plant, player, trainer
 from koopman_ros.parameters.table import as_yaml
+from koopman_ros.records import summary
+from koopman_ros.ros import topics
 from koopman_ros.ros.node_descriptions import tables
 from koopman_ros.ros.process import answer, open_to_the_network
-from koopman_ros.testing import Harness
-from support.nodes import run_here
+from koopman_ros.ros.time_conversion import stamp_message
+from koopman_ros.testing import Harness, NodeProcess
+from support.nodes import run_here, TIMEOUT
 
 TABLES = tables()
 
@@ -93,6 +99,17 @@ def test_signal_while_a_program_loads_ends_it_without_a_word(
     assert process.output() == ''
 
 
+def test_signal_before_the_interpreter_is_up_and_arguments_are_answered_before_the_start(
+        ros: Harness, tmp_path: Path) -> None:
+    with NodeProcess('plant', {}, tmp_path / 'log', ros.environment) as process:
+        assert process.stop(signal.SIGTERM) == 0
+    assert process.output() == ''
+    process = ros.start('plant', command=(
+        *importing((), 'pass', 'process_entry import plant as main'), '--speed=2.0'))
+    assert process.wait() == 2
+    assert 'started' not in process.output()
+
+
 # What happens at the end of a plant that gets a signal as it starts, and its last words.
 ENDS = {
     # each signal is heard, by a thread, before the next one
@@ -125,6 +142,30 @@ def test_signals_during_the_start_end_a_node_cleanly(shared_ros: Harness, name: 
     assert shared_ros.wait_for_end(plant) == ('lock' in name)
     assert 'Traceback' not in plant.output()
     assert re.fullmatch(words, plant.output(), re.DOTALL)
+
+
+def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path) -> None:
+    process = ros.start('trainer', {'output': tmp_path / 'bag.mcap'}, command=(
+        'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh',
+        *importing((), 'pass', 'process_entry import trainer as main')))
+    ros.meet('trainer')
+    assert process.stop() == 0
+    assert summary(tmp_path / 'bag.mcap').complete
+
+
+def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
+    process = ros.start('controller', {'use_sim_time': True})
+    clock = ros.speak(Clock, '/clock', topics.CLOCK_QOS, to='controller')
+    for sec, nanosec in ((-5, 0), (7, 4_000_000_000)):
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = sec, nanosec
+        clock.publish(message)
+        ros.meet('controller')
+    ros.wait_until(lambda: 'ignored an invalid /clock message (sec -5, nanosec 0; ' in (
+        process.output()))
+    # the true time is taken still
+    clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))
+    ros.meet('controller')
 
 
 @pytest.mark.parametrize('name', TABLES)
@@ -167,6 +208,15 @@ def test_help_for_a_system(name: str, given: list[str], code: int, said: str,
                  [name, '--ros-args', *parameters, '--help']):
         assert answer(name, args) == code
         assert said in ''.join(capsys.readouterr())
+
+
+def test_help_survives_a_closed_pipe() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, 'wb') as closed:
+        done = subprocess.run([sys.executable, '-m', 'koopman_ros.nodes.plant', '--help'],
+                              stdout=closed, stderr=subprocess.PIPE, check=False, timeout=TIMEOUT)
+    assert (done.returncode, done.stderr) == (0, b'')
 
 
 @pytest.mark.parametrize(('environment', 'is_open'), [

@@ -192,3 +192,9 @@ def test_integer_fields_are_read_and_not_published(
     SignalSubscriber(shared_ros.node, lambda topic, *_: heard.append(topic), places, {'pump': '1'},
                      reject)
     assert heard == ['pump']
+
+
+def test_signals_of_one_topic_have_one_type() -> None:
+    places = {'heat': place('both', 'heat', 'K'), 'angle': place('both', 'angle', 'rad')}
+    with pytest.raises(ConfigurationError, match='heat and angle share the topic both'):
+        SignalPublisher(places, {'heat': 'K', 'angle': 'rad'}, reject)
