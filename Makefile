@@ -137,7 +137,7 @@ studies-records: RECORDS = ../shared/records
 studies-records: $(VENV)/records.stamp  ## learning from measured records, compared with ARX, N4SID, NARX and EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
 	$(BIN)/python -m studies.records --records $(RECORDS) --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## benchmarks against other programs, 20 min (BENCH=--quick: 2 min) -> out/bench
+bench: $(VENV)/bench.stamp  ## time of a plan of the law mpc, compared with do-mpc and casadi, some minutes (BENCH=--quick: 1 min) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)
 
 faults: $(VENV)/mpc.stamp  ## inject 191 faults into running loops of six plants, run three of them for a day, 60 min (FAULTS=--quick: 1 min; FAULTS=two_tanks: one plant) -> out/faults

@@ -61,7 +61,7 @@ setup(
         'cluster': ['distributed'],
         # what studies and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'daqp', 'do-mpc==5.1.2', 'nfoursid',
-                  'pykoop', 'pysindy==2.1.0'],
+                  'pykoop'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'argon2-cffi',

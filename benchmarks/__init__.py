@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Speed of the package compared with other programs, by ``python -m benchmarks``."""
+"""Speed of the predictive law compared with other programs, by ``python -m benchmarks``."""
 
 import os
 

@@ -1,55 +1,76 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run parts of it: ``python -m benchmarks [part ...] [--quick]``."""
+"""Computing time of the law `mpc`, of do-mpc and of casadi's SQP: ``python -m benchmarks``."""
 
 import argparse
-from importlib import import_module
-import json
+from collections.abc import Iterator
 import os
 from pathlib import Path
+import shutil
 import sys
+from typing import Any
 
-from koopman_ros.core.plots import machine, write_figures
+from benchmarks import pending, planning
+from koopman_ros.core.plots import machine, table, write_figures
 
-# A part has its PLANS by extent, the PACKAGES whose versions matter, and `measure`, which fills
-# in the figures of one plan and yields them piece by piece as text.
-# It is a module here, imported when it is asked for: most need what the others do without.
-PARTS = ('training', 'recording', 'loop')
+PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')
+MEANING = {
+    'plan': 'by plant: figures in microseconds of each side with 30 intervals, targets given, and '
+            'the agreement of their commands',
+    'pending_us': f'median processor time of the control step of {pending.PLANT} with 0 and with '
+                  f'{pending.PENDING} commands on their way, in turns, by law',
+}
+_SIDES = {'step': 'control step with `mpc`', 'law': 'the law alone', 'do_mpc': 'do-mpc',
+          'sqp': 'SQP of casadi'}
+SAMPLES, QUICK_SAMPLES = 800, 80  # timed plans with each lift
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the selected parts, one after the other; the figures of the others stay."""
+    """Measure plans and steps, print tables and write ``summary.json``."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks',
-        description='Compare the package with other programs.')
-    parser.add_argument('parts', nargs='*', metavar='part',
-                        help=f'{", ".join(PARTS)} (default: all)')
-    parser.add_argument('--quick', dest='extent', action='store_const', const='quick',
-                        default='default', help='the smallest cases, about a minute')
+        description='Compare the time of a plan with other programs.')
+    parser.add_argument('--quick', action='store_true',
+                        help='fewer plans, and no compiled SQP: a minute')
     parser.add_argument('--output', type=Path, default=Path('out/bench'),
-                        help='folder for summary.json and pictures (default: %(default)s)')
+                        help='folder of summary.json (default: %(default)s)')
     given = parser.parse_args(args)
-    if unknown := sorted(set(given.parts) - set(PARTS)):
-        parser.error(f'there is no part {", ".join(unknown)}: choose from {", ".join(PARTS)}')
     path = given.output / 'summary.json'
-    summary = json.loads(path.read_text()) if path.exists() else {}
-    if not isinstance(summary, dict):
-        parser.error(f'{path} does not hold the figures of a benchmark: move it away')
-    for name in given.parts or PARTS:
-        part = import_module(f'benchmarks.{name}')
-        figures = summary[name] = {'machine': machine(*part.PACKAGES), 'extent': given.extent}
-        try:
-            for text in part.measure(part.PLANS[given.extent], figures, given.output):
-                write_figures(path, summary)
-                print(text + '\n', flush=True)
-        except KeyboardInterrupt:
-            print(f'\ninterrupted; the finished parts are in {given.output}', file=sys.stderr)
-            return 130
-        figures['machine']['load_at_end'] = os.getloadavg()[0]
-        write_figures(path, summary)
+    figures: dict[str, Any] = {'machine': machine(*PACKAGES), 'meaning': MEANING}
+    try:
+        for text in _measured(given.quick, figures):
+            figures['machine']['load_at_end'] = os.getloadavg()[0]
+            write_figures(path, figures)
+            print(text + '\n', flush=True)
+    except KeyboardInterrupt:
+        print(f'\ninterrupted; the finished figures are in {path}', file=sys.stderr)
+        return 130
     print(f'{path} holds all figures')
     return 0
+
+
+def _measured(quick: bool, figures: dict[str, Any]) -> Iterator[str]:
+    """Fill in the figures, and yield a table of each part."""
+    samples = QUICK_SAMPLES if quick else SAMPLES
+    compiler = None if quick else next(
+        filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
+    plans = figures['plan'] = {
+        plant: planning.compare(plant, samples, compiler) for plant in planning.SETPOINTS}
+    yield table(
+        ('plan of 30 intervals', 'by', 'median [ms]', 'p99 [ms]', 'median / law',
+         'commands apart [range]'),
+        [(f'{plant}, {one["states"]} states', label, *(
+            f'{1e-3 * one[f"{side}_cpu_{quantile}_us"]:.2f}' for quantile in ('median', 'p99')),
+          f'{one[f"{side}_cpu_median_us"] / one["law_cpu_median_us"]:.2g}',
+          f'{one["agreement"].get(side, 0.0):.1e}')
+         for plant, one in plans.items() for side, label in _SIDES.items()])
+    steps = figures['pending_us'] = {
+        law: pending.step_microseconds(law, samples) for law in pending.LAWS}
+    none, some = 0, pending.PENDING
+    yield table(('step with', f'{none} and {some} commands on their way [ms]', 'ratio'), [
+        (law, f'{1e-3 * one[none]:.2f}, {1e-3 * one[some]:.2f}', f'{one[some] / one[none]:.2g}')
+        for law, one in steps.items()])
 
 
 if __name__ == '__main__':

@@ -8,7 +8,6 @@ from time import thread_time_ns
 
 import numpy as np
 
-from benchmarks.process import Tell
 from koopman_ros.control import State
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
@@ -20,14 +19,12 @@ LAWS = ('linear', 'sdre', 'mpc')
 _PERIOD, _NOISE, _BLOCK = 5.0, 0.02, 20  # s, K
 
 
-def measure_pending(tell: Tell, samples: int) -> None:
-    """Time steps at rest with and without commands on their way, block by block in turns."""
-    for law in LAWS:
-        tell({law: _steps(law, samples)})
+def step_microseconds(law: str, samples: int) -> dict[int, float]:
+    """
+    Time steps at rest with and without commands on their way, block by block in turns.
 
-
-def _steps(law: str, samples: int) -> dict[str, float]:
-    """Return the median processor time of a step in microseconds, by number of commands."""
+    :return: median processor time of a step by number of commands, in microseconds.
+    """
     loops, states = {}, {}
     for count in (0, PENDING):
         model = replace(load(model_path(PLANT)), dead_time=np.array([count * _PERIOD]))
@@ -48,4 +45,4 @@ def _steps(law: str, samples: int) -> dict[str, float]:
                     states[count], rest + noise[k], round((k + 1) * _PERIOD * NANOSECONDS))
                 if k >= 2 * PENDING:
                     taken[count].append(thread_time_ns() - start)
-    return {str(count): 1e-3 * float(np.median(times)) for count, times in taken.items()}
+    return {count: 1e-3 * float(np.median(times)) for count, times in taken.items()}

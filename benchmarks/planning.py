@@ -5,14 +5,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
-import shutil
 import tempfile
 from time import perf_counter_ns, thread_time_ns
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from benchmarks.process import Tell
 from benchmarks.sqp import solver_of, Sqp, SqpProblem
 from koopman_ros.control import Controller, SetpointRequest, State
 from koopman_ros.control.laws.base import Target
@@ -44,13 +42,6 @@ _UNIFORM = 0.02  # of a sample, by which intervals of the horizon may differ fro
 #: not quite the plant's, which the others have; do-mpc counts the cost at the samples alone.
 TOLERANCE = {'step': 1e-3, 'sqp': 2e-3, 'do_mpc': 0.03}
 INTERVALS = 30
-
-
-def compare_all(tell: Tell, plants: tuple[str, ...], samples: int, compiled: bool) -> None:
-    """Compare on several plants, in a process with nothing else."""
-    compiler = next(filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
-    for plant in plants:
-        tell({plant: compare(plant, samples, compiler if compiled else None)})
 
 
 def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:

@@ -164,7 +164,8 @@ class Tuning:
         code=True)
     learned_model_margin: float = parameter(
         0.1, 'Distance outside the trained range, in half-ranges, up to which the nonlinear laws '
-             'act; the linear law acts beyond it.', '', 0.0, UNBOUNDED)
+             'act, at least the spacing of the stored training states; the linear law acts '
+             'beyond it.', '', 0.0, UNBOUNDED)
     linear_model_margin: float = parameter(
         0.5, 'Distance outside the trained range, in half-ranges, up to which the laws linear and '
              'pi act; the safe inputs are commanded beyond it.', '', 0.0, UNBOUNDED)

@@ -175,12 +175,12 @@ def _run(_: None, item: tuple[str, int, Experiment], __: Tell) -> tuple[Metrics,
 
 
 def conclude(seeds: int, folder: Path, make: Callable[[], Campaign],
-             report: Callable[[Campaign, dict[str, Any]], str]) -> int:
+             report: Callable[[Campaign, dict[str, Any]], None]) -> int:
     """
     Run a campaign, write its summary and report, print its errors; return the exit status.
 
     :param make: runs the campaign.
-    :param report: writes ``report.md`` and figures of a summary; returns how many these are.
+    :param report: writes ``report.md`` and the figures of a summary.
     """
     # a request to end is an interrupt: the finished runs are reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -191,9 +191,8 @@ def conclude(seeds: int, folder: Path, make: Callable[[], Campaign],
         'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - begin, 1),
         **campaign.summary()}
     write_figures(folder / 'summary.json', summary)
-    figures = report(campaign, summary)
+    report(campaign, summary)
     for line in campaign.errors:
         print(f'failed: {line}', file=sys.stderr)
-    print(f'wrote {folder}/report.md, summary.json and {figures} in '
-          f'{time.monotonic() - begin:.0f} s')
+    print(f'wrote {folder}/report.md and summary.json in {time.monotonic() - begin:.0f} s')
     return 0 if campaign.complete and not campaign.errors else 1

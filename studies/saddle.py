@@ -44,22 +44,12 @@ WANDER = 0.1  # K of coolant in a second
 FIRST_GUESS = np.array([0.2, 2.0])  # mol/L and K
 # With the coolant from 278 to 305 K a fouled jacket that cools too well cannot be made up for.
 WIDE = InputLimits(np.array([253.15]), np.array([373.15]), np.ones(1))
-QUICK = replace(WIDE, rate=np.full(1, 2.0))
 LAWS = {'mpc': ('mpc', 'sdre'), 'sdre': ('sdre',)}
 PERIODS = (1.0, 5.0, 15.0, 30.0)  # s
 # Set-points in K by the time in s from which they hold; then the jacket fouls.
 COURSE, FOULED, END = {0.0: 350.0, 60.0: 355.0, 500.0: 345.0}, 1000.0, 1600.0
 UA = ReactorParameters().heat_transfer_coefficient
 FOULING = {'heat_transfer_coefficient': 0.85 * UA}
-DISTURBANCES: dict[str, tuple[dict[str, float], InputLimits]] = {
-    'UA -15 %': (FOULING, WIDE),
-    'UA +15 %': ({'heat_transfer_coefficient': 1.15 * UA}, WIDE),
-    'C_Af -10 %': ({'feed_concentration': 0.9}, WIDE),
-    'C_Af +10 %': ({'feed_concentration': 1.1}, WIDE),
-    'T_f -5 K': ({'feed_temperature': 345.0}, WIDE),
-    'T_f +5 K': ({'feed_temperature': 355.0}, WIDE),
-    'UA -20 %': ({'heat_transfer_coefficient': 0.8 * UA}, WIDE),
-    'UA -20 %, coolant at 2 K/s': ({'heat_transfer_coefficient': 0.8 * UA}, QUICK)}
 STARTS, ARRIVAL = 40, 600.0  # s
 
 
@@ -152,18 +142,6 @@ def _gave_up(loop: Simulation) -> bool:
     return bool(loop.failure) or bool({'hold', 'safe'} & set(loop.levels))
 
 
-def disturbed(one: Controller, constants: dict[str, float], seed: int) -> tuple[float, float]:
-    """Change the reactor at 350 K; return the largest and the last mean distance, in K."""
-    x0, u0 = steady(SADDLE_TEMPERATURE)
-    loop = simulate(one, Process(SYSTEM, 0, x0, u0), [
-        at(0.0, Initialisation(u0)),
-        at(0.0, SetpointRequest(0, np.array([SADDLE_TEMPERATURE]))),
-        at(60.0, becomes(reactor(constants)))],
-        duration=ARRIVAL, noise=np.array([0.0, NOISE])[-len(one.measured.names):], seed=seed)
-    away = loop.states[:, 1] - SADDLE_TEMPERATURE
-    return float(np.max(np.abs(away))), abs(float(np.mean(away[-200:])))
-
-
 def lost(one: Controller, seed: int) -> set[int]:
     """Return which of the starts about the steady states do not come to 350 K."""
     found, informed = set(), one.measured.all_states
@@ -210,24 +188,6 @@ def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS,
     return rows
 
 
-def disturbance_rows(models: list[LiftedModel], backend: Backend | None = None
-                     ) -> list[list[str]]:
-    """Return a row for each disturbance: of the lifts, and of the true model fully informed."""
-    def all_of(name: str) -> tuple[list[tuple[float, float]], tuple[float, float]]:
-        constants, limits = DISTURBANCES[name]
-        return [disturbed(controller(model, LAWS['mpc'], limits), constants, seed)
-                for seed, model in enumerate(models)], disturbed(
-            controller(truth(), LAWS['mpc'], limits, informed=True), constants, 0)
-
-    rows = []
-    for name, (own, best) in over(backend, all_of, DISTURBANCES).items():
-        rows.append([name, f'{max(peak for peak, _ in own):.2f}',
-                     f'{max(offset for _, offset in own):.3f}', f'{best[0]:.2f}',
-                     f'{best[1]:.3f}'])
-        print(*rows[-1], sep='\t', file=sys.stderr, flush=True)
-    return rows
-
-
 def main(args: list[str] | None = None) -> int:
     """Learn from several seeds and print the tables."""
     options = read_options(
@@ -251,11 +211,6 @@ def _report(seeds: int, backend: Backend) -> None:
     print(f'{seeds} lifts, 0.1 K of noise, 350 -> 355 -> 345 K, then UA -15 %; coolant '
           f'from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at 1 K/s\n')
     print(table(head, course_rows(models, backend=backend), range(1, len(head))))
-    print('\nDisturbances at 350 K, `mpc`, coolant from 253 to 373 K at 1 K/s: largest distance, '
-          'and mean in the end, in K\n')
-    head = ['disturbance', 'from T alone', 'end', 'true model, full information', 'end']
-    print(table(head, disturbance_rows(models, backend), range(1, len(head))))
-
     print(f'\nOf {STARTS} starts from 335 to 370 K, C_A up to 0.2 mol/L from steady, do not come '
           'to 350 K (coolant from 253 to 373 K):\n')
 

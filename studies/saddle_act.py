@@ -27,7 +27,6 @@ from sensor_msgs.msg import JointState
 from koopman_ros.control import Controller, Initialisation, SetpointRequest, Tuning
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, LIMIT, write_figures
-from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_MINUTE, to_celsius, ZERO_CELSIUS
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import FIRST_STAMP_NS, Operator, Row, running_loop, Scenario
@@ -38,10 +37,9 @@ from koopman_ros.evaluation.simulate import after_a_second, Simulation
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
-from koopman_ros.plants import ControlAffineSystem, Process, steady_state
+from koopman_ros.plants import ControlAffineSystem, Process, sensor_noise, steady_state
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.ros.topics import CONTROLLER_INTERNALS, LOOP_QOS
-from koopman_ros.testing import HarnessError
 from studies.saddle import becomes, controller, FOULING, NOISE, reactor, UA, WANDER, WIDE
 from studies.saddle import truth as true_model
 from studies.unstable import MARGIN, SADDLE_TEMPERATURE
@@ -61,8 +59,6 @@ _ANYWHERE = 10.0  # half-ranges of a trained range
 _LATE = 120  # samples over which an offset is averaged
 _TIMEOUT = 900.0  # s for an experiment or a training
 _PLANT = 'two_state'
-# Of the search for a temperature: steps of it, of an interval, and a difference in K.
-_NEWTON, _STEPS, _CHANGE = 4, 4, 1e-4
 # What an operator has at hand: names, units and ranges of two signals, in K.
 _SIGNALS = {'temperature': (320.0, 375.0),
             'coolant_temperature': (float(WIDE.lower[0]), float(WIDE.upper[0]))}
@@ -118,7 +114,7 @@ def run_seed(folder: Path, seed: int, speed: float) -> dict[str, float | bool]:
             JointState, CONTROLLER_INTERNALS, on_estimate, LOOP_QOS)
         phases = _operate(operator, bags[1], learned)
     model = load(learned)
-    run = _reconstructed(rows, estimates, model, phases)
+    run = _run_of(rows, estimates, model, seed, phases)
     figures = _figures(run, model, dict(phases)['lift'])
     draw(folder / 'saddle.png', run, phases, model, seed)
     return figures
@@ -201,46 +197,29 @@ def _requests() -> Iterator[tuple[float, float, float]]:
         sent = when + 1.0
 
 
-def _reconstructed(rows: list[Row], estimates: Mapping[int, JointState], model: LiftedModel,
-                   phases: list[tuple[str, float]]) -> _Run:
-    """
-    Find the temperatures that the sensor's noise hides, which the concentration shows exactly.
-
-    The plant publishes it without noise; none of the nodes under test listens.
-    """
+def _run_of(rows: list[Row], estimates: Mapping[int, JointState], model: LiftedModel, seed: int,
+            phases: list[tuple[str, float]]) -> _Run:
+    """Return a run; the plant publishes the concentration, to which no node under test listens."""
     seconds = np.array([row.seconds for row in rows])
     setpoints = np.array([row.setpoints.get('temperature', np.nan) for row in rows])
     commands = np.array([row.commanded['coolant_temperature'] for row in rows])
     C, measured = (np.array([row.measured[name] for row in rows])
                    for name in ('concentration', 'temperature'))
-    fouled = int(np.searchsorted(seconds, dict(phases)['fouling']))
-    T = measured.copy()
-    for system, part in ((_usual(), slice(0, fouled)),
-                         (reactor(FOULING), slice(fouled, len(rows) - 1))):
-        later = slice(part.start + 1, part.stop + 1)
-        for _ in range(_NEWTON):
-            here, beside = (_after(system, C[part], T[part] + change, commands[part])
-                            for change in (0.0, _CHANGE))
-            T[part] -= _CHANGE * (here - C[later]) / (beside - here)
-    left = float(np.std(measured - T))
-    if not 0.8 * NOISE < left < 1.2 * NOISE:
-        raise HarnessError(f"the plant's equations leave {left:.3g} K of the record, which has "
-                           f'{NOISE} K of noise')
     found = np.full(len(rows), np.nan)
     for k, second in enumerate(seconds):
         message = estimates.get(FIRST_STAMP_NS + round(second * NANOSECONDS))
         if message is not None:
             found[k] = _concentration(model, dict(zip(message.name, message.position,
                                                       strict=True)))
-    return _Run(seconds, measured, setpoints, commands, np.column_stack([C, T]), fouled, found)
+    return _Run(seconds, measured, setpoints, commands,
+                np.column_stack([C, without_noise(seconds, measured, seed)]),
+                int(np.searchsorted(seconds, dict(phases)['fouling'])), found)
 
 
-def _after(system: ControlAffineSystem, C: Array, T: Array, u: Array) -> Array:
-    """Return concentrations (N,) a sample later, in mol/L."""
-    x, h = np.column_stack([C, T]), 1.0 / system.seconds_per_time_unit / _STEPS
-    for _ in range(_STEPS):
-        x = runge_kutta_step(lambda x: system.derivative(x, u[:, None]), x, h)
-    return x[:, 0]
+def without_noise(seconds: Array, measured: Array, seed: int) -> Array:
+    """Return the true temperatures (N,): the seed gives the noise of each sample."""
+    place = _usual().state_names.index('temperature')
+    return measured - [sensor_noise(NOISE, seed, round(second), place) for second in seconds]
 
 
 def _usual() -> ControlAffineSystem:

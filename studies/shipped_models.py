@@ -20,7 +20,6 @@ from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import LOOPS
 from koopman_ros.learning import IncrementalTraining, train
-from koopman_ros.learning.lift.multistart import Watch
 from koopman_ros.model import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import (
     Actuator,
@@ -34,7 +33,6 @@ from koopman_ros.plants import (
 )
 from koopman_ros.plants.library.heated_line import HeatedLine
 from studies.paper.reactor import SYSTEM, TRAINING, training_samples
-from studies.progress import training_progress
 
 SEED = 2026
 SADDLE = 'two_state_saddle'  # the reactor of two states where it runs away by itself
@@ -110,13 +108,12 @@ def train_lift(name: str, loops: int = LOOPS) -> LiftedModel:
                  seed=SEED, starts=1, loops=loops).model
 
 
-def train_lifts(progress: Watch | None = None, starts: int = STARTS, loops: int = LOOPS
-                ) -> dict[int, LiftedModel]:
+def train_lifts(starts: int = STARTS, loops: int = LOOPS) -> dict[int, LiftedModel]:
     """Train the lifts of the one-state reactor, by n_z; the larger grows from the smaller."""
     # a fixed number of steps: where they end depends least on how a processor rounds
     trained = train(describe(SYSTEM), training_samples(SEED),
                     IncrementalTraining(max(LIFTED_SIZES), tolerance=0.0), seed=SEED,
-                    starts=starts, loops=loops, watch=progress)
+                    starts=starts, loops=loops)
     return {model.n_z: _with_roll_out(model) for model in trained.path
             if model.n_z in LIFTED_SIZES}
 
@@ -140,8 +137,7 @@ def _with_roll_out(model: LiftedModel) -> LiftedModel:
 
 def reactor_models() -> dict[str, LiftedModel]:
     """Train the models of the one-state reactor, by the names of their files."""
-    with training_progress('reactor') as progress:
-        lifts = train_lifts(progress)
+    lifts = train_lifts()
     return {**{f'reactor_nz{n_z}': model for n_z, model in lifts.items()},
             'reactor_linear': linear_model(lifts[max(lifts)])}
 

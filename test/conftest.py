@@ -32,7 +32,7 @@ LONGEST = ('test_browser', 'test_training_node', 'test_demo', 'test_unmeasured_s
            'test_studies', 'test_own_plant', 'test_panel', 'test_partly_measured',
            'test_shipped_models', 'test_classes', 'test_several_states', 'test_parallel',
            'test_examples', 'test_closed_loop_test', 'test_fault_campaign', 'test_replay',
-           'test_disturbance_observer', 'test_fleet', 'test_experiment_tanks', 'test_dead_time',
+           'test_disturbance_observer', 'test_experiment_tanks', 'test_dead_time',
            'test_laws', 'test_controller_process', 'test_processes', 'test_experiment_node',
            'test_benchmarks', 'test_kalman_filters', 'test_simulate', 'test_server', 'test_player',
            'test_closed_loop', 'test_learn', 'test_contained_failures', 'test_model_comparison',

@@ -447,7 +447,7 @@ def _check_node(program: str, arguments: list[str], folder: Path) -> None:
     assert program in (*node_descriptions.PROGRAMS, ANY), program
     namespaces = ['']
     if arguments[:1] == ['--loops']:
-        assert node_descriptions.PROGRAMS[program].many
+        assert node_descriptions.PROGRAMS[program].hosts
         namespaces = (folder / arguments[1]).read_text().split()
         arguments = arguments[2:]
     arguments = [str(folder / one) if one.endswith('.yaml') else one for one in arguments]

@@ -213,7 +213,8 @@ class FallbackLevel:
             count = max(1, math.ceil(gathered / (_MOST_STEPS * step)))
             v = model.inputs.to_deviation(impulse / gathered)
             for _ in range(count):
-                found = self.estimator.advance(estimate, v, gathered / count)
+                found = self.estimator.advance(estimate, v, gathered / count,
+                                               covariance=self.law.reads_covariance)
                 ahead += gathered / count
                 if found is None or not found.finite:
                     raise _NotPredictedError(ahead)

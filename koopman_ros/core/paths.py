@@ -41,12 +41,12 @@ def model_path(model: str) -> Path:
     return config_directory() / 'models' / f'{model}.safetensors'
 
 
-def write_atomically(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes, mode: int = 0o666) -> None:
     """Replace a file; a reader sees the old content or the new, after a loss of power as well."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'{path.name}.',
                                      suffix='.tmp') as folder:
         temporary = Path(folder) / path.name
-        with open(temporary, 'wb') as file:
+        with open(temporary, 'wb', opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

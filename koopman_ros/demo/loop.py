@@ -32,6 +32,8 @@ _START_TIME = 1.0  # s of plant time at the first measurement
 FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)
 _DISCOVERY = 1.0  # s in which the nodes of a domain are found
 _NODES = ('plant', 'controller', 'trainer', 'panel')
+#: what to do if messages are missing in a recording
+BUSY = 'the machine was too busy: end other programs, and run the demo again'
 _TIMEOUT = 30.0  # s for the processes to find each other, and from one command to the next
 
 
@@ -298,16 +300,20 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
              on_row: Callable[[Row], None] = lambda _: None) -> None:
     """Run a loop until the scenario's end, recorded whole by the trainer in a new bag."""
     samples = round(scenario.duration / scenario.sample_period) + 1
-
-    places = [*scenario.wiring.measured.values(), *scenario.wiring.commands.values()]
-
-    def recorded(status: DiagnosticStatus) -> bool:
-        counts = {item.key: item.value for item in status.values}
-        return all(int(counts.get(f'messages on /{place.topic}', 0)) >= samples
-                   for place in places)
+    topics = [place.topic for place in (
+        *scenario.wiring.measured.values(), *scenario.wiring.commands.values())]
 
     with running_loop(scenario, logs, {'output': bag}, on_row) as operator:
+        def missing() -> str:
+            status = operator.harness.last_status('trainer: recording')
+            counts = {} if status is None else {item.key: item.value for item in status.values}
+            lost = {topic: samples - int(counts.get(f'messages on /{topic}', 0))
+                    for topic in topics}
+            return ', '.join(f'{count} of {samples} messages on /{topic}'
+                             for topic, count in lost.items() if count > 0)
+
         operator.run_until(scenario.duration)
         # messages the operator received may still be on their way to the trainer, and are lost
         # with its sender
-        operator.harness.wait_for_status('trainer: recording', recorded)
+        operator.harness.wait_until(lambda: not missing(),
+                                    lambda: f'{bag} lacks {missing()}: {BUSY}')

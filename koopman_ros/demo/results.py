@@ -17,7 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import conversion, NANOSECONDS
-from koopman_ros.demo.loop import FIRST_STAMP_NS
+from koopman_ros.demo.loop import BUSY, FIRST_STAMP_NS
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.records import read_series
 
@@ -68,24 +68,44 @@ def read_signal(bag: Path, place: MessageField, unit: str) -> tuple[Array, Array
 
 
 def read_run(wiring: SignalTopics, *bags: Path) -> DemoRun:
-    """Read the bags of one run, in their order."""
-    stamps: Array = np.empty(0)
+    """
+    Read the bags of one run, in their order.
+
+    :raises ValueError: for a single bag that lacks messages.
+    """
+    stamps: dict[str, Array] = {}
 
     def series(places: Mapping[str, MessageField], units: Mapping[str, str]) -> dict[str, Array]:
-        """Read signals whose messages have the same stamps."""
-        nonlocal stamps
         found = {}
         for name, place in places.items():
             parts = [read_series(bag, replace(place, topic=f'/{place.topic}')) for bag in bags]
-            stamps = np.concatenate([part.stamp_ns for part in parts])
+            stamps[name] = np.concatenate([part.stamp_ns for part in parts])
             found[name] = conversion(place.unit, units[name])(
                 np.concatenate([part.values for part in parts]))
         return found
 
     measured = series(wiring.measured, wiring.signals.states)
-    origin, seconds = stamps[0], (stamps - stamps[0]) / NANOSECONDS
     commanded = series(wiring.commands, wiring.signals.inputs)
-    return DemoRun(seconds, measured, (stamps - origin) / NANOSECONDS, commanded)
+    if len(bags) == 1:
+        _check_complete(bags[0], stamps)
+    measured_ns, commanded_ns = (stamps[next(iter(of))] for of in (measured, commanded))
+    origin = measured_ns[0]
+    return DemoRun((measured_ns - origin) / NANOSECONDS, measured,
+                   (commanded_ns - origin) / NANOSECONDS, commanded)
+
+
+def _check_complete(bag: Path, stamps: Mapping[str, Array]) -> None:
+    """Raise a ValueError if signals that are sampled together lack samples before the last."""
+    found = np.unique(np.concatenate(list(stamps.values())))
+    period = np.diff(found).min(initial=2 ** 62)
+    numbers = {name: np.rint((of - found[0]) / period) for name, of in stamps.items()}
+    # a plant that is stopped gets no answer to its last measurement
+    expected = np.arange(float(np.rint((found[-1] - found[0]) / period)))
+    lost = {name: len(np.setdiff1d(expected, of)) for name, of in numbers.items()}
+    if any(lost.values()):
+        raise ValueError(f'{bag} lacks ' + ', '.join(
+            f'{count} of {len(expected) + 1} samples of {name}'
+            for name, count in lost.items() if count) + f': {BUSY}')
 
 
 def draw_phases(panels: Sequence[Axes], phases: Sequence[tuple[str, float]]) -> None:

@@ -166,9 +166,15 @@ class Estimator(ABC):
         :param u: (n_u,) input that is assumed to hold the plant there, or None.
         """
 
-    def advance(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+    def predict_state(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Predict as :meth:`predict`, which is the default; the covariance may be left out."""
+        return self.predict(estimate, u, seconds)
+
+    def advance(self, estimate: Estimate, u: Array, seconds: float, *, covariance: bool = True
+                ) -> Estimate | None:
         """Predict as :meth:`predict`; states that are commands are those of `u` at once."""
-        return self.predict(with_commands(self.model, estimate, u), u, seconds)
+        predict = self.predict if covariance else self.predict_state
+        return predict(with_commands(self.model, estimate, u), u, seconds)
 
     def predict_over(self, estimate: Estimate, pieces: Iterable[tuple[float, Array]],
                      rate: Array | None) -> Estimate | None:

@@ -177,8 +177,7 @@ class ExtendedKalmanFilter(Estimator):
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model, and the covariance with it; see :class:`Estimator`."""
-        duration = seconds / self.model.seconds_per_time_unit
-        steps = max(1, math.ceil(duration * float(np.max(self._rates)) / _STEP_SHARE))
+        h, steps = self._steps(seconds)
         if steps > _MAX_STEPS:
             return None
         n = self.model.n_x
@@ -186,10 +185,26 @@ class ExtendedKalmanFilter(Estimator):
              else estimate.covariance).copy()
         # the disturbance wanders first, and then stays for the interval
         P[n:, n:] += seconds * self._intensity
-        x, P = self._propagated(estimate.x, estimate.w, P, u, duration / steps, steps)
+        x, P = self._propagated(estimate.x, estimate.w, P, u, h, steps)
         if not np.all(np.diag(P)[:n] <= self._lost):
             return None
         return replace(estimate, x=x, covariance=0.5 * (P + P.T))
+
+    def predict_state(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Integrate the model alone; None where the state is lost."""
+        h, steps = self._steps(seconds)
+        if steps > _MAX_STEPS:
+            return None
+        x, rate = estimate.x, self.model.rate_under(u, estimate.w)
+        for _ in range(steps):
+            x = runge_kutta_step(rate, x, h)
+        return replace(estimate, x=x, covariance=None) if np.all(x * x <= self._lost) else None
+
+    def _steps(self, seconds: float) -> tuple[float, int]:
+        """Return the duration of a step of integration, in time units, and their number."""
+        duration = seconds / self.model.seconds_per_time_unit
+        steps = max(1, math.ceil(duration * float(np.max(self._rates)) / _STEP_SHARE))
+        return duration / steps, steps
 
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:

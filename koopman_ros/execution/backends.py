@@ -41,7 +41,7 @@ class Backend(ABC):
 
     @abstractmethod
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never_stop, apart: bool = False) -> Generator[tuple[str, Found]]:
+            watch: Watch = never_stop) -> Generator[tuple[str, Found]]:
         """
         Yield the name and the result of each task, in the order of the items.
 
@@ -53,7 +53,6 @@ class Backend(ABC):
         :param function: of the shared value, an item, and the progress callback.
         :param items: by the names of their tasks.
         :param shared: sent to each worker once.
-        :param apart: whether exceptions are yielded as results instead of raised.
         :raises WorkerLost: when the workers of a task died repeatedly.
         :raises SchedulerLost: when the scheduler does not answer any more.
         """
@@ -72,7 +71,7 @@ class Serial(Backend):
     """Run one task after the other in this process."""
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never_stop, apart: bool = False) -> Generator[tuple[str, Found]]:
+            watch: Watch = never_stop) -> Generator[tuple[str, Found]]:
         """Run tasks, see :meth:`Backend.run`."""
         ended = False
 
@@ -85,14 +84,11 @@ class Serial(Backend):
             return tell
 
         for name, item in items.items():
-            found: Any
             try:
                 found = function(shared, item, telling(name))
             except Exception as error:
                 error.add_note(f'in {name}')
-                if not apart:
-                    raise
-                found = error
+                raise
             yield name, found
             if ended:
                 return

@@ -58,7 +58,7 @@ class _Pool(Backend):
     """Tasks on workers, whose executor and messages the subclasses provide."""
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never_stop, apart: bool = False) -> Generator[tuple[str, Found]]:
+            watch: Watch = never_stop) -> Generator[tuple[str, Found]]:
         """Run tasks, see :meth:`Backend.run`."""
         names, ready, following = list(items), dict[int, Any](), 0
         with contextlib.closing(self._completed(
@@ -66,8 +66,7 @@ class _Pool(Backend):
             for number, found in completed:
                 if isinstance(found, Exception):
                     found.add_note(f'in {names[number]}')
-                    if not apart:
-                        raise found
+                    raise found
                 ready[number] = found
                 while following in ready:
                     yield names[following], ready.pop(following)

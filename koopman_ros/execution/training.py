@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import json
 import queue
 import signal
@@ -29,22 +29,15 @@ class JobState:
     text: str = 'starting'  #: the present stage, or the result
     ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
-    #: those of a fleet that have ended, by name
-    plants: Mapping[str, JobState] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
-        """Whether there is a new lift that may be used, or one of each plant."""
-        if self.plants:
-            return all(one.accepted for one in self.plants.values())
+        """Whether there is a new lift that may be used."""
         return bool(self.summary and self.summary['accepted'])
 
     @property
     def rejected(self) -> bool:
-        """Whether a lift was learned or tried and does not suffice, of a fleet the worst one."""
-        if self.plants:
-            return not self.accepted and all(
-                one.accepted or one.rejected for one in self.plants.values())
+        """Whether a lift was learned or tried and does not suffice."""
         return bool(self.summary and not self.summary['accepted'])
 
 
@@ -69,11 +62,7 @@ class TrainingProgress:
 
 
 class TrainingJob(Job):
-    """
-    A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`.
-
-    Of a fleet with ``plants``, such fields by name, and ``executor``.
-    """
+    """A training in a child process, of fields of :class:`koopman_ros.learning.TrainingTask`."""
 
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()
@@ -101,20 +90,9 @@ class TrainingJob(Job):
         except ValueError:
             # cut off when the process was killed, or printed by a library
             return self.state
-        if 'plant' in said:
-            plants = {**self.state.plants, said['plant']: self._conclusion(said)}
-            return replace(self.state, plants=plants)
         if 'progress' in said:
             return replace(self.state, share=said['progress'],
                            text=said['text'] or self.state.text)
-        if 'ended' in said:
-            accepted = sum(one.accepted for one in self.state.plants.values())
-            return replace(self.state, share=1.0, ended=True, text=(
-                f'{accepted} of {len(self.state.plants)} new models are accepted'))
-        return self._conclusion(said)
-
-    def _conclusion(self, said: Mapping[str, Any]) -> JobState:
-        """Return the state by the last line of a training."""
         if 'summary' in said:
             return JobState(1.0, outcome_text(said['summary']), True, said['summary'])
         if 'stopped' in said:

@@ -9,7 +9,6 @@ From records of a plant to an accepted model; in torch, never in a node.
 
 from koopman_ros.learning.acceptance import AcceptanceResult, evaluate_model, Thresholds
 from koopman_ros.learning.drift_sampling import compare_classes, drift_samples, learn_lift
-from koopman_ros.learning.fleet import retrain_fleet, TrainingOutcome
 from koopman_ros.learning.free_run import FreeRun, simulate
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.edmd import Edmd, Linearisation
@@ -33,6 +32,6 @@ from koopman_ros.learning.task import TrainingTask
 __all__ = ['AcceptanceResult', 'Algorithm1', 'ClassComparison', 'Edmd', 'Fit', 'FreeRun',
            'IncrementalTraining', 'Judge', 'LiftMetrics', 'Linearisation', 'ModelCandidate',
            'MultistartProgress', 'NeuralDrift', 'Retrained', 'Thresholds', 'Trained',
-           'TrainingFailed', 'TrainingOutcome', 'TrainingTask', 'compare', 'compare_classes',
-           'drift_samples', 'evaluate', 'evaluate_model', 'fit', 'learn_lift', 'retrain',
-           'retrain_fleet', 'rollout_rmse', 'simulate', 'train', 'write_report']
+           'TrainingFailed', 'TrainingTask', 'compare', 'compare_classes', 'drift_samples',
+           'evaluate', 'evaluate_model', 'fit', 'learn_lift', 'retrain', 'rollout_rmse',
+           'simulate', 'train', 'write_report']

@@ -51,7 +51,7 @@ from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.learning.record import read_record, RecordSource, reduced, TrainingRecord
 from koopman_ros.learning.retrained import Retrained
-from koopman_ros.learning.task import FIRST, resolve_signals, TrainingTask
+from koopman_ros.learning.task import resolve_signals, TrainingTask
 from koopman_ros.model import LiftedModel, load, LONGEST_DEAD_TIME, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.plants import plant_class
@@ -300,8 +300,8 @@ def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, 
     """Say that a free run diverges, or is clearly worse on the test record than a linear one."""
     for name, own in runs.items():
         linear, test = others[LINEAR_MODEL][name], name == 'test'
-        # that of an unstable plant diverges by any model
-        if own.diverged and (test or not others[DRIFT][name].diverged):
+        # that of an unstable plant leaves the measured range by any model, if not for infinity
+        if own.diverged and (test or np.isnan(others[DRIFT][name].leaves)):
             yield (f'its free run of the {"test " * test}record diverges: from {own.leaves:.4g} '
                    f'{own.plant.time_unit} on it errs by more than the measured range')
         elif test and np.mean(linear.fit) > np.mean(own.fit) + _LESS_FIT:
@@ -325,9 +325,6 @@ def _checked(task: TrainingTask) -> Thresholds:
                          f'{", ".join((*CLASSES, BEST, SAME))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
-    if task.warm_start_model == FIRST:
-        raise ValueError(f'warm_start_model = {FIRST!r} means the first model of a fleet: retrain '
-                         'several plants in one call, or name a model file')
     return Thresholds(task.margin, task.condition)
 
 

@@ -21,8 +21,6 @@ from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.model_classes import SAME
 from koopman_ros.records import RecordedInput, RecordedState
 
-#: As a task's sibling, in a fleet: the first plant of its kind whose lift is accepted.
-FIRST = 'first'
 MOST_SAMPLES = 20_000  # more cost more time, and tell less and less
 
 
@@ -86,7 +84,6 @@ class TrainingTask:
     #: where it is worked, see :func:`~koopman_ros.execution.backend_of`
     executor: str = ''
     #: file of a lift of a plant of the same kind, which training begins from; empty for nothing.
-    #: In a fleet also ``'first'``, see :func:`~koopman_ros.learning.fleet.retrain_fleet`.
     warm_start_model: str = ''
     device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 

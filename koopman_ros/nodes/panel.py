@@ -7,10 +7,8 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
-import math
 from pathlib import Path
 import sys
-import threading
 import time
 from typing import Any
 
@@ -43,12 +41,10 @@ from koopman_ros.panel.snapshot import (
     TRAINING,
 )
 from koopman_ros.panel.training_report import Learning
-from koopman_ros.panel.trend_backfill import backfill, read_past
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import wall_timer
@@ -104,10 +100,8 @@ class PanelNode(LoopNode):
         self._repeated = RepeatedValues(self)
         self._training_ranges: dict[str, Range] = {}
         self._model: dict[str, str] = {}
-        self._past: threading.Thread | None = None
         self._watch = LearningWatch(settings.system, wiring, self.get_namespace(),
                                     self.resolve_topic_name)
-        self._ended = threading.Event()
         self._subscribe()
         self._operator_actions = self._matching.publish(topics.AUDIT_LOG)
         self._nodes = {role: RemoteNode(
@@ -173,13 +167,10 @@ class PanelNode(LoopNode):
 
     def complete(self) -> None:
         """Stop the pages, and save the alarms."""
-        self._ended.set()
         self._watch.complete()
         self._server.stop()
         if self._store is not None:
             self._store.close()
-        if self._past is not None:
-            self._past.join(_REMOTE_PERIOD)
 
     # For the pages; called from their thread.
 
@@ -240,25 +231,7 @@ class PanelNode(LoopNode):
                 self._watch.training(
                     values, str(self.snapshot.parameter(TRAINER, 'model_output') or ''))
             elif name == RECORDING:
-                bag = values.get('bag', '')
-                self._watch.recording(bag)
-                first = self.snapshot.time
-                if bag and self._past is None and not math.isnan(first):
-                    self._past = threading.Thread(
-                        target=self._read_past, args=(bag, first), daemon=True)
-                    self._past.start()
-
-    def _read_past(self, bag: str, first: float) -> None:
-        """Add the trends from before the panel; called in a thread of its own."""
-        try:
-            past = read_past(bag, self._wiring, self.view.read, self.resolve_topic_name,
-                             self.settings.span, self._ended.is_set)
-        except (OSError, BagReadError) as error:
-            self.get_logger().warning(
-                f'Trend history before start-up is not available: {error}')
-            return
-        if not self._ended.is_set():
-            backfill(self.view, past, first)
+                self._watch.recording(values.get('bag', ''))
 
     def _on_event(self, event: ParameterEvent) -> None:
         for node in self._nodes.values():

@@ -12,7 +12,6 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table, TrainerParameters
 from koopman_ros.ros import topics
 from koopman_ros.ros.experiment import PlantExperiment
-from koopman_ros.ros.fleet import run_fleet
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import run
 from koopman_ros.ros.recording import Recording
@@ -97,8 +96,8 @@ class TrainerNode(ManagedNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the trainer node, or with ``--loops`` the retraining of many plants."""
-    return run('trainer', TrainerNode, args, run_fleet)
+    """Run the trainer node."""
+    return run('trainer', TrainerNode, args)
 
 
 if __name__ == '__main__':

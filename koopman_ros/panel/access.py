@@ -25,7 +25,8 @@ import unicodedata
 from argon2 import extract_parameters, PasswordHasher
 from argon2.exceptions import Argon2Error, InvalidHashError
 
-from koopman_ros.panel.files import read_bounded, replacing
+from koopman_ros.core.paths import write_atomically
+from koopman_ros.panel.files import read_bounded
 
 MAX_FILE = 256 * 1024  # bytes
 MIN_PASSWORD = 8  # characters
@@ -146,12 +147,11 @@ def write_user(path: str | os.PathLike[str], name: str, role: Role, secret: str)
     kept = [line for line in lines if normalised(line.partition(':')[0].strip()) != name]
     content = '\n'.join([*kept, line]) + '\n'
     _parsed(content, path)
-    with replacing(target) as file:
-        file.write(content)
-        if owner is not None:
-            # an administrator may change the file of the account that runs the panel
-            with contextlib.suppress(PermissionError):
-                os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
+    write_atomically(target, content.encode(), 0o600)
+    if owner is not None:
+        # an administrator may change the file of the account that runs the panel
+        with contextlib.suppress(PermissionError):
+            os.chown(target, owner.st_uid, owner.st_gid)
 
 
 def _read(path: str | os.PathLike[str]) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 import re
 from typing import Any
 
+from koopman_ros.core.paths import write_atomically
 from koopman_ros.panel.alarms import (
     Alarm,
     AlarmLogEntry,
@@ -21,21 +22,20 @@ from koopman_ros.panel.alarms import (
     MAX_WHO,
     Priority,
 )
-from koopman_ros.panel.files import read_bounded, replacing, sanitize_text
+from koopman_ros.panel.files import read_bounded, sanitize_text
 
 VERSION = 1
 _MAX_BYTES = 32 * 2 ** 20
 _INTERVAL = 5.0  # s between two writes
 _BEGIN = re.compile(rb'\{\s*"version":\s*\d+,\s*"alarms":\s*\[')  # of a file of alarms
 _EVENTS = ('raised', 'returned', 'acknowledged', 'shelved', 'unshelved')
-_Identity = tuple[int, int, int, int]  # device, inode, time of writing in ns, bytes
 
 
 class AlarmStore:
     """
     Loads alarms from a file, and saves their changes.
 
-    A file that no panel wrote is never replaced, neither at the start nor later.
+    A file that no panel wrote is not replaced.
 
     :param path: of the file, which may be missing or empty.
     :param now: wall time.
@@ -48,13 +48,11 @@ class AlarmStore:
         # a link stays one
         self._alarms, self._path = alarms, Path(os.path.realpath(path))
         self._saved, self._due = alarms.noted, now
-        self._own: _Identity | None = None  # of the file as it was saved or loaded
         self.complaint = ''
         if self._path.exists():
             content, _ = read_bounded(self._path, _MAX_BYTES)
             if content.strip():
                 self._load(content, now)
-            self._own = _identity(self._path)
         self._save()
 
     def _load(self, content: bytes, now: float) -> None:
@@ -64,9 +62,8 @@ class AlarmStore:
             self._alarms.restore(*_parsed(content.decode()), now)
         except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError,
                 RecursionError) as error:
-            aside = _unused(self._path)
-            # fails if there is one by now
-            os.link(self._path, aside)
+            aside = self._path.with_name(f'{self._path.name}.damaged')
+            os.replace(self._path, aside)
             self.complaint = (f'the alarms of {self._path} are not loaded, because the file is '
                               f'damaged ({error}): it is kept as {aside}')
 
@@ -86,33 +83,14 @@ class AlarmStore:
         content = {'version': VERSION, 'alarms': [asdict(one) for one in self._alarms.all],
                    'journal': [asdict(one) for one in self._alarms.journal(-math.inf)[::-1]]}
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(self._path) as file:
-            file.write(json.dumps(content, indent=2, allow_nan=False, default=_name) + '\n')
-            file.flush()
-            saved = _identity(file.fileno())
-            if self._path.exists() and _identity(self._path) != self._own:
-                raise FileExistsError(f'another program has changed {self._path}, so it is not '
-                                      'replaced: give each panel its own alarm_file')
-        self._own = saved
+        text = json.dumps(content, indent=2, allow_nan=False, default=_name) + '\n'
+        write_atomically(self._path, text.encode(), 0o600)
 
 
 def _name(value: Any) -> str:
     if isinstance(value, Enum):
         return value.name
     raise TypeError(f'{value!r} is not saved')
-
-
-def _identity(of: Path | int) -> _Identity:
-    found = os.stat(of)
-    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
-
-
-def _unused(path: Path) -> Path:
-    """Return an unused name in the folder of a file."""
-    number, found = 1, path.with_name(f'{path.name}.damaged')
-    while os.path.lexists(found):
-        number, found = number + 1, path.with_name(f'{path.name}.damaged{number + 1}')
-    return found
 
 
 def _parsed(text: str) -> tuple[list[Alarm], list[AlarmLogEntry]]:

@@ -1,15 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text and files: bounded when they are read, and replaced as a whole."""
+"""Text and files, bounded when they are read."""
 
-from collections.abc import Iterator
-import contextlib
 import os
 from pathlib import Path
 import stat
-import tempfile
-from typing import TextIO
 
 
 def sanitize_text(text: str, longest: int) -> str:
@@ -39,20 +35,6 @@ def read_bounded(path: Path, most: int) -> tuple[bytes, os.stat_result]:
     if len(content) > most:
         raise ValueError(f'{path} has more than {most} bytes')
     return content, about
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[TextIO]:
-    """Return a new file of mode 0600, which replaces a file at the end of the block."""
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix='.part')
-    try:
-        with os.fdopen(descriptor, 'w', encoding='utf-8') as file:
-            yield file
-            file.flush()
-            os.fsync(descriptor)
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def _check_regular(about: os.stat_result, path: Path) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 import tempfile
+import threading
 import time
 
 import yaml
@@ -45,13 +46,21 @@ class LearningWatch:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._cancelled = False
         self._read: object = None  # the report that was read last
+        self._reader: threading.Thread | None = None
 
     def training(self, values: Mapping[str, str], output: str) -> None:
         """Take the figures of the trainer's status, and the file of its next model."""
         trained = values if 'accepted' in values else {}
         self._model_file = trained.get('model_file', '')
-        if (base := report_base(self._model_file or output)) is None:
-            return
+        base = report_base(self._model_file or output)
+        # a disk that does not answer must not stop the pages; the status is repeated
+        if base is not None and (self._reader is None or not self._reader.is_alive()):
+            self._reader = threading.Thread(
+                target=self._follow, args=(base, trained), daemon=True)
+            self._reader.start()
+
+    def _follow(self, base: Path, trained: Mapping[str, str]) -> None:
+        """Read a report if it has changed; called in a thread of its own."""
         found = base, trained, report_time(base)
         # a trainer that has not trained yet has no report
         if found != self._read and (trained or found[2]):

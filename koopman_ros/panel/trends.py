@@ -11,7 +11,6 @@ import math
 import threading
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.panel.files import sanitize_text
@@ -88,7 +87,11 @@ class _RecordedPen:
             # double the room, and drop the values that are too old
             kept = int(np.searchsorted(self.times, self.last - self._span))
             room = min(2 * (len(self.times) - kept), self._points + self._points // 4)
-            self._put(self.times[kept:], self.values[kept:], room)
+            times, values = self.times[kept:], self.values[kept:]
+            size = max(room, len(times) + _FIRST_ROOM)
+            self._times, self._values = np.empty(size), np.empty(size)
+            self._times[:len(times)], self._values[:len(values)] = times, values
+            self._begin, self._end = 0, len(times)
         self._times[self._end], self._values[self._end] = time, value
         self._end += 1
         self._begin = max(self._begin, self._end - self._points)
@@ -96,19 +99,6 @@ class _RecordedPen:
     def cut(self, time: float) -> None:
         """Drop the values at a time and later."""
         self._end = self._begin + int(np.searchsorted(self.times, time))
-
-    def prepend(self, times: Array, values: Array) -> None:
-        """Add values before the first one."""
-        new = times < (self._times[self._begin] if self._end > self._begin else math.inf)
-        self._put(np.concatenate((times[new], self.times))[-self._points:],
-                  np.concatenate((values[new], self.values))[-self._points:])
-
-    def _put(self, times: Array, values: Array, room: int = 0) -> None:
-        size = max(room, len(times) + _FIRST_ROOM)
-        new_times, new_values = np.empty(size), np.empty(size)
-        new_times[:len(times)], new_values[:len(values)] = times, values
-        self._begin, self._end = 0, len(times)
-        self._times, self._values = new_times, new_values
 
 
 class Trends:
@@ -139,16 +129,6 @@ class Trends:
         """Append a value to a pen."""
         with self._lock:
             self._pen(pen).add(time, value if math.isfinite(value) else math.nan)
-
-    def prepend(self, pen: str, times: ArrayLike, values: ArrayLike) -> None:
-        """
-        Add the past of a pen, before its first value.
-
-        :param times: shape (k,), rising.
-        :param values: shape (k,).
-        """
-        with self._lock:
-            self._pen(pen).prepend(np.asarray(times, np.float64), np.asarray(values, np.float64))
 
     def mark(self, time: float, kind: str, text: str) -> None:
         """Add an event; too many of a kind drop its oldest."""

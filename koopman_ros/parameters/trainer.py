@@ -55,7 +55,6 @@ from koopman_ros.parameters.signal_topics import (
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
-FIRST = 'first'  # as `warm_start_model`, the first plant of a fleet whose lift is accepted
 
 
 @dataclass(frozen=True)
@@ -163,8 +162,7 @@ class TrainerParameters(SignalParameters):
         1_000_000)
     warm_start_model: str = parameter(
         '', 'Model of a similar plant from which the training starts: a bundled model by name, or '
-        'the path of a model file; first (with --loops): the first accepted model of the fleet; '
-        'empty: none.')
+        'the path of a model file; empty: none.')
     executor: str = parameter(
         '', 'Back end of the training. Empty: one process; joblib: one process per core; '
             'joblib:N: N processes; tcp://host:port: the workers of a Dask '

@@ -88,7 +88,6 @@ def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
 
 
 _NAMES = ('plant', 'controller', 'trainer', 'player', 'replay', 'panel')
-_HOSTS = 'runs one node in each'
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ class Program:
     subscribes: tuple[str, ...] = ()  #: topics; /clock where it follows simulated time
     serves: tuple[str, ...] = ()  #: services
     calls: tuple[str, ...] = ()  #: services of others
-    many: str = ''  #: clause about its action with ``--loops``
+    hosts: bool = False  #: whether it runs many loops with ``--loops``
 
 
 def _wiring(given: Mapping[str, Any]) -> tuple[SignalTopics, tuple[str, ...]]:
@@ -132,7 +131,7 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                        topics.CLOCK,
                        topics.DIAGNOSTICS, _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
-            serves=('~/reset', *lifecycle, *STANDARD_SERVICES), many=_HOSTS),
+            serves=('~/reset', *lifecycle, *STANDARD_SERVICES), hosts=True),
         'controller': Program(
             'Commands the inputs at each measurement, with a learned model.',
             publishes=(*topics_of('commands', 'active_setpoints', 'predicted'),
@@ -143,17 +142,16 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                                    'setpoints', 'manual'), topics.CLOCK),
             serves=('~/set_automatic', '~/clear_safe_state', '~/reload_model', *lifecycle,
                     *STANDARD_SERVICES),
-            many=_HOSTS),
+            hosts=True),
         'trainer': Program(
             'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
-            f'{Program.codes}; with task:=train or --loops 0 for an accepted model, 2 for a '
-            'rejected one, 1 for a failure; of several, the worst',
+            f'{Program.codes}; with task:=train 0 for an accepted model, 2 for a rejected one, 1 '
+            'for a failure',
             publishes=(*topics_of('commands', 'manual', 'setpoints'), topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*dict.fromkeys((*wiring.topics, *recorded)), topics.CLOCK),
             serves=('~/record', '~/experiment', '~/train', '~/cancel_training', *lifecycle,
-                    *STANDARD_SERVICES),
-            many='trains the plant of each from its bags, then exits'),
+                    *STANDARD_SERVICES)),
         'player': Program(
             'Plays the measurements and set-points of a bag, in recorded time or in lock-step '
             'with a controller.',
@@ -255,10 +253,10 @@ def help_text(name: str, given: Mapping[str, Any] = MappingProxyType({})) -> str
             ('subscribes to', program.subscribes), ('publishes', program.publishes),
             ('serves', program.serves))
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
-    called = f'{name} [--loops file]' if program.many else name
+    called = f'{name} [--loops file]' if program.hosts else name
     many = '\n' + _filled(
-        f'--loops reads a file with one namespace per line, and {program.many}. Parameters are '
-        f'given by the full name of a node, e.g. /line_1/reactor_3/{name}.', '') + '\n'
+        '--loops reads a file with one namespace per line, and runs one node in each. Parameters '
+        f'are given by the full name of a node, e.g. /line_1/reactor_3/{name}.', '') + '\n'
     other = '' if name == 'replay' else (
         f'For another system: {name} --help --ros-args -p system:=NAME\n')
     parameters = '\n'.join(_help_row(row) for row in table.rows.values())
@@ -266,7 +264,7 @@ def help_text(name: str, given: Mapping[str, Any] = MappingProxyType({})) -> str
 usage: ros2 run koopman_ros {called} [--ros-args [-p name:=value ...] [--params-file file] ...]
 
 {program.does}
-{many * bool(program.many)}
+{many * program.hosts}
 {lists}{_filled(f'exit codes: {program.codes}')}
 
 Parameters, with the defaults of the system {system!r}. A file of those of the {DEFAULT_SYSTEM}:

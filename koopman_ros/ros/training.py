@@ -23,13 +23,13 @@ from koopman_ros.execution.training import (
 )
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.signal_topics import plant_defaults, SignalTopics, system_of
-from koopman_ros.parameters.trainer import FIRST, TrainerParameters
+from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode
 
-POLL_PERIOD = 0.1  # s between two looks at a training
+_POLL_PERIOD = 0.1  # s between two looks at a training
 
 
 def current_model(given: Mapping[str, Any]) -> LiftedModel | None:
@@ -54,8 +54,7 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: SignalTopic
         'bags': [os.path.abspath(bag) for bag in bags],
         'output': os.path.abspath(settings.model_output),
         'model': file(settings.model), 'plant': settings.system,
-        'warm_start_model': (FIRST if settings.warm_start_model == FIRST
-                             else file(settings.warm_start_model)),
+        'warm_start_model': file(settings.warm_start_model),
         'states': [{'name': name, 'unit': unit, 'place': found(wiring.measured[name])}
                    for name, unit in states.items()],
         'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
@@ -85,7 +84,7 @@ class Training:
         self._diagnostics = node.diagnostics.add('training', self._status)
         node.create_service(Trigger, '~/train', self._on_train)
         node.create_service(Trigger, '~/cancel_training', self._on_cancel)
-        self._timer = wall_timer(node, POLL_PERIOD, self._on_poll, autostart=False)
+        self._timer = wall_timer(node, _POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
         """Start a training, return a message; ValueError without a bag, OSError of the system."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from koopman_ros.testing import deferred_interrupt
 from studies.faults import report
-from studies.faults.case import FaultCase, LoopTrace
+from studies.faults.case import FaultCase
 from studies.faults.cases import CASES
 from studies.faults.endurance import DAYS, HOURS, run_endurance
 from studies.faults.harness import run
@@ -53,14 +53,12 @@ def main(args: list[str] | None = None) -> int:
 
 def _run(cases: Sequence[FaultCase], days: Sequence[str], hours: float, folder: Path) -> int:
     results: dict[str, dict[str, Any]] = {}
-    traces: dict[str, LoopTrace] = {}
     endured: dict[str, dict[str, Any]] = {}
     try:
         with deferred_interrupt() as check:
             for number, case in enumerate(cases, 1):
                 print(f'[{number:2d}/{len(cases)}] {case.name:49s}', end='', flush=True)
-                results[case.name], traces[case.name] = run(
-                    case, folder / 'logs' / case.name, check)
+                results[case.name], _ = run(case, folder / 'logs' / case.name, check)
                 print(report.line(results[case.name]), flush=True)
                 report.write(folder, results)
             for name in days:
@@ -69,7 +67,7 @@ def _run(cases: Sequence[FaultCase], days: Sequence[str], hours: float, folder: 
     except KeyboardInterrupt:
         print(f'\ninterrupted; the finished cases are in {folder}', file=sys.stderr)
         return 130
-    survived = report.write(folder, results, endured, traces)
+    survived = report.write(folder, results, endured)
     print(f'\n{sum(result["survived"] for result in results.values())} of {len(results)} cases '
           f'survived ({report.by_plant(results)}); see {folder / "report.md"}')
     return 0 if survived else 1

@@ -5,12 +5,12 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+import contextlib
 import itertools
 import math
 import re
 import sys
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -122,7 +122,7 @@ def _records(trace: LoopTrace, case: FaultCase) -> Iterator[str]:
         records = [(seconds, parse(text)) for seconds, text in trace.records]
         # as the controller was; a module that found the packages before would find them again
         missing = (*case.missing, _PLANNER) if case.missing else ()
-        with patch.dict(sys.modules, dict.fromkeys(missing)):
+        with _without(missing):
             found = replay_records(record for _, record in records)
     except RecordError as error:
         yield f'its records cannot be replayed: {error}'
@@ -138,6 +138,20 @@ def _records(trace: LoopTrace, case: FaultCase) -> Iterator[str]:
                f'{wrong[0]} ns')
     for lost in found.lost:
         yield f'records {lost.first} to {lost.last} are missing'
+
+
+@contextlib.contextmanager
+def _without(modules: Sequence[str]) -> Iterator[None]:
+    """Let some modules be missing, and keep all others that are imported meanwhile."""
+    before = {name: sys.modules.get(name) for name in modules}
+    sys.modules.update(dict.fromkeys(modules))  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        for name, module in before.items():
+            del sys.modules[name]
+            if module is not None:
+                sys.modules[name] = module
 
 
 def responses(delivered: Sequence[int], answers: Sequence[int]) -> dict[str, int]:

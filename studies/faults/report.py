@@ -1,35 +1,24 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report of the campaign: a page and a picture for people, figures for programs."""
-
-from __future__ import annotations
+"""The report of the campaign: a page for people, figures for programs."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
 import math
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from koopman_ros.core import plots
-from studies.faults.case import LoopTrace
 from studies.faults.plants import PLANTS
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-# Drawn, because they tell most.
-TELLING = ('nan-long', 'bias', 'feed-warm', 'controller-killed-in-a-step', 'plant-reset',
-           'actuator-saturated', 'two_tanks-silent-one', 'quadruple_tank-frozen-one')
-_BEFORE, _AFTER = 30.0, 300.0  # s around the fault
 _HEAD = ('case', 'fault', 'worst error', 'worst step', 'back after [s]', 'left', '')
 
 
 def write(folder: Path, results: Mapping[str, dict[str, Any]],
-          runs: Mapping[str, dict[str, Any]] | None = None,
-          traces: Mapping[str, LoopTrace] | None = None) -> bool:
+          runs: Mapping[str, dict[str, Any]] | None = None) -> bool:
     """
-    Write a page, figures and, where traces are given, a picture of all cases so far.
+    Write a page and figures of all cases so far.
 
     :return: whether every case that could be tried was survived, and every endurance run.
     """
@@ -39,9 +28,7 @@ def write(folder: Path, results: Mapping[str, dict[str, Any]],
         'skipped': sum('skipped' in result for result in results.values()),
         'results': results, **(runs or {})}
     plots.write_figures(folder / 'summary.json', figures)
-    drawn = _draw(traces or {}, folder / 'cases.png')
-    plots.write_page(folder / 'report.md', 'Fault campaign', [
-        *_sections(figures), *(['![Some of the cases](cases.png)'] if drawn else [])])
+    plots.write_page(folder / 'report.md', 'Fault campaign', _sections(figures))
     return figures['survived'] + figures['skipped'] == len(results) and all(
         run['survived'] for run in (runs or {}).values())
 
@@ -118,43 +105,3 @@ def _endurance_sections(name: str, run: dict[str, Any]) -> Iterator[str]:
     yield plots.table(
         ('process', 'memory at first [MB]', 'at last [MB]', 'growth when warm [MB]'),
         ((name, *seen.values()) for name, seen in run['memory_MB'].items()), (1, 2, 3))
-
-
-def _draw(traces: Mapping[str, LoopTrace], path: Path) -> bool:
-    """Draw the first controlled state and the first input of telling cases, if there are any."""
-    shown = {name: trace for name in TELLING if (trace := traces.get(name)) is not None
-             and trace.commands and math.isfinite(trace.end)}
-    if shown:
-        with plots.drawing(path, 2, len(shown), size=(3.2 * len(shown), 5.2),
-                           sharex='col') as (_, panels):
-            for upper, lower, name in zip(panels, panels[len(shown):], shown, strict=False):
-                _draw_case(upper, lower, shown[name])
-                upper.set_title(name, fontsize='medium')
-            for panel in (panels[0], panels[len(shown)]):
-                panel.legend(fontsize='small')
-    return bool(shown)
-
-
-def _draw_case(upper: Axes, lower: Axes, trace: LoopTrace) -> None:
-    on = trace.on
-    state = on.controlled[0]
-    times = [seconds for seconds, _ in trace.samples]
-    true = [states[on.states.index(state)] for _, states in trace.samples]
-    since, wanted = zip(*((seconds, values[0]) for seconds, values in trace.setpoints),
-                        strict=True)
-    upper.plot(times, true, label='true')
-    upper.step([*since, times[-1]], [*wanted, wanted[-1]], where='post', linestyle='--',
-               color='black', linewidth=1.0, label='set-point')
-    lower.plot([command.seconds for command in trace.commands],
-               [command.values[0] for command in trace.commands], label='command')
-    plots.draw_limits(lower, on.range(on.inputs[0]), 'limits')
-    for axes, name, unit in zip((upper, lower), (state, on.inputs[0]), on.shown_units,
-                                strict=True):
-        axes.set_ylabel(f'{name} [{unit}]')
-        axes.axvspan(trace.begin, max(trace.end, trace.begin + 2.0), alpha=0.2,
-                     color='tab:red', linewidth=0.0, label='fault')
-    near = [*wanted, *(value for seconds, value in zip(times, true, strict=True)
-                       if seconds > trace.begin - _BEFORE)]
-    upper.set(xlim=(trace.begin - _BEFORE, min(trace.end + _AFTER, times[-1])),
-              ylim=(min(near) - 2.0 * on.band, max(near) + 2.0 * on.band))
-    lower.set_xlabel('plant time [s]')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the study (needs the `train`, `demo` and `bench` requirements): report and figure."""
+"""Run the study (needs the `train`, `demo` and `bench` requirements): report."""
 
 import sys
 
@@ -27,11 +27,8 @@ def main(args: list[str] | None = None) -> int:
                     f'{coordinates.PLACE}/{name}' for name in names)}, options.scheduler))
         return campaign
 
-    def report(_: Campaign, summary: dict[str, object]) -> str:
-        write_report(summary, options.output)
-        return 'a figure'
-
-    return conclude(options.seeds, options.output, run, report)
+    return conclude(options.seeds, options.output, run,
+                    lambda _, summary: write_report(summary, options.output))
 
 
 if __name__ == '__main__':

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The benefit of the linear coordinates of a lift, and model classes in harder cases."""
+"""The benefit of the linear coordinates of a lift, and model classes on noisy data."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -13,25 +13,22 @@ from scipy.integrate import solve_ivp
 
 from koopman_ros.control import averaged, recentred
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import DriftSamples, split_by_episode
+from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import rollout_rmse, train, TrainingFailed
 from koopman_ros.learning.lift.metrics import drift_error
-from koopman_ros.model import Box, LiftedModel, PolynomialObservables
+from koopman_ros.model import LiftedModel
 from koopman_ros.plants import describe
 from studies.campaign import Experiment, Metrics, Models
 from studies.general.learners import LEARNERS, RECIPES
 from studies.general.loops import judged, known, loops, STARTS
-from studies.general.systems import CASES, Regulation
+from studies.general.systems import CASES
 
 PLACE = 'coordinates'  # of its figures in the summary
 SEEDS = 3  # as many of those of the study
 NOISE = 0.03  # of the derivatives, beside their root mean square
-FEW = 0.1  # share of the episodes
-BEYOND = 0.2  # how far starts lie beyond the box at its upper ends, in units of it
 _HELD_OUT = 40
 _POLYNOMIALS = ('EDMD-3', 'EDMD-5')
 LIFTS = ('identity lift', 'free lift')
-_DEGREE = 3  # of the monomials in discrete time
 _FAR = 1e3  # half-ranges, beyond which a prediction has diverged
 
 
@@ -42,25 +39,8 @@ def noisy(samples: DriftSamples, seed: int) -> DriftSamples:
     return replace(samples, dxdt=samples.dxdt + size * rng.normal(size=samples.dxdt.shape))
 
 
-def few(samples: DriftSamples, seed: int) -> DriftSamples:
-    """Return the first episodes alone."""
-    episodes = np.unique(samples.episode)
-    return samples.take(episodes[:round(FEW * len(episodes))])
-
-
 CONDITIONS: Mapping[str, Callable[[DriftSamples, int], DriftSamples]] = {
-    'rx': lambda samples, seed: samples, 'rx_noisy': noisy, 'rx_few': few}
-
-
-def beyond(case: Regulation, box: Box, seed: int) -> DriftSamples:
-    """Return held-out samples outside of a box, of episodes that go beyond its upper ends."""
-    more = BEYOND * (box.states.upper - box.states.lower)
-    wider = replace(case, lower=0.5 * (box.states.lower + box.states.upper),
-                    upper=box.states.upper + more, design=replace(
-                        case.design, state_lower=box.states.lower,
-                        state_upper=box.states.upper + 1.5 * more))
-    found = wider.samples(seed, _HELD_OUT)
-    return found.where(np.any(found.x > box.states.upper, axis=1))
+    'rx': lambda samples, seed: samples, 'rx_noisy': noisy}
 
 
 def rolled_in_z(model: LiftedModel, samples: DriftSamples) -> Array:
@@ -90,62 +70,19 @@ def rolled_in_z(model: LiftedModel, samples: DriftSamples) -> Array:
     return np.sqrt(squares / count)
 
 
-def discrete(case: Regulation, box: Box, samples: DriftSamples, held_out: DriftSamples, delays: int
-             ) -> float:
-    """
-    Predict held-out episodes by EDMD in discrete time, with inputs and delay coordinates.
-
-    z_k+1 = A z_k + B u_k by least squares, z the monomials of the state and, with delays, the last
-    states and inputs; once lifted it is not lifted again. (Korda, Mezic 2018.)
-
-    :return: root mean square error from the first state with a past, of the worst state, in half
-        widths of the box.
-    """
-    terms = PolynomialObservables.total_degree(case.system.n_x, _DEGREE)
-    n = case.system.n_x
-
-    def lifted(given: DriftSamples) -> list[tuple[Array, Array, Array]]:
-        found = []
-        for number in np.unique(given.episode):
-            rows = given.episode == number
-            x = box.states.to_deviation(given.x[rows])
-            u = box.inputs.to_deviation(given.u[rows])
-            last = len(x)
-            past = [part[1 - i:last - i] for i in range(1, delays + 1) for part in (x, u)]
-            found.append((np.hstack([terms.lift(x[1:]), *past, np.ones((last - 1, 1))]),
-                          u[1:], x[1:]))
-        return found
-
-    known_ones = lifted(split_by_episode(samples, 0)[0])
-    before = np.vstack([np.hstack([z[:-1], u[:-1]]) for z, u, _ in known_ones])
-    after = np.vstack([z[1:] for z, _, _ in known_ones])
-    weights = np.linalg.lstsq(before, after, rcond=None)[0]
-    squares, count = np.zeros(n), 0
-    with np.errstate(all='ignore'):
-        for z, u, x in lifted(held_out):
-            state = z[0]
-            for k in range(len(x) - 1):
-                state = np.concatenate([state, u[k]]) @ weights
-                squares += (box.states.scale * (state[:n] - x[k + 1])) ** 2
-                count += 1
-    return float(np.max(np.sqrt(squares / count) / case.units[0]))
-
-
 def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
     """
-    Learn a case by several classes from good, noisy and few data, and use each model's parts.
+    Learn a case by several classes from good and noisy data, and use each model's parts.
 
-    :return: figures named ``<class>/<figure>``: relative errors of the drift `rx`, `rx_noisy`,
-        `rx_few` on the same exact held-out data, and `rx_beyond` outside of the box; `rollout` by
-        the drift, for lifts `rollout_z` by the linear coordinates; for lifts ``averaged`` and
+    :return: figures named ``<class>/<figure>``: relative errors of the drift `rx` and `rx_noisy`
+        on the same exact held-out data; `rollout` by the
+        drift, for lifts `rollout_z` by the linear coordinates; for lifts ``averaged`` and
         ``recentred``, the largest cost of each law over that of the better law that knows the
         plant, with ``..._missed`` as in :func:`judged`.
     """
     case = CASES[name]
     samples, held_out = case.samples(seed), case.samples(1000 + seed, _HELD_OUT)
     plant = describe(case.system)
-    box = Box.of(plant, samples.x, samples.u)
-    outside = beyond(case, box, 2000 + seed)
     found: dict[str, Metrics] = {}
     for label in (*_POLYNOMIALS, *RECIPES):
         figures: Metrics = {}
@@ -161,21 +98,17 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
                 continue
             figures[figure] = drift_error(model, held_out)
             if figure == 'rx':
-                figures |= _used(name, model, held_out, outside, label in LIFTS, starts)
-    for delays in (0, 1):
-        found[f'in discrete time, {delays} delays'] = {
-            'rollout': discrete(case, box, samples, held_out, delays)}
+                figures |= _used(name, model, held_out, label in LIFTS, starts)
     return {f'{label}/{figure}': value for label, figures in found.items()
             for figure, value in figures.items()}, {}
 
 
-def _used(name: str, model: LiftedModel, held_out: DriftSamples, outside: DriftSamples, lift: bool,
-          starts: int) -> Metrics:
+def _used(name: str, model: LiftedModel, held_out: DriftSamples, lift: bool, starts: int
+          ) -> Metrics:
     """Judge a model of good data by its use."""
     case = CASES[name]
     error = rollout_rmse(model, held_out)
     found: Metrics = {
-        'rx_beyond': drift_error(model, outside),
         'rollout': None if error is None else float(np.max(error / case.units[0]))}
     if not lift:
         return found

@@ -4,16 +4,14 @@
 """Model classes to compare; to add one, name it in LEARNERS or RECIPES."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import time
 from typing import TypeAlias
-
-import numpy as np
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.learning import Edmd, IncrementalTraining, NeuralDrift, train, TrainingFailed
 from koopman_ros.learning.lift.multistart import Recipe
-from koopman_ros.model import Box, LiftedModel, PolynomialObservables
+from koopman_ros.model import Box, LiftedModel
 
 
 @dataclass(frozen=True)
@@ -34,37 +32,6 @@ def _polynomial(degree: int) -> Learner:
         known, box = split_by_episode(samples, 0)[0], Box.of(plant, samples.x, samples.u)
         model = Edmd(degree).learn(plant, known, box)
         return Learned(model, time.process_time() - begin)
-
-    return learn
-
-
-_RIDGE = 1e-9  # the data are exact: its usual 0.05 keeps terms that are not there
-
-
-def _sparse(degree: int, threshold: float = 0.01) -> Learner:
-    """
-    Return SINDy (Brunton, Proctor, Kutz 2016) of pysindy: monomials, most of them left out.
-
-    :param threshold: coefficients below are 0, with states in halves of their range and rates in
-        units of their root mean square.
-    """
-    def learn(plant: PlantDescription, samples: DriftSamples, seed: int) -> Learned:
-        import pysindy
-
-        full = _polynomial(degree)(plant, samples, seed).model
-        begin = time.process_time()
-        known = split_by_episode(samples, 0)[0]
-        rate = known.dxdt / full.states.scale - full.inputs.to_deviation(known.u) @ full.B.T
-        pace = np.sqrt(np.mean(rate ** 2))
-        terms = pysindy.PolynomialLibrary(degree=degree, include_bias=False)
-        found = pysindy.SINDy(pysindy.STLSQ(threshold=threshold, alpha=_RIDGE), terms).fit(
-            full.states.to_deviation(known.x), t=1.0, x_dot=rate / pace)
-        weights = {tuple(powers): pace * column for powers, column in zip(
-            terms.powers_.tolist(), found.coefficients().T, strict=True)}
-        exponents = PolynomialObservables.total_degree(full.n_x, degree).exponents
-        drift = np.stack([weights[tuple(powers)] for powers in exponents.tolist()])
-        A = np.vstack([drift.T, full.A[full.n_x:]])
-        return Learned(replace(full, A=A, readout=drift.T), time.process_time() - begin)
 
     return learn
 
@@ -100,6 +67,5 @@ LEARNERS: dict[str, Learner] = {
     'linear': _polynomial(1),
     'EDMD-3': _polynomial(3),
     'EDMD-5': _polynomial(5),
-    'SINDy-5': _sparse(5),
     **{label: _trained(recipe) for label, recipe in RECIPES.items()},
 }

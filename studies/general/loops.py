@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cost of a law on the true plant, relative to laws that know the plant and to the least."""
+"""Cost of a law on the true plant, relative to laws that know the plant."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,16 +14,13 @@ from koopman_ros.control import Feedback, feedback, Form, Target, Weights
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.evaluation import run_closed_loop
-from koopman_ros.evaluation.optimal_cost import optimum, Task
 from koopman_ros.model import LiftedModel
 from studies.campaign import Metrics
 from studies.general.systems import CASES, Regulation
 
 STARTS = 20
-OPTIMA = 5  # of the first of them, as the least cost takes a second to find
 ARRIVED = 0.1  # distance from the nominal state, in half-ranges of the box
 HELD_TO = 1.05  # most that a law may cost, over the better of those that know the plant
-_SAMPLES = 800  # of the least cost, for each of which the inputs are held
 _MAX_EVALUATIONS = 5000  # of a law; what needs more chatters
 
 
@@ -42,7 +39,6 @@ class Known:
     lqr: tuple[LoopEnd, ...]  #: with the linear-quadratic gain of the nominal state
     #: with that of the true drift as :meth:`Regulation.factorised` factorises it
     sdre: tuple[LoopEnd, ...]
-    least: tuple[float, ...]  #: least costs; infinite where none was found, or looked for
 
     @property
     def better(self) -> tuple[float, ...]:
@@ -64,9 +60,7 @@ def known(name: str, starts: int) -> Known:
                         -model.B @ found.K)
 
     return Known(tuple(loops(case, case.truth, starts)),
-                 tuple(loops(case, case.truth, starts, natural)),
-                 tuple(_least(case, x0) if number < OPTIMA else math.inf
-                       for number, x0 in enumerate(case.starts(starts))))
+                 tuple(loops(case, case.truth, starts, natural)))
 
 
 def loops(case: Regulation, model: LiftedModel, starts: int,
@@ -90,17 +84,6 @@ def loops(case: Regulation, model: LiftedModel, starts: int,
     return ends
 
 
-def _least(case: Regulation, x0: Array) -> float:
-    """Return the least cost from a start (n_x,), on the true equations with inputs held."""
-    system = case.system
-    Q, R = (1.0 / unit ** 2 for unit in case.units)
-    try:
-        return optimum(Task(system, x0, system.nominal_state,
-                            system.nominal_input, Q, R, case.horizon / _SAMPLES, _SAMPLES, 1)).cost
-    except ValueError:
-        return math.inf
-
-
 def judged(ends: Sequence[LoopEnd], beside: Known) -> Metrics:
     """
     Count and compare how loops ended, start by start.
@@ -108,19 +91,14 @@ def judged(ends: Sequence[LoopEnd], beside: Known) -> Metrics:
     :return: `no_gain` and `not_arrived`, numbers of starts; `missed`, the number from which the
         law did not arrive or cost more than HELD_TO times the better law that knows the plant;
         `ratio` and `ratio_worst`, that cost ratio at the median and the largest, over starts
-        from which it arrived; `least_ratio`, the largest over the least cost.
+        from which it arrived.
     """
     costs, better = np.array([end.cost for end in ends]), np.array(beside.better)
     arrived = np.isfinite(costs)
 
-    def over(below: Array) -> Array:
-        both = arrived & np.isfinite(below)
-        ratios: Array = costs[both] / below[both]
-        return ratios
-
-    ratios, over_least = over(better), over(np.array(beside.least))
+    both = arrived & np.isfinite(better)
+    ratios = costs[both] / better[both]
     return {'no_gain': sum(end.no_gain for end in ends), 'not_arrived': int(np.sum(~arrived)),
             'missed': int(np.sum(~(arrived & (costs <= HELD_TO * better)))),
             'ratio': float(np.median(ratios)) if len(ratios) else None,
-            'ratio_worst': float(np.max(ratios)) if len(ratios) else None,
-            'least_ratio': float(np.max(over_least)) if len(over_least) else None}
+            'ratio_worst': float(np.max(ratios)) if len(ratios) else None}

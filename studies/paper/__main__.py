@@ -46,10 +46,8 @@ def main(args: list[str] | None = None) -> int:
     if options.sensors and output == Path('out/studies'):
         output = Path('out/studies-sensors')
 
-    def report(campaign: Campaign, summary: dict[str, Any]) -> str:
-        pictures = draw_figures(campaign, output)
-        write_report(summary, pictures, output)
-        return f'{len(pictures)} figures'
+    def report(campaign: Campaign, summary: dict[str, Any]) -> None:
+        write_report(summary, draw_figures(campaign, output), output)
 
     return campaigns.conclude(options.seeds, output, lambda: run_campaign(
         options.seeds, SENSOR_EXPERIMENTS if options.sensors else EXPERIMENTS,

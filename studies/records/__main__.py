@@ -137,7 +137,7 @@ def main(args: list[str] | None = None) -> int:
         elif options.records.is_dir():
             print(f'{name} is left out, without {", ".join(missing)}: {_HELP}', file=sys.stderr)
 
-    def written(_: Campaign, summary: dict[str, Any]) -> str:
+    def written(_: Campaign, summary: dict[str, Any]) -> None:
         text = table_of(summary)
         print(text)
         report.write(options.output, 'Measured records', [
@@ -146,7 +146,6 @@ def main(args: list[str] | None = None) -> int:
                 if SETS[name].published), 'Options of the other methods are those with the best '
             'free run on held-out data; `summary.json` has them.'],
             packages=(*report.PACKAGES, 'nfoursid', 'sysidentpy', 'pykoop'))
-        return 'models and records'
 
     return conclude(options.seeds, options.output, lambda: campaign_of(
         names, options.records, options.output, options.seeds, options.scheduler,

@@ -4,18 +4,16 @@
 """Lifts of too narrow data used outside them, without fallback and with it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from koopman_ros import control, evaluation
 from koopman_ros.control import Controller
 from koopman_ros.evaluation import at, Simulation
-from koopman_ros.learning import IncrementalTraining, Linearisation, train
-from koopman_ros.model import LiftedModel
+from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign
 from studies.campaign import Metrics
-from studies.paper import two_state
 from studies.robustness import loop
 from studies.robustness.loop import REACTOR, START
 
@@ -27,12 +25,6 @@ DESIGN = RandomStepDesign(
 SECONDS = 1200.0
 LINEAR_MARGINS, MARGIN_BANDWIDTHS = (0.2, 0.5, 1.0), (0.0, 2.0, 6.0)
 _DISTURBED = 60.0  # s
-_ESCAPED = 100.0  # in either state of the two-state example
-_BOUND = 200.0  # of its input, in 1/s
-_SAMPLE = 0.05  # s
-_HORIZON = 60.0  # s
-_HOLDING = float(two_state.START[0] ** 2 - two_state.START[1])  # holds x2 where it starts
-NARROWEST = '[3,6]x[3,8]'
 
 
 @dataclass(frozen=True)
@@ -85,43 +77,3 @@ def far_from_the_model(linear_model_margin: float, bandwidth: float) -> Metrics:
     controller = loop.reactor_controller(bandwidth=bandwidth,
                                          linear_model_margin=linear_model_margin)
     return judge_reactor(TRIALS[1].run(controller), _DISTURBED)
-
-
-def two_state_courses() -> dict[tuple[str, str], Simulation]:
-    """Run the two-state example by the box of its lift and ``narrow`` or ``guarded``."""
-    system, boxes = two_state.SYSTEM, {**two_state.NARROW, 'wide': two_state.WIDE}
-    models = {name: train(
-        describe(system), two_state.samples(box, 0),
-        two_state.WIDE_RECIPE if name == 'wide' else two_state.NARROW_RECIPE, seed=0, starts=1,
-        reject=False).model for name, box in boxes.items()}
-    models['true linearisation'] = Linearisation(system.drift_jacobian(np.zeros(2))).learn(
-        describe(system), two_state.samples(two_state.WIDE, 0, episodes=5))
-    return {(name, kind): _two_state_course(model, fallback=kind == 'guarded')
-            for name, model in models.items() for kind in ('narrow', 'guarded')}
-
-
-def _two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
-    """Regulate the two-state example from (5, 5) to the origin, sampled 20 times a second."""
-    controller = Controller(model, control.Tuning.for_model(
-        model, state_weight=np.ones(2), input_weight=np.ones(1),
-        limits=control.InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
-        safe_value=np.zeros(1), bumpless_transfer_time=1.0,
-        **({'recovery_time': 1.0} if fallback else loop.NO_FALLBACK)))
-
-    # put into the controller's state, since it rejects set-points outside its data
-    def to_origin(before: evaluation.Loop) -> evaluation.Loop:
-        origin = control.Setpoint(np.zeros(2), np.zeros(2))
-        return replace(before, state=replace(before.state, setpoint=origin))
-
-    return loop.run_loop(
-        controller, two_state.SYSTEM, two_state.START, _HOLDING, _HORIZON, [at(0.0, to_origin)],
-        period=_SAMPLE, stop=lambda x, *_: bool(np.max(np.abs(x)) > _ESCAPED))
-
-
-def judge_two_state(course: Simulation) -> Metrics:
-    """Return the result of the example; `left_after` are s until another law than the learned."""
-    below = [level != 'sdre' for level in course.levels]
-    return {'largest_x2': float(np.max(np.abs(course.states[:, 1]))),
-            'final_distance': float(np.linalg.norm(course.states[-1])),
-            'escaped': bool(np.max(np.abs(course.states)) > _ESCAPED),
-            'left_after': float(course.times[below.index(True)]) if any(below) else None}

@@ -11,12 +11,9 @@ from typing import Any
 from matplotlib.axes import Axes
 import numpy as np
 
-from koopman_ros.core.arrays import Array
 from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend, Picture, table
 from koopman_ros.core.status import level_words
-from koopman_ros.evaluation import Simulation
 from studies import report
-from studies.paper import two_state
 from studies.robustness import disturbances, narrow
 from studies.robustness.loop import BANDWIDTH, shipped_model, START
 from studies.robustness.stability import End, hottest_cooled
@@ -42,8 +39,6 @@ def write_report(found: Found, folder: Path) -> None:
     ends = found.grids[True], found.grids[False], found.two_state_grid
     report.write(folder, 'How far the loop can be pushed', [
         '## Margins, smallest over the trained range', _margin_table(found),
-        f'In simulation at {START:.1f} K with the default parameters, 3 % below and above:',
-        _table(figures['verified']),
         '## Disturbances: deviation of the temperature; of steps, overshoot',
         _table(figures['disturbances']),
         '## A step by −10 K with a coolant whose dead time is wrong',
@@ -62,7 +57,6 @@ def write_report(found: Found, folder: Path) -> None:
         'The lift of narrow data alone (narrow) and with fallback (guarded), and the shipped one '
         '(wide):', _table(figures['narrow']['reactor']),
         'The shipped lift after UA −40 %:', _table(figures['narrow']['heat_transfer_-40%']),
-        'The two-state example, by the box of its data:', _table(figures['narrow']['two_state']),
         ], [draw(found, folder / f'{name}.png') for name, draw in (
             ('margins', _draw_margins), ('noise', _draw_noise),
             ('attraction', _draw_attraction), ('narrow', _draw_narrow))])
@@ -192,42 +186,26 @@ def _draw_attraction(found: Found, path: Path) -> Picture:
         f'{found.boundaries[300.0]["physics_kelvin"]:.1f} K.'))
 
 
-def _path(axis: Axes, course: Simulation, kind: str, x: Array, y: Array, **style: Any) -> None:
-    """Draw a course; where it has fallbacks, mark where another level takes over."""
-    axis.plot(x, y, **{**_PATHS[kind], **style})
-    for number, level in enumerate(course.levels if kind == 'guarded' else ()):
-        if number == 0 or level != course.levels[number - 1]:
-            axis.plot(x[number], y[number], markersize=6, linestyle='none', markeredgecolor='k',
-                      **_LEVELS[level])
-
-
 def _draw_narrow(found: Found, path: Path) -> Picture:
-    with drawing(path, 1, 4, size=(11.0, 4.6)) as (figure, axes):
-        *others, last = axes
-        for axis, trial in zip(others, narrow.TRIALS, strict=True):
-            for kind in _PATHS:
+    with drawing(path, 1, 3, size=(11.0, 4.6), sharey=True) as (figure, axes):
+        for axis, trial in zip(axes, narrow.TRIALS, strict=True):
+            for kind, style in _PATHS.items():
                 course = found.reactor[trial.name, kind]
-                _path(axis, course, kind, course.times / 60.0, course.states[:, 0])
+                minutes, kelvin = course.times / 60.0, course.states[:, 0]
+                axis.plot(minutes, kelvin, **style)
+                # where another level takes over
+                for number, level in enumerate(course.levels if kind == 'guarded' else ()):
+                    if number == 0 or level != course.levels[number - 1]:
+                        axis.plot(minutes[number], kelvin[number], markersize=6,
+                                  linestyle='none', markeredgecolor='k', **_LEVELS[level])
             axis.axhspan(START - narrow.HALF_WIDTH, START + narrow.HALF_WIDTH, **DRAWN_RANGE)
-            axis.set(title=trial.name, xlabel='time [min]', ylim=(295.0, 350.0))
+            axis.set(xlabel='time [min]', ylim=(295.0, 350.0))
+            axis.set_title(trial.name, fontsize=9)
         axes[0].set_ylabel('temperature [K]')
-        for kind in _PATHS:
-            key = ('wide', 'guarded') if kind == 'wide' else (narrow.NARROWEST, kind)
-            _path(last, found.two_state[key], kind, *found.two_state[key].states.T, label=None)
-        last.plot(*found.two_state['true linearisation', 'narrow'].states.T, color='k',
-                  linewidth=0.8, label='true linearisation')
-        last.legend(fontsize=8, loc='lower right')
-        box = two_state.NARROW[narrow.NARROWEST]
-        last.fill_between((box.lower[0], box.upper[0]), box.lower[1], box.upper[1], **DRAWN_RANGE)
-        last.set(title=f'two-state example, {narrow.NARROWEST}', xlabel='x$_1$', ylabel='x$_2$',
-                 ylim=(-40.0, 40.0))
-        for axis in axes:
-            axis.title.set_fontsize(9)
         for level, mark in _LEVELS.items():
             axes[0].plot([], [], linestyle='none', markeredgecolor='k',
                          label=f'takes {level_words(level)}', **mark)
         legend(figure, axes[:1], 4)
     return Picture(path.name, (
-        'Lifts of narrow data (grey: the data) used outside them. On the reactor the '
-        'fallback keeps the loop from running away, and leads it back from the cold; the '
-        'two-state example is unstable by itself and no constant input saves it.'))
+        'A lift of narrow data (grey: the data) used outside them. The fallback keeps the loop '
+        'from running away, and leads it back from the cold.'))

@@ -20,7 +20,7 @@ from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, Loop
-from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
+from koopman_ros.plants import ControlAffineSystem, two_state_reactor
 from studies.campaign import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import at_setpoint, COOLANT, COOLANT_RANGE, PERIOD, REACTOR
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import control
 
 _STEP = 1e-5  # of scaled deviations and K, for differences
-_KICK = 1e-4  # K
 _FREQUENCIES = 1500
 HORIZON = 2400.0  # s
 TOLERANCE = 0.2  # K
@@ -121,22 +120,6 @@ def margins_at(controller: Controller, temperature: float) -> Margins:
     return Margins(
         min(rising, default=math.inf), min(map(abs, phases), default=math.inf),
         min(delays, default=math.inf), float(np.min(np.abs(1.0 + response))))
-
-
-def grows(controller: Controller, temperature: float, *, factor: float = 1.0, delay: float = 0.0,
-          seconds: float = 1800.0) -> bool:
-    """Simulate whether a deviation grows when the coolant's is amplified, or late by some s."""
-    held = equilibrium_input(REACTOR, [temperature])
-    # the coolant deviates by the factor from what holds the temperature
-    B = REACTOR.input_matrix(REACTOR.nominal_state)
-    plant = replace(REACTOR, B=factor * B,
-                    drift=lambda x: REACTOR.drift(x) + (1.0 - factor) * (B @ held))
-    course = loop.run_loop(
-        controller, plant, np.array([temperature + _KICK]), float(held[0]), seconds,
-        [at(0.0, at_setpoint(temperature))], actuator=Actuator(delay=delay))
-    # the swing at the end: without an observer an offset is left
-    late = loop.errors(course, temperature)[-len(course.times) // 3:]
-    return bool(np.ptp(late) > 2.0 * _KICK)
 
 
 class End(Enum):

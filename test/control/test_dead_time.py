@@ -12,6 +12,7 @@ import pytest
 from scipy.linalg import expm
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
+from koopman_ros.control.laws import StateDependentRiccati
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import AppliedInputs, largest_bandwidth
 from koopman_ros.estimation.kalman_filters import uncertainty
@@ -144,6 +145,37 @@ def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
         own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
         np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
                                       uncertainty(loop.model, outputs, own)[1])
+
+
+class ReadingLaw(StateDependentRiccati):
+    """A law that remembers the covariance at which it was evaluated."""
+
+    reads_covariance = True
+
+    def compute(self, estimate, target, memory, interval, previous):
+        found = super().compute(estimate, target, memory, interval, previous)
+        return replace(found, memory=(estimate.x, estimate.covariance))
+
+
+class OtherLaw(ReadingLaw):
+    reads_covariance = False
+
+
+@pytest.mark.parametrize('kind', ['extended', 'unscented'])
+def test_the_covariance_is_predicted_over_a_dead_time_for_a_law_that_reads_it(kind):
+    found = {}
+    for law in (ReadingLaw, OtherLaw):
+        loop, plant, state = late_reactor(
+            30.0, estimator=f'{kind}_kalman_filter',
+            fallback_order=(f'{__name__}:{law.__name__}',))
+        now = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
+                       duration=20.0, period=2.0, state=state).loop.state
+        found[law] = now.law_memory
+        measured = now.estimate.covariance[0, 0]
+    (x, P), (alone, none) = found[ReadingLaw], found[OtherLaw]
+    assert P[0, 0] != pytest.approx(measured, rel=0.1)
+    assert none is None
+    np.testing.assert_allclose(alone, x, atol=1e-6 if kind == 'extended' else 1e-3)
 
 
 @pytest.mark.parametrize(('levels', 'estimator'), [

@@ -23,7 +23,7 @@ from koopman_ros.control.recovery import rest_under, SafeStateRecovery
 from koopman_ros.control.supervisor import FallbackOrder, LevelRequest
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.evaluation import exchange
-from koopman_ros.model import Coordinates, linearised_model, Provenance
+from koopman_ros.model import Coordinates, linearised_model, Provenance, TrainingStates
 from koopman_ros.parameters.model_checks import rests_outside
 from studies.robustness.disturbances import CHANGED
 from studies.robustness.loop import changed_reactor
@@ -378,3 +378,38 @@ def test_a_lift_of_narrow_data_reports_a_safe_coolant_outside_its_range():
     hot = controller(safe_value=np.array([305.15]))
     assert hot.rest.holding[0] < 305.15
     assert 'or less' in rests_outside(hot)
+
+
+def test_a_margin_is_at_least_the_spacing_of_the_training_states():
+    """With three dimensions 256 states are farther apart than `learned_model_margin`."""
+    cloud = np.random.default_rng(0).uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 0.0], (2000, 3))
+    data = TrainingStates.of(cloud, np.ones(3))
+    spacing = data.fill_distance
+    assert 0.15 < spacing < 0.2
+    names = ('product', 'wall', 'jacket')
+    model = replace(linearised_model(
+        -0.01 * np.eye(3), np.full((3, 1), 0.01), Coordinates.spanning(
+            names, ('K',) * 3, -np.ones(3), np.ones(3)),
+        Coordinates.spanning(('heater',), ('kW',), -np.ones(1), np.ones(1)), 's',
+        Provenance('vessel')), training_states=data)
+    loop = Controller(model, replace(Tuning.for_model(model), controlled=names[:1]))
+    assert loop.order.margins == (spacing, 0.5)
+
+    def at(distance):
+        """Return a state above the cloud, at so many half-ranges from it."""
+        return np.array([0.0, 0.0, brentq(
+            lambda z: model.distance(np.array([0.0, 0.0, z])) - distance, 0.1, 1.0)])
+
+    state, found = State(), []
+    for second, distance in enumerate([0.9 * spacing] + [1.1 * spacing] * 2 + [0.074] * 20):
+        state, _, report = loop.step(state, at(distance) + 1e-9 * second, (second + 1) * SECOND)
+        found.append(report.level)
+    assert found[:3] == ['sdre', 'linear', 'linear']
+    assert found[-1] == 'sdre'
+
+
+@pytest.mark.parametrize('name', [
+    'reactor_nz4', 'two_state_saddle', 'two_tanks', 'pendulum', 'fed_reactor', 'heated_line'])
+def test_training_states_of_one_or_two_dimensions_are_closer_than_the_margins(name):
+    model = shipped(name)
+    assert Controller(model, Tuning.for_model(model)).order.margins == (0.1, 0.5)

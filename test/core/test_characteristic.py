@@ -24,11 +24,6 @@ def test_a_dead_zone_is_crossed_at_once():
     assert (below, above) == pytest.approx((40.0, 60.0), abs=1.0)
 
 
-def test_its_slope_is_that_of_its_segments():
-    assert VALVE.slope(np.array([-1.0, 20.0, 50.0, 80.0, 101.0])) == pytest.approx(
-        [1.0, 0.25, 0.001, 2.25, 1.0], abs=0.002)
-
-
 @pytest.mark.parametrize(('values', 'effects'), [
     ([0.0, 1.0, 2.0], [0.0, 1.0, 0.5]), ([0.0, 1.0], [1.0, 1.0]), ([0.0, 0.0], [0.0, 1.0]),
     ([0.0], [0.0]), ([], []), ([0.0, 1.0], [0.0]), ([0.0, np.nan], [0.0, 1.0])])

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from koopman_ros.core.message_fields import base_name, MessageField, place
+from koopman_ros.core.message_fields import MessageField, place
 from koopman_ros.parameters.signal_topics import named_units, Signals
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
@@ -42,18 +42,6 @@ def test_field_that_is_no_path_is_rejected(field):
         MessageField('t', 'std_msgs/msg/Float64', field, '1')
 
 
-def test_arrays_and_names_grow_as_values_are_written():
-    message = SimpleNamespace(name=[], effort=[])
-    for name, value in (('left', 1.0), ('right', 2.0), ('left', 3.0)):
-        MessageField('motors', 'sensor_msgs/msg/JointState', f'effort[{name}]', 'N m').put(message,
-                                                                                           value)
-    assert (message.name, message.effort) == (['left', 'right'], [3.0, 2.0])
-    array = SimpleNamespace(data=[])
-    MessageField('out', 'std_msgs/msg/Float64MultiArray', 'data[1]', '1').put(array, 5.0)
-    assert array.data[1] == 5.0
-    assert len(array.data) == 2
-
-
 @pytest.mark.parametrize(('unit', 'given', 'expected'), [
     ('K', {}, ('sensor_msgs/msg/Temperature', 'temperature', 'degC')),
     ('Pa', {}, ('sensor_msgs/msg/FluidPressure', 'fluid_pressure', 'Pa')),
@@ -65,11 +53,6 @@ def test_arrays_and_names_grow_as_values_are_written():
 def test_missing_parts_of_a_message_field_get_defaults(unit, given, expected):
     found = place('s', 's', unit, given)
     assert (found.topic, (found.type, found.field, found.unit)) == ('s', expected)
-
-
-def test_commands_are_named_after_the_commanded_signal():
-    assert base_name('coolant_temperature', 'K') == 'coolant'
-    assert base_name('flow', 'm^3/s') == 'flow'
 
 
 def test_signals_have_names_of_topics_and_units_that_there_are():
@@ -97,15 +80,3 @@ def test_missing_bounds_of_an_experiment_are_named():
     assert table.snapshot(given).experiment(signals).measured_lower.tolist() == [0.1, 293.15]
     with pytest.raises(ValueError, match=r'level.setpoint_min \[m\], level.setpoint_max \[m\]$'):
         table.snapshot(given).experiment(signals, np.array([1.0]))
-
-
-def test_a_trainer_without_signals_explains_how_to_name_them():
-    with pytest.raises(ConfigurationError, match="'oven' are unknown"):
-        trainer_table(None, {'system': 'oven'})
-
-
-def test_type_without_a_usual_field_wants_one():
-    with pytest.raises(ValueError, match='a geometry_msgs/msg/Twist'):
-        place('s', 's', 'm/s', {'type': 'geometry_msgs/msg/Twist'})
-    said = {'type': 'geometry_msgs/msg/Twist', 'field': 'linear.x'}
-    assert place('s', 's', 'm/s', said).unit == 'm/s'

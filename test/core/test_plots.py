@@ -9,29 +9,7 @@ import math
 import numpy as np
 import pytest
 
-import koopman_ros
 from koopman_ros.core import plots
-
-
-def test_a_table_in_markdown():
-    head = 'case', 'error [K]'
-    assert plots.table(head, [('bias', 0.5), ('a|b', '1')], numbers=(1,)) == (
-        '| case | error [K] |\n|---|---:|\n| bias | 0.5 |\n| a\\|b | 1 |')
-    with pytest.raises(ValueError, match='a row of 1 cells in a table of 2 columns'):
-        plots.table(head, [('bias',)])
-
-
-def test_a_page_names_versions_and_machine_and_leaves_out_empty_parts(tmp_path):
-    path = plots.write_page(tmp_path / 'new' / 'report.md', 'Title', [
-        'First.', '', plots.bullets([]), plots.bullets(['one', 'two']),
-        plots.Picture('a.png', 'Seen. In detail.')], ('numpy', 'not-installed'))
-    title, about, *sections = path.read_text().split('\n\n')
-    assert title == '# Title'
-    assert about.startswith(f'*koopman_ros {koopman_ros.__version__}, Python ')
-    assert f', numpy {np.__version__}; ' in about
-    assert 'not-installed' not in about
-    assert f'{plots.machine()["cpu_count"]} processors' in about
-    assert sections == ['First.', '- one\n- two', '![Seen](a.png)', '*Seen. In detail.*\n']
 
 
 def test_figures_hold_null_for_numbers_without_json_form(tmp_path):

@@ -9,8 +9,6 @@ import sys
 import pytest
 
 from koopman_ros.core import progress
-from koopman_ros.learning import train
-from support import small_plants
 
 
 class Terminal(io.StringIO):
@@ -33,10 +31,3 @@ def test_progress_is_shown_on_a_terminal_alone(
     # each in the place of the last, and removed at the end
     assert [line.partition('| ')[2] for line in shown.split('\r\x1b[K')] == (
         ['', '  0 % reading', ' 50 % learning', ''] if stream.isatty() else [''])
-
-
-def test_a_training_shows_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = Terminal()
-    monkeypatch.setattr(sys, 'stderr', stream)
-    train(small_plants.UNFORCED, small_plants.unforced_samples(), small_plants.SMALL, starts=1)
-    assert '|   0 % n_z 2, start 1 of 1' in stream.getvalue()

@@ -54,13 +54,6 @@ def test_the_source_that_is_left_is_news_after_some_rounds(left):
     assert base.take(0, 26.0, 25.0) is TWO
 
 
-def test_a_clock_that_cycles_is_news_in_its_first_two_rounds_at_most():
-    for period in (2, 5, 9):
-        stamps = [float(k % period) for k in range(50)]
-        ways = found(TimeBase(), stamps)
-        assert set(ways[2 * period:]) <= {TWO, OLD}, period
-
-
 def test_numbers_of_messages_have_no_late_ones():
     base, number = TimeBase(late=-1), count(1)
     assert [base.take(next(number), float(k), WINDOW) for k in range(5)] == [NEW] * 5
@@ -70,9 +63,3 @@ def test_numbers_of_messages_have_no_late_ones():
     base = TimeBase(late=-1)
     assert [base.take(k // 2, 0.5 * k, WINDOW) for k in range(2, 8)] == [
         NEW, RESTARTED, NEW, TWO, TWO, TWO]
-
-
-def test_without_a_window_every_restart_is_one():
-    base = TimeBase()
-    assert [base.take(stamp * SECOND, 0.0, 0.0) for stamp in (9, 1, 9, 1)] == [
-        NEW, RESTARTED, NEW, RESTARTED]

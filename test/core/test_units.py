@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.status import reason, StatusCode, StatusFormatter
-from koopman_ros.core.units import check_unit, Conversion, conversion, Display, Displays
+from koopman_ros.core.units import check_unit, conversion, Display, Displays
 
 
 @pytest.mark.parametrize(('unit', 'wanted', 'value', 'converted'), [
@@ -24,22 +24,10 @@ def test_values_are_converted(unit: str, wanted: str, value: float, converted: f
     np.testing.assert_allclose(conversion(unit, wanted)(np.full(2, value)), converted, rtol=1e-12)
 
 
-def test_differences_have_no_offset_and_a_value_without_conversion_keeps_its_bits() -> None:
-    assert conversion('degC', 'K').factor == 1.0
-    assert conversion('degF', 'K').factor == pytest.approx(5.0 / 9.0, rel=1e-12)
-    assert math.copysign(1.0, Conversion()(-0.0)) == -1.0
-
-
 @pytest.mark.parametrize(('unit', 'wanted'), [('K', 'm'), ('K', 'nonsense'), ('', 'degC')])
 def test_units_that_do_not_fit_are_named(unit: str, wanted: str) -> None:
     with pytest.raises(ValueError, match=f"'{unit}' cannot be converted to '{wanted}'"):
         conversion(unit, wanted)
-
-
-def test_a_signal_is_written_in_the_unit_of_its_reader() -> None:
-    displays = Displays({'T': 'K', 'h': 'm', 'x': ''}, {'K': Display('K', 'degC', '.2f')})
-    assert [displays[name].text(300.0) for name in ('T', 'h', 'x', 'unknown')] == [
-        '26.85 degC', '300 m', '300', '300']
 
 
 def test_every_code_has_its_words() -> None:

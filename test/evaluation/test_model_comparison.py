@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
+from koopman_ros.control import Controller, InputLimits, Tuning
 from koopman_ros.control.events import Measurement
 from koopman_ros.control.state import Arrival, MeasurementReport
 from koopman_ros.core.signals import Outputs
@@ -18,10 +18,8 @@ from koopman_ros.evaluation.model_comparison import (
     ModelComparison,
     PredictionWindows,
 )
-from koopman_ros.evaluation.simulate import at, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
-from koopman_ros.plants import Process
-from support.closed_loops import controller, REACTOR, SECOND, shipped, START
+from support.closed_loops import SECOND
 from support.sampling import sampled
 
 ACCEPTED, REJECTED = MeasurementReport(Arrival.ACCEPTED), MeasurementReport(Arrival.REJECTED)
@@ -114,20 +112,6 @@ def test_models_are_compared_only_by_moving_signals(other, accepted, noise):
     assert bool(np.all(found.ratio <= 2.0)) is accepted
 
 
-@pytest.mark.parametrize(('other', 'accepted'), [
-    (model(), True), (model(B=1.1 * B), True), (model(A=1.2 * A), True),
-    (model(B=-B), False), (model(B=5.0 * B), False)])
-def test_models_are_compared_by_each_of_two_outputs(other, accepted):
-    u = random_steps(301, 1)
-    y = two_lags(u)[:, :1] + 0.01 * np.random.default_rng(2).normal(size=(301, 1))
-    # what moves the output is the state that is not measured
-    windows = recent(y + 3.0, u + 3.0, 200.0).windows(200.0)
-    found = compare(model(), other, windows, Outputs(('x1',), ('1',), np.array([[1.0, 0.0]])))
-    assert found.tells
-    assert found.ratio.shape == (1,)
-    assert bool(np.all(found.ratio <= 2.0)) is accepted
-
-
 @pytest.mark.parametrize(('known', 'accepted'), [(4.5, True), (5.0, True), (0.0, False)])
 def test_models_are_compared_with_their_dead_time(known, accepted):
     u = random_steps(301, 1)
@@ -155,45 +139,6 @@ def test_models_are_compared_with_their_measured_disturbances(factor, accepted, 
         found.add(Measurement(round((1 + k) * SECOND), value), ACCEPTED, held, 200.0, acting)
     ratio = compare(disturbed(1.0), disturbed(factor), found.windows(200.0), outputs).ratio
     assert bool((ratio < 2.0).all()) is accepted
-
-
-def test_steady_noise_decides_nothing():
-    noise = 0.1 * np.random.default_rng(3).normal(size=(300, 2))
-    held = np.full((300, 1), 3.0)
-    for x in (3.0 + noise, np.full((300, 2), 3.0)):
-        windows = recent(x, held, 200.0).windows(200.0)
-        for other in (model(B=-B), model(A=0.5 * A)):
-            found = compare(model(), other, windows)
-            assert not found.tells
-            assert np.all(found.ratio <= 1.1)
-
-
-@pytest.mark.parametrize('noise', [0.0, 0.1])
-def test_closed_loop_data_of_the_reactor_distinguish_models(noise):
-    lift = shipped('reactor_nz4')
-    run = simulate(
-        controller(lift, observer_bandwidth=0.1),
-        Process(REACTOR, 0, REACTOR.nominal_state, REACTOR.nominal_input),
-        [at(500.0, SetpointRequest(0, np.array([START - 4.0]))),
-         at(700.0, SetpointRequest(0, np.array([START - 1.0])))],
-        duration=1000.0, noise=np.array([noise]))
-    windows = recent(run.measured, run.inputs, 600.0).windows(600.0)
-    ratio = {name: float(compare(lift, other, windows).ratio[0]) for name, other in {
-        'fewer coordinates': shipped('reactor_nz3'), 'linear': shipped('reactor_linear'),
-        'other way': replace(lift, B=-lift.B), 'no way': replace(lift, B=0.0 * lift.B),
-        'ten times slower': replace(lift, A=0.1 * lift.A, B=0.1 * lift.B)}.items()}
-    assert {name for name, found in ratio.items() if found <= 2.0} == {
-        'fewer coordinates', 'linear'}
-    # the other way about, the better model is welcome
-    assert compare(replace(lift, B=-lift.B), lift, windows).ratio[0] < 0.5
-
-
-def test_model_that_cannot_predict_has_no_opinion():
-    windows = recent(3.0 + two_lags(random_steps(101)), 3.0 + random_steps(101), 100.0
-                     ).windows(100.0)
-    hopeless = model(B=1e300 * B)
-    assert compare(hopeless, model(), windows) is None
-    assert np.all(compare(model(), hopeless, windows).candidate == np.inf)
 
 
 def test_memory_is_bounded_and_averages_the_inputs():

@@ -37,7 +37,6 @@ from studies.exported_loops import (
     SANITIZERS,
 )
 
-PLANTS = Path(__file__).parents[2] / 'config' / 'plants'
 CROSS_COMPILER = ('arm-none-eabi-gcc', 'qemu-system-arm')
 BUNDLED = {name: (controller, interval) for name, controller, interval in bundled_loops()}
 
@@ -85,12 +84,6 @@ def test_a_cortex_m4_gives_the_same_commands(tmp_path: Path) -> None:
     assert not different
     assert found.stack < 16384
     assert found.instructions > 100_000  # a law was among the calls
-
-
-def test_without_a_cross_compiler_nothing_is_measured(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('PATH', str(tmp_path))
-    assert measured(tmp_path, []) is None
 
 
 @needs('gcc')

@@ -109,6 +109,17 @@ def test_a_model_is_rejected_whose_free_run_diverges_or_is_worse_than_that_of_th
     assert len(reasons) == bool(words) + (slope[0, 0] > 0.0 and not diverged)
 
 
+def test_a_free_run_may_diverge_where_that_of_the_drift_leaves_the_record():
+    record = read(table(), 'position [m]', 'force [N]')
+    own, drift = (simulate(lifted(slope=slope), record, init=2)
+                  for slope in (30.0 * np.eye(2), 0.2 * np.eye(2)))
+    # an unstable plant, of which the one grows beyond all numbers and the other not so far
+    assert own.diverged
+    assert np.all(np.isfinite([drift.leaves, *drift.rmse]))
+    runs = {'record': own}
+    assert not list(_failed_runs(runs, {DRIFT: {'record': drift}, LINEAR_MODEL: runs}))
+
+
 @pytest.mark.parametrize('usual', ['good', 'bad'])
 def test_a_model_is_rejected_that_errs_more_than_the_mean_of_a_record_with_motion(usual):
     record = read(table(), 'position [m]', 'force [N]')

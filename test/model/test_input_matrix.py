@@ -4,7 +4,6 @@
 """An input matrix that depends on the state: against differences, averages and its own weights."""
 
 import numpy as np
-import pytest
 
 from koopman_ros.model import InputTerms
 
@@ -13,14 +12,6 @@ TERMS = InputTerms(np.random.default_rng(0).standard_normal((9, 2, 3)))
 
 def value(x, u):
     return TERMS.matrix(x) @ u
-
-
-def test_the_degree_is_that_of_as_many_monomials():
-    assert TERMS.degree == 3
-    assert InputTerms(np.ones((1, 1, 1))).degree == 1
-    for shape in ((4, 2, 1), (0, 2, 1), (2, 0, 1)):
-        with pytest.raises(ValueError, match='incompatible input terms'):
-            InputTerms(np.ones(shape))
 
 
 def test_derivative_and_average_are_those_of_the_polynomial():
@@ -50,11 +41,3 @@ def test_weights_of_the_regressors_are_the_matrix_and_its_terms():
     np.testing.assert_allclose(InputTerms.regressors(x, u, 3) @ weights.T, expected,
                                rtol=0, atol=1e-13)
     assert InputTerms.split(weights[:, :3], 3)[1] is None
-
-
-@pytest.mark.parametrize('degree', [0, 1, 3])
-def test_no_states_have_no_regressors(degree):
-    """As in a batch of closed loops that have all ended."""
-    none = InputTerms.regressors(np.empty((0, 2)), np.empty((0, 3)), degree)
-    assert none.shape == (0, InputTerms.regressors(np.ones((1, 2)), np.ones((1, 3)), degree).size)
-    assert TERMS.matrix(np.empty((0, 2))).shape == (0, 2, 3)

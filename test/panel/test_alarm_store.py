@@ -107,9 +107,6 @@ def test_a_damaged_file_is_moved_aside_and_reported(
     assert Path(f'{file}.damaged').read_bytes() == text.encode(errors='surrogateescape')
     assert not alarms.all
     assert json.loads(file.read_text())['journal'] == []
-    # a second one is kept as well
-    file.write_text('{"version": 1, "alarms": [')
-    assert AlarmStore(Alarms(), file, AGAIN).complaint.endswith(f'{file}.damaged2')
 
 
 @pytest.mark.parametrize('content', [
@@ -134,19 +131,6 @@ def test_an_empty_file_becomes_one_of_alarms_and_a_link_stays_one(tmp_path: Path
     AlarmStore(Alarms(), tmp_path / 'link', NOW)
     assert (tmp_path / 'link').is_symlink()
     assert json.loads((tmp_path / 'target').read_text())['alarms'] == []
-
-
-def test_a_file_that_another_program_has_put_there_since_is_not_replaced(file: Path) -> None:
-    alarms = Alarms(delay_on=0.0)
-    store = AlarmStore(alarms, file, AGAIN)
-    other = file.with_name('other')
-    other.write_text('of another program')
-    os.replace(other, file)
-    alarms.report('another', True, Priority.LOW, '', AGAIN + 10.0)
-    with pytest.raises(FileExistsError, match='another program has changed'):
-        store.save(AGAIN + 10.0)
-    assert file.read_text() == 'of another program'
-    assert [one.name for one in file.parent.iterdir()] == [file.name], 'nothing is left beside'
 
 
 def test_markup_and_control_characters_are_shown_as_text(file: Path) -> None:

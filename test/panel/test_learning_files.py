@@ -3,11 +3,13 @@
 
 """The files of a training and of a replay, and the words for a model."""
 
+from collections.abc import Mapping
 from datetime import datetime
 import json
 import os
 from pathlib import Path
 import struct
+import threading
 import zlib
 
 import pytest
@@ -18,11 +20,8 @@ from koopman_ros.panel.files import read_bounded
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, status_card, training_card, training_ranges
 from koopman_ros.panel.training_report import (
-    Learning,
     read_comparison,
     read_report,
-    report_base,
-    TrainingReport,
 )
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.signal_topics import SignalTopics
@@ -73,23 +72,6 @@ def test_a_report_of_another_training_or_machine_is_a_problem(
     assert (found.accepted, found.text, found.picture) == (False, '', b'')
 
 
-@pytest.mark.parametrize('text', [
-    '[]', '{', '[' * 100_000, '\xff', '{"bags": 1}', '{"bags": [{"recorded_model": []}]}'])
-def test_malformed_figures_are_a_problem_and_no_more(tmp_path: Path, text: str) -> None:
-    for name in ('new.json', 'summary.json'):
-        (tmp_path / name).write_text(text, encoding='latin-1')
-    assert text[:2] == '{"' or 'cannot read' in read_report(tmp_path / 'new').problem
-    found = read_comparison(tmp_path, 'new', 1.0, 'one\n\ntwo: wrong\n')
-    assert found.problem.endswith('one two: wrong')
-
-
-@pytest.mark.parametrize('data', [
-    b'', png()[:-1], b'GIF89a' + png(), b'<svg xmlns="http://www.w3.org/2000/svg"/>'])
-def test_only_a_whole_png_is_a_picture(base: Path, data: bytes) -> None:
-    Path(f'{base}.png').write_bytes(data)
-    assert read_report(base).picture == b''
-
-
 def test_pipes_folders_and_large_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'large').write_bytes(bytes(11))
@@ -97,19 +79,6 @@ def test_pipes_folders_and_large_files_are_not_read(tmp_path: Path) -> None:
                         ('large', 'more than 10 bytes')):
         with pytest.raises(ValueError, match=words):
             read_bounded(tmp_path / name, 10)
-
-
-@pytest.mark.parametrize(('model', 'name'), [
-    ('/a/new.safetensors', '/a/new'), ('/a/new.rejected.safetensors', '/a/new'),
-    ('reactor_nz4', None), ('', None)])
-def test_a_report_is_written_next_to_its_model(model: str, name: str | None) -> None:
-    assert report_base(model) == (None if name is None else Path(name))
-
-
-def test_pictures_have_two_names() -> None:
-    own = Learning(report=TrainingReport(picture=b'one'))
-    assert [own.picture(name) for name in ('training', 'comparison', '../x', '/etc/passwd')] == [
-        b'one', b'', b'', b'']
 
 
 def test_a_comparison_counts_the_commands_that_differ(tmp_path: Path) -> None:
@@ -121,18 +90,50 @@ def test_a_comparison_counts_the_commands_that_differ(tmp_path: Path) -> None:
     assert '3 of 10' in found.lines[1]
 
 
+class SlowDisk(LearningWatch):
+    """A watch whose files are on a disk that does not answer until it is released."""
+
+    def __init__(self) -> None:
+        given = {'system': 'reactor'}
+        values = {name: row.default for name, row in panel_table(None, given).rows.items()}
+        settings = panel_table(None, given).snapshot(values)
+        super().__init__('reactor', SignalTopics(
+            panel_signals(None, given), settings.states, settings.inputs), '/', str)
+        self.released, self.reads = threading.Event(), 0
+
+    def _follow(self, base: Path, trained: Mapping[str, str]) -> None:
+        self.reads += 1
+        self.released.wait(10.0)
+        super()._follow(base, trained)
+
+    def wait(self) -> None:
+        """Wait for the thread that reads."""
+        assert self._reader is not None
+        self._reader.join()
+
+
+def test_a_disk_that_does_not_answer_does_not_stop_the_panel(base: Path) -> None:
+    watch = SlowDisk()
+    for _ in range(3):
+        watch.training({**TRAINED, 'model_file': f'{base}.safetensors'}, '')
+        assert watch.learning.report is None
+    watch.released.set()
+    watch.wait()
+    assert watch.learning.report is not None
+    assert watch.reads == 1
+    watch.complete()
+
+
 def test_a_report_is_followed(base: Path) -> None:
-    given = {'system': 'reactor'}
-    values = {name: row.default for name, row in panel_table(None, given).rows.items()}
-    settings = panel_table(None, given).snapshot(values)
-    watch = LearningWatch('reactor', SignalTopics(
-        panel_signals(None, given), settings.states, settings.inputs), '/', str)
+    watch = SlowDisk()
+    watch.released.set()
     assert 'train one' in watch.compare('reactor_nz4').text
     trained = {**TRAINED, 'model_file': f'{base}.safetensors'}
     for number, (model, accepted) in enumerate(((trained['model_file'], True), ('other', False))):
         Path(f'{base}.json').write_text(json.dumps({**FIGURES, 'model_file': model}))
         os.utime(f'{base}.json', (2e9 + number, 2e9 + number))
         watch.training(trained, '')
+        watch.wait()
         assert watch.learning.report
         assert watch.learning.report.accepted is accepted
         assert 'record first' in watch.compare('reactor_nz4').text

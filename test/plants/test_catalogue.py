@@ -4,7 +4,7 @@
 """Plants by name, and their constants as parameters in SI."""
 
 import contextlib
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pytest
@@ -75,26 +75,6 @@ def test_each_plant_of_the_library_is_built_from_its_defaults_in_si_to_the_bit(n
                 build(plant, {row.name: end})
 
 
-def test_constants_are_shown_in_si_and_temperatures_in_degrees_celsius():
-    rate, surroundings = constants_of(Heater)
-    assert (rate.name, rate.unit, rate.description) == ('rate', '1/s', 'of cooling')
-    assert (rate.lower, rate.default, rate.upper) == pytest.approx((0.0, 0.7 / 60.0, 1.0 / 6.0))
-    assert astuple(surroundings) == (
-        'surroundings', 76.85, 'degC', -23.15, 226.85, 'around it', None)
-    warmer = build(Heater, {'rate': 0.05, 'surroundings': 20.0})
-    # 3 / min times 10 K
-    np.testing.assert_allclose(warmer.drift(np.array([283.15])), [30.0], rtol=1e-12)
-    np.testing.assert_array_equal(build(Heater, {}).drift(np.array([0.0])), [0.7 * 350.0])
-
-
-def test_a_nominal_state_is_given_only_where_it_is_wanted():
-    with pytest.raises(EquilibriumError, match='it freezes'):
-        build(Heater, {'surroundings': -10.0})
-    frozen = build(Heater, {'surroundings': -10.0}, [270.0])
-    np.testing.assert_array_equal(frozen.nominal_state, [270.0])
-    assert build(Plain, {}).name == 'two-state example'
-
-
 @pytest.mark.parametrize(('plant', 'values', 'message'), [
     (Heater, {'rate': 0.2}, r'rate is 12 1/min, must lie in \[0, 10\] 1/min'),
     (Heater, {'rate': np.nan}, 'rate is nan 1/min, must lie in'),
@@ -126,15 +106,3 @@ def test_plants_of_other_packages_are_found(monkeypatch, tmp_path):
     with pytest.raises(ValueError, match=r"'broken:plant' cannot be loaded "
                                          r"\(ModuleNotFoundError: No module named 'no_such_"):
         plant_class('broken:plant')
-
-
-class Untidy:
-    def system(self):
-        raise RuntimeError('no pump')
-
-
-@pytest.mark.parametrize(('plant', 'cause'), [
-    (Untidy, 'RuntimeError: no pump'), (lambda pump: pump, 'TypeError: .* argument: .pump')])
-def test_plant_that_fails_is_named_with_the_cause(plant, cause):
-    with pytest.raises(ValueError, match=rf'constructed \({cause}.*\): correct the class'):
-        build(plant, {})

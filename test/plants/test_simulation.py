@@ -11,7 +11,6 @@ import pytest
 
 from koopman_ros.plants import (
     advance,
-    ExcitationError,
     IntegrationError,
     IntegrationFailure,
     one_state_reactor,
@@ -20,7 +19,6 @@ from koopman_ros.plants import (
     sample_derivatives,
     scalar_example,
     simulate,
-    simulation,
     two_state_example,
     two_state_reactor,
 )
@@ -39,13 +37,6 @@ def _random_holds(count):
     return np.random.default_rng(1).uniform(281.3, 300.9, (count, 1))
 
 
-@pytest.mark.parametrize('x0', [0.05, 1.0, 3.0])
-def test_scalar_example_against_its_closed_form(x0):
-    episode = simulate(scalar_example(), [x0], np.zeros((9, 0)), 0.1 / x0)
-    expected = x0 / (1.0 - x0 * episode.time)
-    np.testing.assert_allclose(episode.x[:, 0], expected, rtol=1e-9)
-
-
 @pytest.mark.parametrize(('mu', 'lambda_'), [(-0.1, 1.0), (0.2, -1.5)])
 def test_two_state_example_against_its_closed_form(mu, lambda_):
     inputs = np.array([[1.0], [-2.0], [0.5], [40.0], [3.0]])
@@ -54,21 +45,6 @@ def test_two_state_example_against_its_closed_form(mu, lambda_):
     for u in inputs[:, 0]:
         expected.append(_two_state_closed_form(expected[-1], u, 1.0, mu, lambda_))
     np.testing.assert_allclose(episode.x, expected, rtol=1e-9)
-
-
-def test_reactor_settles_at_its_steady_state_but_not_in_no_time():
-    system = one_state_reactor()
-    state = advance(system, [310.0], [300.0], 60.0)
-    np.testing.assert_allclose(state, system.nominal_state, rtol=1e-9)
-    np.testing.assert_array_equal(advance(system, [310.0], [300.0], 0.0), [310.0])
-
-
-@pytest.mark.parametrize('rtol', [1e-9, 1e-10, 1e-11])
-def test_tolerance_is_kept(rtol):
-    system, inputs = one_state_reactor(), _random_holds(40)
-    episode, exact = (simulate(system, system.nominal_state, inputs, 0.5,
-                               limits=integration_limits(system, of)) for of in (rtol, 1e-13))
-    np.testing.assert_allclose(episode.x, exact.x, rtol=10.0 * rtol)
 
 
 def test_advancing_hold_by_hold_is_simulating_to_the_bit():
@@ -123,15 +99,6 @@ def test_a_failing_simulation_names_state_and_time(
     assert (copy.failure, copy.time) == (failure, caught.value.time)
 
 
-def test_stiff_plant_is_given_up_and_a_runaway_without_bounds_is_no_warning(monkeypatch):
-    free = replace(one_state_reactor(), state_lower=-np.inf, state_upper=np.inf)
-    assert advance(free, [324.0], [310.0], 5.0).item() > 1e6
-    monkeypatch.setattr(simulation, '_MAX_STEPS_PER_HOLD', 50)
-    with pytest.raises(IntegrationError, match='too many') as caught:
-        advance(two_state_example(-0.1, -1e6), [0.0, 1.0], [1.0], 1.0)
-    assert caught.value.failure is IntegrationFailure.TOO_MANY_STEPS
-
-
 @pytest.mark.parametrize(('call', 'message'), [
     (lambda s: advance(s, [1.0, 2.0], [300.0], 1.0), r'incompatible x: expected \(1,\)'),
     (lambda s: advance(s, [np.nan], [300.0], 1.0), 'x must be'),
@@ -164,15 +131,6 @@ def test_derivatives_are_exact_at_each_sample_but_the_last():
     np.testing.assert_array_equal(samples.dxdt, system.derivative(samples.x, samples.u))
     np.testing.assert_array_equal(samples.episode, np.repeat([0, 1], 3))
     np.testing.assert_array_equal(samples.time, np.tile(0.5 * np.arange(3), 2))
-
-
-def test_samples_without_input():
-    episode = simulate(scalar_example(), [0.5], np.zeros((3, 0)), 0.1)
-    samples = sample_derivatives(scalar_example(), [episode])
-    assert samples.u.shape == (3, 0)
-    np.testing.assert_array_equal(samples.dxdt, samples.x ** 2)
-    with pytest.raises(ValueError, match=r'incompatible u: expected \(\.\.\., 1\), got \(3, 0\)'):
-        sample_derivatives(one_state_reactor(), [episode])
 
 
 # Random steps.
@@ -219,40 +177,6 @@ def test_hold_times_are_random_or_fixed_and_the_last_one_is_cut_short():
     assert episode.x[0] == [306.0]
     # 0.3 / 0.1 is slightly below 3
     assert replace(DESIGN, hold_time=0.3, sample_period=0.1).hold_samples == (3, 3)
-
-
-def test_levels_that_leave_the_box_are_drawn_again():
-    design = replace(DESIGN, input_upper=315.0)
-    episode = random_steps(one_state_reactor(), design, 40.0, 0)
-    assert _inside(episode, design)
-    # the same levels without a box would have left it
-    free = replace(design, state_lower=0.0, state_upper=999.0)
-    assert not _inside(random_steps(one_state_reactor(), free, 40.0, 0), design)
-
-
-def test_two_states_in_a_box():
-    design = RandomStepDesign([285.0], [306.0], [0.6, 305.0], [1.0, 330.0], hold_time=(0.5, 3.0),
-                              sample_period=0.25)
-    episode = random_steps(two_state_reactor(), design, 40.0, 1)
-    assert _inside(episode, design)
-
-
-@pytest.mark.parametrize(('changes', 'x0', 'message'), [
-    ({'input_lower': 310.0, 'input_upper': 320.0, 'max_redraws': 7}, None,
-     r'levels of coolant_temperature in \[310, 320\] K; narrow the input bounds, widen the'),
-    ({}, [300.0], 'at the start temperature reached 300 K, outside the'),
-])
-def test_no_level_saves_it(changes, x0, message):
-    with pytest.raises(ExcitationError, match=message):
-        random_steps(one_state_reactor(), replace(DESIGN, **changes), 40.0, 0, x0=x0)
-
-
-def test_failure_that_is_not_the_box_is_passed_on():
-    design = RandomStepDesign(-1.0, 1.0, -np.inf, np.inf, hold_time=1.0, sample_period=1.0)
-    broken = replace(two_state_example(), drift=lambda x: np.where(x > 0.5, np.inf, x),
-                     drift_jacobian=None)
-    with pytest.raises(IntegrationError, match='is not finite'):
-        random_steps(broken, design, 5.0, 0, x0=[1.0, 1.0])
 
 
 @pytest.mark.parametrize(('changes', 'duration', 'message'), [

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from koopman_ros.plants import (
-    describe,
     equilibrium_input,
     EquilibriumError,
     one_state_reactor,
@@ -75,26 +74,6 @@ def test_derivatives_of_a_plant(plant_and_states):
         system.B = np.zeros((1, 1))
 
 
-def test_no_input_works_throughout():
-    system = scalar_example()
-    assert (system.n_x, system.n_u, system.B.shape) == (1, 0, (1, 0))
-    np.testing.assert_array_equal(system.derivative([3.0], []), [9.0])
-    np.testing.assert_array_equal(system.derivative([[3.0], [2.0]], np.zeros((2, 0))),
-                                  [[9.0], [4.0]])
-    assert equilibrium_input(system, [0.0]).shape == (0,)
-
-
-def test_units_scale_and_words():
-    system = replace(two_state_example(), nominal_state=[-3.0, 0.0])
-    for unit, seconds in (('min', 60.0), ('s', 1.0)):
-        assert replace(system, time_unit=unit).seconds_per_time_unit == seconds
-    # the nominal magnitude, and one at zero
-    np.testing.assert_array_equal(system.state_scale, [3.0, 1.0])
-    assert system.describe_state(np.array([1.0, -2.0])) == 'x1 = 1, x2 = -2'
-    assert two_state_reactor().describe_state(np.array([0.5, 350.0])) == (
-        'concentration = 0.5 mol/L, temperature = 350 K')
-
-
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'B': np.zeros((2, 2))}, r'incompatible B: expected \(2, 1\), got \(2, 2\)'),
     ({'B': np.zeros(2)}, r'incompatible B: expected \(2, 1\), got \(2,\)'),
@@ -134,13 +113,6 @@ def test_no_jacobian_means_finite_differences(plant_and_states):
     halved = replace(found, drift=lambda x: 0.5 * system.drift(x))
     np.testing.assert_allclose(halved.drift_jacobian(states), 0.5 * found.drift_jacobian(states),
                                rtol=1e-9, atol=1e-12)
-
-
-def test_a_kink_at_the_nominal_state_is_accepted():
-    """Coulomb friction at rest: the difference quotient there is no derivative."""
-    system = replace(two_state_example(), drift=lambda x: -np.sign(x) - x,
-                     drift_jacobian=lambda x: -np.broadcast_to(np.eye(2), (*x.shape, 2)))
-    assert system.n_x == 2
 
 
 @pytest.mark.parametrize(('x', 'u', 'message'), [
@@ -207,45 +179,7 @@ def test_state_that_no_input_holds(system, state, message):
     assert isinstance(caught.value, EquilibriumError) is ('no input' in message)
 
 
-def test_the_description_of_a_plant_has_everything_but_its_drift():
-    system = plant_class('two_tanks')().system()
-    known = describe(system)
-    # which it has of a B that is to be learned
-    names = {field.name for field in fields(known)} - {
-        'input_matrix_degree', 'disturbance_names', 'characteristics'}
-    for name in names:
-        np.testing.assert_array_equal(getattr(known, name), getattr(system, name))
-    assert {field.name for field in fields(system)} - names == {
-        'drift', 'drift_jacobian', 'state_lower', 'state_upper'}
-
-
 # The reactors and the examples of the paper.
-
-@pytest.mark.parametrize(('build', 'names', 'units', 'nominal', 'B'), [
-    (one_state_reactor, ('temperature',), ('K',), [NOMINAL], [[2.092050209]]),
-    (two_state_reactor, ('concentration', 'temperature'), ('mol/L', 'K'),
-     [0.87725294608097, NOMINAL], [[0.0], [2.092050209]]),
-])
-def test_signals_and_nominal_point_of_a_reactor(build, names, units, nominal, B):
-    system = build()
-    assert (system.state_names, system.state_units, system.time_unit) == (names, units, 'min')
-    assert (system.input_names, system.input_units) == (('coolant_temperature',), ('K',))
-    np.testing.assert_allclose(system.nominal_state, nominal, rtol=1e-13)
-    np.testing.assert_array_equal(system.nominal_input, [300.0])
-    np.testing.assert_allclose(system.B, B, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize('build', REACTORS)
-@pytest.mark.parametrize('changes', [
-    *({'heat_transfer_coefficient': 6e4, 'feed_temperature': kelvin}
-      for kelvin in (345.0, 350.0, 355.0)), {'feed_temperature': 345.0}])
-def test_nominal_point_follows_the_parameters(build, changes):
-    system = build(ReactorParameters(**changes))
-    assert system.nominal_input == [300.0]
-    rate = system.derivative(system.nominal_state, system.nominal_input)
-    np.testing.assert_allclose(rate, 0.0, atol=1e-10)
-    assert np.all(np.linalg.eigvals(system.drift_jacobian(system.nominal_state)).real < 0.0)
-    assert system.nominal_state[-1] < build().nominal_state[-1]
 
 
 @pytest.mark.parametrize(('build', 'changes'), [
@@ -265,15 +199,6 @@ def test_missing_stable_steady_state_is_an_error_unless_a_nominal_state_is_given
     assert system.B[-1, 0] == pytest.approx(gain * before.B[-1, 0])
     with pytest.raises(ValueError, match=r'incompatible nominal_state: expected .* got \(3,\)'):
         build(nominal_state=[1.0, 2.0, 3.0])
-
-
-def test_two_state_reactor_at_the_held_concentration_is_the_one_state_reactor():
-    parameters = ReactorParameters()
-    temperatures = np.linspace(300.0, 360.0, 7)
-    states = np.stack([np.full(7, parameters.concentration), temperatures], axis=-1)
-    np.testing.assert_array_equal(
-        two_state_reactor(parameters).drift(states)[:, 1],
-        one_state_reactor(parameters).drift(temperatures[:, None])[:, 0])
 
 
 @pytest.mark.parametrize(('changes', 'rate'), [

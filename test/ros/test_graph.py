@@ -4,7 +4,6 @@
 """Nodes among others: the policy grants what each does, and no more; messages that do not pass."""
 
 from collections.abc import Callable, Iterator
-from fnmatch import fnmatch
 from pathlib import Path
 import re
 from typing import Any
@@ -24,12 +23,10 @@ from std_srvs.srv import SetBool
 from koopman_ros.core.paths import config_directory
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
-from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import (
     COMMAND,
     MANUAL,
     player_table,
-    preset_wiring,
     SETPOINT,
 )
 from koopman_ros.records import BagWriter, message_definition
@@ -102,16 +99,6 @@ def test_a_node_uses_exactly_the_names_that_its_policy_grants(
     assert 'ignored' not in process.output()
 
 
-def test_there_is_a_policy_for_each_plant_that_is_shipped() -> None:
-    files = [path.stem for path in (config_directory() / 'plants').glob('*.yaml')]
-    assert {'reactor', 'two_tanks'} < set(files)
-    for system in files:
-        topic = preset_wiring(system).commands.popitem()[1].topic  # type: ignore[union-attr]
-        assert f'<topic>{topic}</topic>' in policy(system)
-    with pytest.raises(ConfigurationError, match=r'write config/plants/nowhere\.yaml'):
-        policy('nowhere')
-
-
 def test_the_trainer_uses_exactly_its_granted_topics_and_services(
         ros: Harness, tmp_path: Path) -> None:
     seen: Seen = {}
@@ -168,27 +155,6 @@ def test_an_operator_asks_and_watches_all_and_commands_by_the_set_points_alone()
     assert operator['publishes'] == {
         '/setpoint', '/manual_coolant_setpoint', '/rosout', '/parameter_events',
         '/events/write_split'}
-
-
-def test_an_operator_may_use_the_command_line_and_record_with_rosbag2() -> None:
-    """`ros2 service call` starts a node as rclpy makes them, `ros2 bag record` one of its own."""
-    serves = resolved(OPERATOR, 'operator')['serves']
-    rclpy.init()
-    try:
-        node = rclpy.create_node('_ros2cli_requester_std_srvs_Trigger')
-        own = {name for name, _ in node.get_service_names_and_types_by_node(
-            node.get_name(), node.get_namespace())}
-        published = {name for name, _ in node.get_publisher_names_and_types_by_node(
-            node.get_name(), node.get_namespace())}
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
-    assert len(own) == 7
-    assert {name for name in own if any(fnmatch(name, rule) for rule in serves)} == own
-    assert published <= resolved(OPERATOR, 'operator')['publishes']
-    # by rosbag2_transport/src/rosbag2_transport/recorder.cpp of Jazzy
-    assert {f'/rosbag2_recorder/{name}' for name in (
-        'snapshot', 'split_bagfile', 'pause', 'resume', 'is_paused', 'get_parameters')} <= serves
 
 
 def test_policy_has_the_form_that_sros2_reads() -> None:
@@ -267,13 +233,3 @@ def test_another_end_that_does_not_match_is_reported_and_logged(
         pair.other.destroy_publisher(publisher)
     pair.wait(lambda: not pair.matching.complaint)
     assert f'[WARN] [own]: {complaint}\n' in re.sub(r' \[[0-9.]+\]', '', capfd.readouterr().err)
-
-
-def test_subscriptions_that_match_are_no_complaint(pair: Pair) -> None:
-    for profile in (topics.LOOP_QOS, QoSProfile(depth=1), BEST_EFFORT):
-        hearing = pair.other.create_subscription(Temperature, 'command', lambda _: None, profile)
-        pair.wait(lambda: pair.speaker.get_subscription_count() == 1)
-        pair.wait(lambda: len(pair.own.get_subscriptions_info_by_topic('command')) == 1)
-        assert not pair.matching.complaint
-        pair.other.destroy_subscription(hearing)
-        pair.wait(lambda: not pair.own.get_subscriptions_info_by_topic('command'))

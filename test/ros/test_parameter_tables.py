@@ -11,7 +11,6 @@ import re
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from rclpy.node import Node
 
@@ -20,7 +19,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.signal_topics import plant_defaults, Signals, SignalTopics
+from koopman_ros.parameters.signal_topics import plant_defaults, SignalTopics
 from koopman_ros.parameters.table import (
     ConfigurationError,
     group,
@@ -30,7 +29,6 @@ from koopman_ros.parameters.table import (
     Specification,
 )
 from koopman_ros.parameters.trainer import trainer_signals, trainer_table
-from koopman_ros.plants import build, plant_class
 from koopman_ros.ros.node import LoopNode, range_of
 from koopman_ros.ros.node_descriptions import main, POLICY_FILE, tables
 from koopman_ros.ros.training import task_fields
@@ -133,14 +131,6 @@ def test_a_value_that_fails_to_build_is_rejected_with_error_and_parameter(
     assert BUILT.check(now, before) == (reason and f'{reason}; choose another value')
 
 
-@pytest.mark.parametrize('system', ['reactor', 'two_tanks'])
-def test_the_quality_of_a_measurement_is_recorded(system: str) -> None:
-    usual = trainer_table(None, {'system': system}).rows['topics'].default
-    name = usual[0]
-    given = {'system': system, f'{name}.quality_topic': 'quality'}
-    assert {*trainer_table(None, given).rows['topics'].default} == {*usual, 'quality'}
-
-
 @pytest.mark.parametrize('node', TABLES)
 def test_every_number_has_a_range_that_a_slider_can_show(node: str) -> None:
     for item in TABLES[node].rows.values():
@@ -163,18 +153,6 @@ def declared(ros: Harness, *arguments: str, name: str = 'odd',
         node.destroy_node()
 
 
-def test_names_of_other_nodes_are_ignored_with_one_warning(
-        ros: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / 'shared.yaml'
-    file.write_text('/**:\n  ros__parameters:\n    count: 5\n    foreign: 1.0\n    cuont: 7\n'
-                    '    nothing: []\n    more:\n      than: one\n')
-    assert declared(ros, '--params-file', str(file)) == (Odd(count=5), False)
-    (line,) = capfd.readouterr().err.splitlines()
-    assert '[WARN]' in line
-    assert line.endswith("[odd]: unknown parameters are ignored: 'foreign', "
-                         "'cuont' (did you mean count?), 'more.than'")
-
-
 @pytest.mark.parametrize(('node', 'given', 'words'), [
     ('trainer', ('topics:=[]',), 'topics = [] must be a list of at least one string'),
     ('plant', ('speed:=[]',), 'speed = [] must be a double, e.g. 1.0'),
@@ -191,18 +169,6 @@ def test_a_start_with_unusable_parameters_is_rejected(
         declared(ros, *arguments, table=TABLES[node])
     assert str(rejection.value).startswith(words)
     assert '\n' not in str(rejection.value)
-
-
-def test_concentration_too_small_to_integrate_is_rejected() -> None:
-    one, two = PlantTable(), PlantTable({'system': 'two_state'})
-
-    def check(table: PlantTable, concentration: float) -> str:
-        return table.check(table.snapshot({'constants.feed_concentration': concentration}))
-
-    assert check(one, 1e-312) == ''
-    assert check(two, 1e-312).startswith(
-        'constants.feed_concentration = 1e-312 mol/m^3 is not usable: atol is ')
-    assert [check(two, harmless) for harmless in (0.0, 1e-97)] == ['', '']
 
 
 # Signals.
@@ -308,14 +274,6 @@ def test_file_of_a_plant_fits_the_tables_of_its_nodes(system: str) -> None:
         assert table.check(table.snapshot({})) == '', node
 
 
-@pytest.mark.parametrize('system', PLANTS)
-def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
-    """As a whole loop is started with it."""
-    file = config_directory() / 'plants' / f'{system}.yaml'
-    assert declared(ros, '--params-file', str(file), name='plant',
-                    table=PlantTable({'system': system}))[0].system == system
-
-
 @pytest.mark.parametrize(('node', 'given', 'words'), [
     ('controller', {'coolant_temperature.command_topic': 'temperature'},
      "coolant_temperature is commanded on 'temperature', the topic on which temperature is"),
@@ -384,43 +342,12 @@ def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> Non
             PlantTable({**named, 'disturbances_measured': (given,)})
 
 
-def test_a_characteristic_is_converted_to_the_unit_of_the_model() -> None:
-    table = trainer_table(load(model_path(reactor.MODEL)))
-    signals = trainer_signals(load(model_path(reactor.MODEL)), {})
-    assert table.snapshot({}).training(signals)['characteristics'] == {}
-    values = table.snapshot({'coolant_temperature.characteristic': [10.0, 0.0, 20.0, 1.0]})
-    assert values.training(signals)['characteristics']['coolant_temperature'] == pytest.approx(
-        (283.15, 0.0, 293.15, 1.0))
-
-
-def test_equations_of_a_trainer_are_those_of_its_task() -> None:
-    table = trainer_table(load(model_path(reactor.MODEL)))
-    fields = table.snapshot({'physical_model': 'two_state', 'estimated_constants': [
-        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training(
-            Signals({'T': 'K'}, {'u': '1'}))
-    assert fields['physical_model'] == 'two_state'
-    assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
-                                   'reaction_enthalpy': None}
-
-
 @pytest.mark.parametrize(('name', 'levels'), [
     ('reactor_nz4', ('sdre', 'linear')), ('two_state', ('sdre', 'linear')),
     ('pendulum', ('mpc', 'sdre', 'linear')), ('two_state_example', ('mpc', 'sdre', 'linear'))])
 def test_an_unstable_plant_is_planned_for(name: str, levels: tuple[str, ...]) -> None:
     tuning = table_of(load(model_path(name)), {'system': ''}).snapshot({}).tuning
     assert tuning.fallback_order == levels
-
-
-@pytest.mark.parametrize('name', ['two_tanks', 'pendulum'])
-def test_times_follow_from_the_modes_of_the_plant(name: str) -> None:
-    """Of the true one, whose pendulum falls by itself."""
-    plant = build(plant_class(name), {})
-    modes = np.linalg.eigvals(plant.drift_jacobian(plant.nominal_state))
-    fastest = 0.0 if np.any(modes.real > 0.0) else float(np.max(np.abs(modes)))
-    rows = table_of(load(model_path(name)), {'system': ''}).rows
-    assert rows['observer_bandwidth'].default == pytest.approx(fastest, rel=0.05)
-    assert rows['bumpless_transfer_time'].default == pytest.approx(
-        0.5 / fastest if fastest else 0.0, rel=0.05)
 
 
 # The shipped files.

@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control import Initialisation, SetpointRequest
+from koopman_ros.control import Controller
 from koopman_ros.core.paths import model_path
-from koopman_ros.demo.loop import Row
-from koopman_ros.evaluation import at, simulate, Simulation
+from koopman_ros.evaluation import at
 from koopman_ros.evaluation.optimal_cost import optimum
 from koopman_ros.learning import IncrementalTraining, Linearisation, NeuralDrift, rollout_rmse
-from koopman_ros.model import Box, load
-from koopman_ros.plants import describe, Process
-from koopman_ros.testing import HarnessError
+from koopman_ros.model import load
+from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.plants import Actuator, describe, equilibrium_input
+from koopman_ros.ros.simulated_plant import SimulatedPlant
 from studies import saddle, saddle_act, unstable
 from studies.campaign import Campaign, Experiment, Metrics, Models, run_campaign
 from studies.equations import EQUATIONS
@@ -44,7 +44,6 @@ from studies.partly_measured.study import least
 from studies.robustness import disturbances, loop, stability
 from studies.robustness.loop import REACTOR, START
 from studies.true_model import TrueModel
-from studies.unstable import steady
 
 PERIOD = 1.0 / 60.0  # min
 
@@ -175,10 +174,10 @@ def test_figures_of_the_paper(campaign: Campaign) -> None:
         assert of_reactor[f'{name}/cost_ratio_to_optimum'] == pytest.approx(1.0, abs=1e-5)
 
 
-def test_report_of_the_paper_has_its_tables_and_eleven_figures(
+def test_report_of_the_paper_has_its_tables_and_figures(
         campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = figures.draw_figures(campaign, tmp_path)
-    assert [one.file[:2] for one in drawn] == [f'{number:02d}' for number in range(1, 12)]
+    assert [one.file[:2] for one in drawn] == [f'{number:02d}' for number in range(1, 7)]
     for one in drawn:
         # neither blank nor one colour
         assert np.std(matplotlib.image.imread(tmp_path / one.file)[..., :3]) > 0.02
@@ -190,7 +189,7 @@ def test_report_of_the_paper_has_its_tables_and_eleven_figures(
     report.write_report({'seeds': 1, 'complete': True, 'wall_seconds': 1.0, **campaign.summary()},
                         drawn, tmp_path)
     text = (tmp_path / 'report.md').read_text()
-    assert len(re.findall(r'^!\[.*\]\((.*)\)$', text, re.MULTILINE)) == 11
+    assert len(re.findall(r'^!\[.*\]\((.*)\)$', text, re.MULTILINE)) == 6
     assert '| `reactor/nz=3/tracking_offset_kelvin` | 0.001 |' in text
     assert 'nan' not in text
     assert report.Criterion('a/b', 1e-6, 1.0).met({'a': {'b': [1.0, 1.1, None, 0.99]}}) == (2, 4)
@@ -204,7 +203,7 @@ def van_der_pol(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp('general')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, 'LEARNERS', {
-            'EDMD-3': learners.LEARNERS['EDMD-3'], 'SINDy-5': learners.LEARNERS['SINDy-5'],
+            'EDMD-3': learners.LEARNERS['EDMD-3'],
             'hasty lift': learners._trained(lambda n_x: IncrementalTraining(n_x + 1,
                                                                             max_iterations=5))})
         patch.setitem(study.EXPERIMENTS, 'van_der_pol', partial(
@@ -223,32 +222,24 @@ def test_a_cubic_drift_is_found_by_cubic_models(van_der_pol: Path) -> None:
     found = {label: {name: values[0] for name, values in of.items()}
              for label, of in summary['van_der_pol'].items()}
     assert found['EDMD-3']['rx'] < 1e-20
-    assert found['SINDy-5']['rx'] < 1e-10
     assert found['hasty lift']['accepted'] in (True, False)
     for of in found.values():
         assert 0 <= of['no_gain'] <= of['not_arrived'] <= of['missed'] <= 3
-        assert of['least_ratio'] is None or of['least_ratio'] > 0.99
     used = summary['coordinates']['van_der_pol']
-    # noise apart, exact in and beyond the box
-    assert max(used['EDMD-3']['rx'] + used['EDMD-3']['rx_few'] + used['EDMD-3']['rx_beyond']
-               ) < 1e-20
+    assert used['EDMD-3']['rx'][0] < 1e-20 < used['EDMD-3']['rx_noisy'][0]
     assert used['identity lift']['rollout'][0] < used['identity lift']['rollout_z'][0]
     text = (van_der_pol / 'report.md').read_text()
     assert re.search(r'^\| natural SDRE on the truth \| 1 of 1 \|$', text, re.MULTILINE)
     assert 'nan' not in text
-    assert np.std(matplotlib.image.imread(van_der_pol / 'general.png')[..., :3]) > 0.02
 
 
 def test_predictions_of_a_linear_plant_are_exact() -> None:
-    """In z as by the drift, and in discrete time with and without delays."""
+    """In z as by the drift."""
     spring = oscillator('spring', lambda x1, x2: x1 - x2, lambda x1, x2: (1.0, -1.0))
     case = replace(CASES['duffing'], system=spring)
-    samples, held_out = case.samples(0), case.samples(1, 10)
+    held_out = case.samples(1, 10)
     np.testing.assert_allclose(coordinates.rolled_in_z(case.truth, held_out),
                                rollout_rmse(case.truth, held_out), rtol=1e-3, atol=1e-9)
-    box = Box.of(describe(spring), samples.x, samples.u)
-    for delays in (0, 1):
-        assert coordinates.discrete(case, box, samples, held_out, delays) < 1e-6
 
 
 def test_controllers_of_partly_measured_plants_stand_in_one_table(
@@ -297,12 +288,23 @@ def test_margins_without_observer_are_those_of_a_first_order_loop() -> None:
         (1.0 + pole) / (learned * gain), rel=1e-6)
 
 
+def grows(controller: Controller, temperature: float, delay: float) -> bool:
+    """Simulate for 450 s whether a deviation grows when the coolant is late by some s."""
+    held = float(equilibrium_input(REACTOR, [temperature])[0])
+    course = loop.run_loop(
+        controller, REACTOR, np.array([temperature + 1e-4]), held, 450.0,
+        [at(0.0, loop.at_setpoint(temperature))], actuator=Actuator(delay=delay))
+    # the swing at the end
+    late = loop.errors(course, temperature)[-len(course.times) // 3:]
+    return bool(np.ptp(late) > 2e-4)
+
+
 def test_the_simulated_loop_oscillates_beyond_its_delay_margin() -> None:
     controller = loop.reactor_controller(bandwidth=10.0, coolant_weight=0.1)
     margin = stability.margins_at(controller, 316.0).delay
     assert margin == pytest.approx(8.92, abs=0.05)
-    assert not stability.grows(controller, 316.0, delay=0.95 * margin, seconds=450.0)
-    assert stability.grows(controller, 316.0, delay=1.05 * margin, seconds=450.0)
+    assert not grows(controller, 316.0, 0.95 * margin)
+    assert grows(controller, 316.0, 1.05 * margin)
 
 
 def test_no_coolant_saves_a_start_above_the_boundary() -> None:
@@ -365,31 +367,11 @@ def test_without_the_concentration_the_same_law_costs_hardly_more(
     assert lost == ['0 of 1', '1.0000', '0 of 1', '0 of 1']
 
 
-@pytest.fixture(scope='module')
-def fouled_run() -> Simulation:
-    x0, u0 = steady(350.0)
-    return simulate(
-        saddle_act._laws(saddle.truth(), ('sdre',)), Process(saddle.reactor({}), 0, x0, u0),
-        [at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
-         at(10.0, SetpointRequest(0, np.array([352.0]))),
-         at(40.0, saddle.becomes(saddle.reactor(saddle.FOULING)))],
-        duration=90.0, C=np.array([[0.0, 1.0]]), noise=np.array([0.1]), seed=1)
-
-
-@pytest.mark.parametrize('noise', [1.0, 3.0])
-def test_temperatures_are_found_behind_their_noise(fouled_run: Simulation, noise: float) -> None:
-    one = fouled_run
-    measured = one.states[:, 1] + noise * (one.measured[:, 0] - one.states[:, 1])
-    rows = [Row(float(t), {'concentration': float(x[0]), 'temperature': float(y)},
-                {'temperature': float(r[0])}, {'coolant_temperature': float(u[0])})
-            for t, x, y, r, u in zip(one.times, one.states, measured, one.setpoints,
-                                     one.commands, strict=True)]
-    phases = [('lift', 0.0), ('fouling', 40.0)]
-    if noise > 1.0:
-        with pytest.raises(HarnessError, match='K of noise'):
-            saddle_act._reconstructed(rows, {}, saddle.truth(), phases)
-        return
-    found = saddle_act._reconstructed(rows, {}, saddle.truth(), phases)
-    # the last one has no sample after it that would tell
-    assert found.states[:-1] == pytest.approx(one.states[:-1], abs=1e-4)
-    assert found.fouled == 40
+def test_the_noise_of_the_plant_is_known() -> None:
+    table = PlantTable({'system': 'two_state'})
+    plant = SimulatedPlant(table, table.snapshot({
+        'temperature.measurement_noise': saddle.NOISE, 'seed': 3}), 0)
+    measured = np.array([plant.measure(sample)[0][1] for sample in range(20)])
+    assert np.std(measured) > 0.5 * saddle.NOISE
+    found = saddle_act.without_noise(np.arange(20.0), measured, 3)
+    assert found == pytest.approx(plant.process.x[1], abs=1e-9)

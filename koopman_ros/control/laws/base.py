@@ -199,6 +199,8 @@ class Law(ABC):
     model_free: ClassVar[bool] = False
     #: whether it acts up to `linear_model_margin`, in place of `learned_model_margin`
     extrapolates: ClassVar[bool] = False
+    #: whether it reads the covariance of an estimate, predicted over a dead time only if so
+    reads_covariance: ClassVar[bool] = False
 
     def __init__(self, model: LiftedModel, tuning: Tuning, parameters: Any) -> None:
         """
@@ -221,8 +223,10 @@ class Law(ABC):
     @property
     def margin(self) -> float:
         """The distance outside the training data, in half-ranges, up to which it acts."""
-        tuning = self.tuning
-        return tuning.linear_model_margin if self.extrapolates else tuning.learned_model_margin
+        tuning, data = self.tuning, self.model.training_states
+        given = tuning.linear_model_margin if self.extrapolates else tuning.learned_model_margin
+        # training states of several dimensions are farther apart than a margin of one
+        return given if data is None else max(given, data.fill_distance)
 
     def unusable(self) -> Reason | None:
         """Return why it can never act, as for a missing package; None where it can."""

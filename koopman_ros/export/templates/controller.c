@@ -659,34 +659,38 @@ static int usable(const koopman_estimate *e) {
         && all_finite(of(NP, NP, e->P));
 }
 
-/* Predict an estimate under an input, in its units, for some seconds; returns 0 where it is lost.
- * `all` is x and, for a Kalman filter, its derivatives by what x and w were. */
-static int predicted(int linear, koopman_estimate *e, const double *input, double seconds) {
+/* Predict an estimate under an input, in its units, for some seconds, with or without its
+ * covariance; returns 0 where it is lost. `all` is x and, with the covariance, its derivatives by
+ * what x and w were. */
+static int predicted(int linear, koopman_estimate *e, const double *input, double seconds,
+                     int covariance) {
     double count = larger(1.0, ceil(seconds * STEP_RATE)), h = seconds / TIME_UNIT / count;
-    mat all = zeros(NX, WIDTH), rate = all, J, F = diagonal(NP, 1.0);
+    int width = covariance ? WIDTH : 1;
+    mat all = zeros(NX, width), rate = all, J, F = diagonal(NP, 1.0);
     if (!(count <= MOST_STEPS)) return 0;
-    if (KALMAN) put(&all, 0, 1, diagonal(NX, 1.0));
+    if (covariance) put(&all, 0, 1, diagonal(NX, 1.0));
     put(&all, 0, 0, of(NX, 1, e->x));
     EACH(k, count) {
-        mat sum = zeros(NX, WIDTH);
+        mat sum = zeros(NX, width);
         EACH(stage, STAGES) {
             mat at = plus(all, AHEAD[stage] * h, rate), x;
             x = rate_under(linear, joined(block(at, 0, 0, NX, 1), input_deviation(input)),
-                           of(NX, 1, e->w), KALMAN ? &J : NULL);
-            if (KALMAN) rate = mul(block(J, 0, 0, NX, NX), at);
+                           of(NX, 1, e->w), covariance ? &J : NULL);
+            if (covariance) rate = mul(block(J, 0, 0, NX, NX), at);
             put(&rate, 0, 0, x);
-            EACH(i, KALMAN ? NX : 0) rate.a[i * WIDTH + 1 + NX + i] += 1.0;
+            EACH(i, covariance ? NX : 0) rate.a[i * width + 1 + NX + i] += 1.0;
             sum = plus(sum, PARTS[stage], rate);
         }
         all = plus(all, h / 6.0, sum);
     }
     store(block(all, 0, 0, NX, 1), e->x);
-    if (KALMAN) {
+    if (covariance) {
         put(&F, 0, 0, block(all, 0, 1, NX, NP));
         F = mul(mul(F, plus(of(NP, NP, e->P), seconds, of(NP, NP, INTENSITY))), transposed(F));
         store(symmetric(F), e->P);
     }
-    EACH(i, NX) if (!((KALMAN ? sqrt(e->P[i * NP + i]) : fabs(e->x[i])) <= FARTHEST[i])) return 0;
+    EACH(i, NX)
+        if (!((covariance ? sqrt(e->P[i * NP + i]) : fabs(e->x[i])) <= FARTHEST[i])) return 0;
     return usable(e);
 }
 
@@ -786,9 +790,9 @@ static mat feed_forward(const koopman_state *s) {
     return mul(of(NX, ND, MODEL_E), deviation(OF_D, s->disturbance));
 }
 
-/* Predict an estimate from one time to another; returns 0 where it is lost. Pieces shorter than a
- * share of the fastest time constant act by their mean; inputs with a dead time up to `acts` are
- * held. */
+/* Predict an estimate from one time to another; returns 0 where it is lost. For a law, pieces
+ * shorter than a share of the fastest time constant act by their mean, and the covariance stays;
+ * inputs with a dead time up to `acts` are held. */
 static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end,
                        double share, int64_t acts, mat held, koopman_estimate *e) {
     double time = 0.0, u[NU];
@@ -801,7 +805,8 @@ static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_
         if (time * FASTEST_RATE < share && next < end) continue;
         count = share > 0.0 ? larger(1.0, ceil(time * FASTEST_RATE)) : 1.0;
         sum = scaled(1.0 / time, sum);
-        EACH(k, count) if (!predicted(linear, e, sum.a, time / count)) return 0;
+        EACH(k, count) if (!predicted(linear, e, sum.a, time / count, KALMAN && !(share > 0.0)))
+            return 0;
         sum = zeros(NU, 1);
         time = 0.0;
     }

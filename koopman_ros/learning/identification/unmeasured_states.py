@@ -170,7 +170,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
 
     for degree in usual_degrees(n_y + count)[1:highest_degree] if (
             count or search.record.late or not measured) else ():
-        if last is None or explained():
+        # of a linear drift the errors of its filter do not say what noise alone would leave
+        if last is None or (degree > 2 and explained()):
             break
         name = f'drift of degree {degree} with {not_measured(count)}'
         monitor = stage(name)
@@ -201,11 +202,12 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             add_networks(choice, shared(other), {
                 name: item for name, item in sizes.items() if item[0] == (units or item[0])},
                 stage_with(other.hidden), backend or Serial())
-        best = smallest_adequate(choice.candidates)
-        if any(manipulated) and not (
-                isinstance(best.model.drift, DriftModel) and best.model.drift.linear):
-            choice.gains(late_as_suits(best, manipulated, search.samples, stage(
-                f'dead time of the {best.model.drift.form}')))
+    best = smallest_adequate(choice.candidates)
+    # a linear model may need a dead time to stand for what is not linear
+    if any(manipulated) and (best.late or not explained()) and not (
+            isinstance(best.model.drift, DriftModel) and best.model.drift.linear):
+        choice.gains(late_as_suits(best, manipulated, search.samples, stage(
+            f'dead time of the {best.model.drift.form}')))
     # with as many as are allowed, more may be better
     searched = ('input_matrix_degree', *['unmeasured_states'] * (linear.hidden < hidden))
     able = choice.candidates

@@ -88,6 +88,17 @@ def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate
     assert ('unmeasured_states' in found.searched) == bool(hidden)
 
 
+@pytest.mark.parametrize(('curvature', 'degree'), [(0.0, 1), (0.015, 2)])
+def test_a_curvature_that_is_small_beside_the_noise_is_learned(curvature, degree):
+    found = identify_unmeasured(PLANT, [record(
+        lambda x, u: oscillator(x, u) - np.array([0.0, curvature * x[0] ** 2]), samples=800)], 1,
+        networks=False, dead_times=False)
+    linear = max(score.rmse[0] for score in found.scores)
+    # so little above the noise that a filter, which sees each measurement, might not show it
+    assert linear < 1.1 * NOISE
+    assert found.drift.degree == degree
+
+
 def test_an_input_may_act_by_a_product_with_the_state():
     found = identify_structure(PLANT, [record(
         lambda x, u: np.array([-x[0] + (1.0 + 0.5 * x[0]) * u, -x[1]]), samples=500)])
