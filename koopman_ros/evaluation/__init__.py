@@ -26,24 +26,7 @@ from koopman_ros.evaluation.simulate import (
     Simulation,
 )
 
-__all__ = [
-    'Change',
-    'ClosedLoop',
-    'ClosedLoopTest',
-    'Loop',
-    'MeasurementBuffer',
-    'ModelComparison',
-    'Plant',
-    'PredictionWindows',
-    'ScheduledChange',
-    'Sensor',
-    'Simulation',
-    'at',
-    'compare',
-    'evaluate_closed_loops',
-    'exchange',
-    'perfect',
-    'restart',
-    'run_closed_loop',
-    'simulate',
-]
+__all__ = ['Change', 'ClosedLoop', 'ClosedLoopTest', 'Loop', 'MeasurementBuffer',
+           'ModelComparison', 'Plant', 'PredictionWindows', 'ScheduledChange', 'Sensor',
+           'Simulation', 'at', 'compare', 'evaluate_closed_loops', 'exchange', 'perfect',
+           'restart', 'run_closed_loop', 'simulate']

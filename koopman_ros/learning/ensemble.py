@@ -23,8 +23,10 @@ from koopman_ros.learning.identification import (
 from koopman_ros.learning.identification.chance import clearly_positive
 from koopman_ros.learning.identification.drift import autocorrelation
 from koopman_ros.learning.identification.network_drift import NetworkDrift
-from koopman_ros.learning.identification.output_error import PolynomialCoefficients
-from koopman_ros.learning.identification.structure_candidates import fitted_by_simulation
+from koopman_ros.learning.identification.output_error import (
+    fitted_by_simulation,
+    PolynomialCoefficients,
+)
 
 # They differ where their rates do by more than these shares of the motion: in the mean square,
 # and at most.
@@ -84,11 +86,8 @@ def inconsistency(found: Identified) -> str:
 
 
 def _fitted(drift: DriftModel | NetworkDrift, episodes: Sequence[Episode]) -> Drift:
-    data, states = _segments(episodes), drift.box.states
     model = drift if isinstance(drift, NetworkDrift) else PolynomialCoefficients(drift, True)
-    return fitted_by_simulation(
-        model, np.zeros((len(states),) * 2), data, states.to_deviation(data.x[0]),
-        lambda *_: False, _STEPS).model.drift
+    return fitted_by_simulation(model, _segments(episodes), iterations=_STEPS).model.drift
 
 
 def _squares(drift: Drift, episodes: Sequence[Episode]) -> Array:

@@ -81,7 +81,7 @@ def unfounded_instability(model: LiftedModel, found: Identified,
     :param advice: to be followed by another one.
     """
     factor = SECONDS_PER_TIME_UNIT[found.drift.box.time_unit] / model.seconds_per_time_unit
-    episodes = [*found.fitted, *found.held_out]
+    episodes = found.episodes
     longest = factor * max(float(one.time[-1] - one.time[0]) for one in episodes)
 
     def unstable(point: OperatingPoint) -> str:

@@ -154,7 +154,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                       tuple(one for one in record.episodes if one.delayed(dead_time) is not None),
                       record.account, task.bags)
     if found.hidden:
-        episodes = [*found.fitted, *found.held_out]
+        episodes = found.episodes
     box = found.drift.box
     if current is not None and (box.states.names, box.states.units) != (
             current.states.names, current.states.units):

@@ -189,7 +189,7 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
     """Draw where a state was, over the input that moves it most."""
     box = found.drift.box
     j = int(np.argmax(np.abs(found.drift.input_matrix[i] * box.inputs.scale)))
-    episodes = [*found.fitted, *found.held_out]
+    episodes = found.episodes
     visited = np.full((CELLS, CELLS), np.nan)
     cells = visited_cells(episodes, box)
     visited[cells[:, len(box.states) + j], cells[:, i]] = 1.0

@@ -26,7 +26,7 @@ from koopman_ros.learning.identification.identify import Identified, identify
 from koopman_ros.learning.identification.innovations_form import SETTLING
 from koopman_ros.learning.identification.input_functions import Hats, NonAffineDrift
 from koopman_ros.learning.identification.output_error import (
-    innovations_form,
+    fitted_by_simulation,
     PolynomialCoefficients,
     Refined,
 )
@@ -34,7 +34,7 @@ from koopman_ros.learning.identification.weak_form import weak_form
 
 _POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions next to states
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
-_FEW_STEPS, _MOST_STEPS = 10, 40  # of refinements
+_FEW_STEPS, _MOST_STEPS, _TOLERANCE = 10, 40, 1e-4  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
 
 
@@ -118,7 +118,7 @@ def _not_affine(found: Identified) -> NonAffineDrift | None:
 def _hats(found: Identified, names: Sequence[str], count: int) -> Hats | None:
     """Return functions of some inputs, knots at quantiles; None for inputs of two levels."""
     inputs = found.drift.box.inputs
-    u = np.concatenate([one.inputs_at(one.time) for one in (*found.fitted, *found.held_out)])
+    u = np.concatenate([one.inputs_at(one.time) for one in found.episodes])
     knots = {name: np.unique(np.quantile(u[:, inputs.names.index(name)], np.linspace(
         0.0, 1.0, count))) for name in names}
     knots = {name: own for name, own in knots.items() if len(own) > 2}
@@ -127,7 +127,7 @@ def _hats(found: Identified, names: Sequence[str], count: int) -> Hats | None:
 
 def _better(found: Identified, functions: Hats, drift: DriftModel) -> DriftModel | None:
     """Return a drift with functions of inputs added; None if it does not err less."""
-    episodes, step = [*found.fitted, *found.held_out], longest_step(found.fitted)
+    episodes, step = found.episodes, longest_step(found.fitted)
     more = [functions.added(one) for one in episodes]
     box = replace(drift.box, inputs=functions.coordinates())
     n_x, n_u = len(box.states), len(drift.box.inputs)
@@ -157,8 +157,5 @@ def _better(found: Identified, functions: Hats, drift: DriftModel) -> DriftModel
 
 def _refined(drift: DriftModel, segments: Segments, steps: int = _MOST_STEPS
              ) -> Refined[PolynomialCoefficients]:
-    states = drift.box.states
-    return innovations_form(
-        PolynomialCoefficients(drift, learn_input_matrix=True), np.zeros((len(states),) * 2),
-        segments, states.to_deviation(segments.x[0]), np.ones(len(states)), smooth=True,
-        iterations=steps)
+    return fitted_by_simulation(PolynomialCoefficients(drift, learn_input_matrix=True), segments,
+                                tolerance=_TOLERANCE, iterations=steps)

@@ -31,22 +31,26 @@ class SplitRecord:
 
     :param plant: names and units of the measured signals, and B where it is known.
     :param hidden: whether the plant has other states, which a filter finds after a while.
+    :param offsets: whether the last inputs are constant disturbances of the episodes.
+    :ivar late: dead times (n_u,) by which its inputs are later, in samples, where there are any.
     :raises ValueError: when the episodes are too short.
     """
 
     def __init__(self, plant: PlantDescription, episodes: Sequence[Episode], seed: int, *,
-                 hidden: bool
-                 ) -> None:
+                 hidden: bool, offsets: bool = False) -> None:
         self.plant, self.episodes = plant, list(episodes)
-        self._seed, self._hidden = seed, hidden
+        self._seed, self._hidden, self.offsets = seed, hidden, offsets
+        self.late, self._unmoved = tuple[int, ...](), self
         signals = len(plant.state_names) + len(plant.input_names)
-        self.parts = segments_of(episodes, signals)
-        # which samples of all episodes each of them holds
+        # with the numbers of samples in place of measurements
         edges = np.cumsum([0, *map(len, episodes)]).tolist()
         self._numbered = [
-            replace(episode, x=np.arange(*ends, dtype=np.float64)[:, None])
+            replace(episode, x=np.arange(*ends)[:, None])
             for episode, ends in zip(episodes, itertools.pairwise(edges), strict=True)]
-        self._rows = [part.x[:, 0].astype(int) for part in segments_of(self._numbered, signals)]
+        self._numbered_parts = segments_of(self._numbered, signals)
+        self._measured = np.concatenate([episode.x for episode in episodes])
+        self.parts = [replace(part, x=self._measured[_rows(part)])
+                      for part in self._numbered_parts]
         # a filter that knows nothing at first knows more when an episode has lasted a while
         begins = {episode.time[0] for episode in episodes} if hidden else set()
         self._settled = [i for i, part in enumerate(self.parts) if part.time[0] not in begins]
@@ -64,34 +68,30 @@ class SplitRecord:
         self.period = sample_interval(self.parts)
 
     def later(self, late: Sequence[int]) -> SplitRecord:
-        """Return the record with its first inputs later by numbers of samples."""
+        """Return the record as it was given, with its first inputs later by numbers of samples."""
+        given = self._unmoved
         if not any(late):
-            return self
+            return given
         dead_time = np.zeros(len(self.plant.input_names))
-        dead_time[:len(late)] = self.period * np.array(late)
-        return SplitRecord(self.plant, [_moved(one, dead_time) for one in self.episodes],
-                           self._seed, hidden=self._hidden)
+        dead_time[:len(late)] = given.period * np.array(late)
+        moved = SplitRecord(self.plant, [_moved(one, dead_time) for one in given.episodes],
+                            self._seed, hidden=self._hidden, offsets=self.offsets)
+        moved.late, moved._unmoved = tuple(late), given
+        return moved
 
-    def segments(self, parts: Sequence[int], samples: int | None = None) -> Segments:
-        """Return some segments on grids, cut into pieces of a largest number of samples."""
-        return Segments.of(self._pieces([self.parts[i] for i in parts], samples), self.step)
-
-    def foreseen(self, predictor: Predictor[Drift], parts: Sequence[int],
-                 samples: int | None = None) -> Array:
-        """Return the predicted states (M, n_x) of the first samples of these, in deviations."""
-        run = self._run(predictor)
-        pieces = self._pieces([replace(self.parts[i], x=self._rows[i][:, None].astype(float))
-                               for i in parts], samples)
-        return run.foreseen[[int(piece.x[0, 0]) for piece in pieces]]
-
-    def simulated(self, predictor: Predictor[Drift], samples: int) -> tuple[Segments, Array]:
+    def simulated(self, predictor: Predictor[Drift], samples: int | None = None,
+                  parts: Sequence[int] | None = None) -> tuple[Segments, Array]:
         """
-        Return the whole record in pieces with at most a number of samples, for simulations.
+        Return segments, of the whole record by default, and where simulations of them start.
 
-        With them the predicted states (M, n_x) of their first samples, in deviations.
+        :param samples: most of a piece, into which they are cut.
+        :return: with the predicted states (M, n_x) of their first samples, in deviations.
         """
-        rows = [int(piece.x[0, 0]) for piece in cut(self._numbered, samples)]
-        return self.pieces(samples), self._run(predictor).foreseen[rows]
+        pieces = self._numbered if parts is None else [self._numbered_parts[i] for i in parts]
+        pieces = pieces if samples is None else cut(pieces, samples)
+        return (Segments.of([replace(one, x=self._measured[_rows(one)]) for one in pieces],
+                            self.step),
+                self._run(predictor).foreseen[[int(one.x[0, 0]) for one in pieces]])
 
     def pieces(self, samples: int) -> Segments:
         """Return the whole record on grids, cut into pieces of a largest number of samples."""
@@ -102,9 +102,9 @@ class SplitRecord:
         """Return the innovations, (N, n_y), over segments, all that settled by default."""
         return self._run(predictor).innovations[self._rows_of(parts)]
 
-    def estimates(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None) -> Array:
-        """Return the estimated states (N, n_x) there, in deviations."""
-        return self._run(predictor).estimates[self._rows_of(parts)]
+    def estimates(self, predictor: Predictor[Drift]) -> Array:
+        """Return the estimated states (N, n_x) over those that settled, in deviations."""
+        return self._run(predictor).estimates[self._rows_of(None)]
 
     def identified(self, predictor: Predictor[Drift], method: str, scores: Sequence[Score],
                    monitor: Callable[..., bool]) -> Identified:
@@ -112,7 +112,7 @@ class SplitRecord:
         drift, n_y = predictor.drift, predictor.gain.shape[1]
         hidden = drift.box.states.to_physical(self._run(predictor).estimates)[:, n_y:]
         known, held_out = (
-            cut([replace(part, x=np.hstack([part.x, hidden[self._rows[i]]]))
+            cut([replace(part, x=np.hstack([part.x, hidden[_rows(self._numbered_parts[i])]]))
                  for i, part in enumerate(self.parts) if i in share and i in self._settled],
                 self.length(drift, _GROWTH))
             for share in ((*self.fit, *self.choose), self.held_out))
@@ -129,8 +129,8 @@ class SplitRecord:
         return self._last[1]
 
     def _rows_of(self, parts: Sequence[int] | None) -> NDArray[np.int64]:
-        return np.concatenate([
-            self._rows[i] for i in (self._settled if parts is None else parts)])
+        return np.concatenate([_rows(self._numbered_parts[i])
+                               for i in (self._settled if parts is None else parts)])
 
     def length(self, drift: Drift, growth: float) -> int:
         """Return samples over which roll-outs of a plant, be it unstable, grow e^growth-fold."""
@@ -149,9 +149,10 @@ class SplitRecord:
         longest = max(len(episode) for episode in self.episodes)
         return int(min(longest, max(shortest, _MEMORIES / max(-fastest * self.period, 1e-9))))
 
-    @staticmethod
-    def _pieces(episodes: list[Episode], samples: int | None) -> list[Episode]:
-        return episodes if samples is None else cut(episodes, samples)
+
+def _rows(numbered: Episode) -> NDArray[np.int64]:
+    """Return the numbers of the samples (N,) of a part of the record."""
+    return numbered.x[:, 0].astype(np.int64)
 
 
 def _moved(episode: Episode, dead_time: Array) -> Episode:

@@ -34,7 +34,6 @@ class DeadTimes:
     period: float  #: usual interval, in time units
     order: int  #: of the linear model of each output
     rmse: Array  #: (n_y,) error of its simulation, in state units
-    rmse_without: Array  #: (n_y,) that of the best model without dead time
 
     @property
     def values(self) -> Array:
@@ -79,7 +78,7 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
         highest = tuple(min(most, d + 2) for most, d in zip(highest, delays, strict=True))
     tried = [model for search in searches for model in search.models]
     if not tried:
-        return DeadTimes(none, period, 0, np.full(n_y, np.nan), np.full(n_y, np.nan))
+        return DeadTimes(none, period, 0, np.full(n_y, np.nan))
     best = _median(searches, tried)
     plain = min((one for one in tried if one.delays == none), key=lambda one: one.criterion,
                 default=best)
@@ -87,7 +86,7 @@ def find_dead_times(episodes: Sequence[Episode], known: Sequence[bool] = (), *,
     if not (_white(best.errors) or clearly_positive(
             block_gains(best.errors, plain.errors, _BLOCKS))):
         best = plain
-    return DeadTimes(best.delays, period, best.order, best.rmse, plain.rmse)
+    return DeadTimes(best.delays, period, best.order, best.rmse)
 
 
 @dataclass(frozen=True)

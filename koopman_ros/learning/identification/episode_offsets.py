@@ -52,13 +52,9 @@ def without_episode_inputs(found: Identified, n_u: int) -> Identified:
         assert isinstance(one, DriftModel | NetworkDrift)
         return replace(one, B=one.B[:, :n_u], box=box)
 
-    fitted, held_out = (tuple(replace(one, u=one.u[:, :n_u], linear=one.linear[:n_u])
-                              for one in some) for some in (found.fitted, found.held_out))
-    linear = first(found.linear)
-    assert isinstance(linear, DriftModel)
-    return replace(found, drift=first(drift), linear=linear, fitted=fitted, held_out=held_out,
-                   alternatives=tuple(map(first, found.alternatives)), offsets=offsets,
-                   dead_time=found.dead_time[:n_u])
+    return found.mapped(
+        first, lambda one: replace(one, u=one.u[:, :n_u], linear=one.linear[:n_u]),
+        offsets=offsets, dead_time=found.dead_time[:n_u])
 
 
 def _levels(episodes: int) -> Array:

@@ -17,7 +17,7 @@ from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.learning.identification.drift import Drift
-from koopman_ros.model import Box
+from koopman_ros.model import Box, Coordinates
 from koopman_ros.plants import build, Constant, ControlAffineSystem
 
 # Of an angle, by which the equations are differentiated by a constant: rounding and curvature both
@@ -88,6 +88,10 @@ class Equations(Drift):
     def at(self, theta: Array) -> Equations:
         """Return the same with other angles."""
         return replace(self, theta=theta)
+
+    def moved(self, states: Coordinates) -> Equations:
+        """Return the same in deviations of other coordinates of the states."""
+        return replace(self, box=replace(self.box, states=states))
 
     @property
     def shares(self) -> Array:

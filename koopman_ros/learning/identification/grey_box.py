@@ -23,12 +23,11 @@ from koopman_ros.learning.identification.identify import (
     INNOVATIONS_FORM,
     OUTPUT_ERROR,
     Score,
-    stage_by_stage,
+    Stopped,
     Watch,
 )
-from koopman_ros.learning.identification.innovations_form import Predictor
+from koopman_ros.learning.identification.innovations_form import Predictor, spanned
 from koopman_ros.learning.identification.output_error import innovations_form, Refined
-from koopman_ros.model import Coordinates
 from koopman_ros.plants import Constant, estimated_parameters_of
 
 # How far disturbances, as filters assume them, move a state from sample to sample, over the noise
@@ -71,25 +70,37 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     """
     plant = replace(plant, B=None, input_matrix_degree=0)
     sought = estimated_parameters_of(equations, ranges or {})
-    progress = stage_by_stage(watch, 3)
     start = Equations.of(equations, sought, plant,
                          np.concatenate([e.interpolated() for e in episodes]),
                          np.concatenate([e.u for e in episodes]))
     n_y = len(plant.state_names)
     record = SplitRecord(plant, episodes, seed, hidden=len(start.box.states) > n_y)
-    predictor = _within(record, _filter(record, start, n_y))
-    predictor, refined = _refined(record, predictor, progress(
-        f'{len(sought)} constants of {equations.__name__}'))
+    predictor = _filter(record, start, n_y)
+    predictor = spanned(predictor, record.estimates(predictor))
+    predictor, refined = _refined(record, predictor, _stage(
+        watch, 0, f'{len(sought)} constants of {equations.__name__}'))
     method = INNOVATIONS_FORM if np.any(refined.gain) else OUTPUT_ERROR
     left = record.innovations(predictor, record.choose)
     scale = start.box.states.scale[:n_y]
     score = Score(method, None, scale * np.sqrt(np.mean(left ** 2, axis=0)),
                   float(np.mean(left ** 2)))
     refined = _fitted(record, predictor, refined.gain, sorted([*record.fit, *record.choose]),
-                      _GROWTHS[1], progress('constants on all episodes'))
-    predictor = _within(record, Predictor(refined.model, predictor.gain))
-    found = record.identified(predictor, method, [score], progress('linear model'))
+                      _GROWTHS[1], _stage(watch, 1, 'constants on all episodes'))
+    predictor = Predictor(refined.model, predictor.gain)
+    predictor = spanned(predictor, record.estimates(predictor))
+    found = record.identified(predictor, method, [score], _stage(watch, 2, 'linear model'))
     return replace(found, constants=_estimates(sought, refined))
+
+
+def _stage(watch: Watch, number: int, text: str) -> Callable[..., bool]:
+    """Begin one of three stages, and return its monitor."""
+    def monitor(*_: object) -> bool:
+        if watch(number, 3, text):
+            raise Stopped
+        return False
+
+    monitor()
+    return monitor
 
 
 def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equations]:
@@ -143,27 +154,11 @@ def _fitted(record: SplitRecord, start: Predictor[Equations], gain: Array, parts
     :param gain: with which the segments are predicted.
     :param growth: exponent by which predictions may grow, for which the segments are cut.
     """
-    samples = record.length(start.drift, growth)
-    segments, starts = record.segments(parts, samples), record.foreseen(start, parts, samples)
+    segments, starts = record.simulated(start, record.length(start.drift, growth), parts)
     # outputs weighed by the innovations of a filter
     deviation = np.std(start.along(segments, starts).innovations, axis=0)
     return innovations_form(start.drift, gain, segments, starts, deviation, smooth=True,
                             tolerance=_TOLERANCE, monitor=monitor)
-
-
-def _within(record: SplitRecord, predictor: Predictor[Equations]) -> Predictor[Equations]:
-    """Return the same in deviations that span the states as they are estimated."""
-    drift, n_y = predictor.drift, predictor.gain.shape[1]
-    old = drift.box.states
-    x = old.to_physical(record.estimates(predictor))
-    low, high = (np.concatenate((end[:n_y], of(x[:, n_y:], axis=0))) for end, of in (
-        (old.lower, np.min), (old.upper, np.max)))
-    if not np.all(high > low):
-        raise ValueError('an unmeasured state is constant: record longer, with steps of the input')
-    new = Coordinates.spanning(old.names, old.units, low, high)
-    gain = predictor.gain * old.scale[:, None] / old.scale[:n_y] * (
-        new.scale[:n_y] / new.scale[:, None])
-    return Predictor(replace(drift, box=replace(drift.box, states=new)), gain)
 
 
 def _estimates(sought: Sequence[Constant], refined: Refined[Equations]

@@ -3,11 +3,12 @@
 
 """Choice of a drift model among all methods and degrees, by held-out segments."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field, replace
 from enum import Enum
-import itertools
 import math
 from typing import Any
 
@@ -61,32 +62,6 @@ Watch = Callable[[int, int, str], bool]
 
 class Stopped(Exception):  # noqa: N818
     """The `watch` callback asked to stop."""
-
-
-def stage_by_stage(watch: Watch, total: int, done: int = 0
-                   ) -> Callable[[str], Callable[..., bool]]:
-    """
-    Return a function that begins the next of `total` stages and returns its monitor.
-
-    `done` stages are already complete.
-
-    A stage reports when it begins and whenever its monitor is called, which raises
-    :class:`Stopped` when `watch` asked to stop.
-    """
-    numbers = itertools.count(done)
-
-    def begin(text: str) -> Callable[..., bool]:
-        number = next(numbers)
-
-        def monitor(*_: object) -> bool:
-            if watch(number, total, text):
-                raise Stopped
-            return False
-
-        monitor()
-        return monitor
-
-    return begin
 
 
 @dataclass(frozen=True)
@@ -170,6 +145,20 @@ class Identified:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dead_time', np.broadcast_to(
             self.dead_time, len(self.drift.box.inputs)))
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """All segments."""
+        return [*self.fitted, *self.held_out]
+
+    def mapped(self, drift: Callable[[Any], Any], episode: Callable[[Episode], Episode],
+               **changes: Any) -> Identified:
+        """Return the same with functions of its drifts and segments, and other changes."""
+        fitted, held_out = (tuple(map(episode, some)) for some in (self.fitted, self.held_out))
+        return replace(self, **{
+            'drift': drift(self.drift), 'linear': drift(self.linear), 'fitted': fitted,
+            'held_out': held_out, 'alternatives': tuple(map(drift, self.alternatives)),
+            **changes})
 
 
 def identify(plant: PlantDescription, episodes: Sequence[Episode], *,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from koopman_ros.learning.identification.drift import (
     Segments,
 )
 from koopman_ros.learning.identification.weak_form import regress
+from koopman_ros.model import Coordinates
 
 SETTLING = 40  # samples after which a filter has found the state
 # Of the search for the start of an episode: how far hidden states are tried, steps, differences.
@@ -41,32 +42,42 @@ class Predictor(Generic[_Drift]):
     def run(self, episodes: Sequence[Episode], step: float) -> FilterRun:
         """Filter episodes of measurements (N, n_y), from the starts that suit the first ones."""
         data = Segments.of(episodes, step)
-        run = self._filter(data, self.starts(data))
-        if not np.all(np.isfinite(run[1])):
+        found = self.along(data, self.starts(data))
+        if not np.all(np.isfinite(found.estimates)):
             raise ValueError('the estimate of the unmeasured states diverges')
-        return _run(data, run)
+        return found
 
     def along(self, segments: Segments, starts: Array) -> FilterRun:
         """Filter segments from starts (M, n_x), in deviations."""
-        return _run(segments, self._filter(segments, starts))
+        before, after = self.states(segments, starts)
+        # episode by episode, each in the order of its times
+        return FilterRun(*(np.swapaxes(one, 0, 1)[segments.sampled.T] for one in (
+            before, after, self._errors(segments, before))))
 
-    def _filter(self, data: Segments, x: Array) -> tuple[Array, Array, Array]:
-        """Return the arrays of a run from starts (M, n_x), on the grid (K + 1, M, ...)."""
+    def states(self, data: Segments, x: Array) -> tuple[Array, Array]:
+        """Return the states (K + 1, M, n_x) before and after corrections, from starts (M, n_x)."""
         drift, n_y = self.drift, self.gain.shape[1]
-        v, target = drift.box.inputs.to_deviation(data.u), self._target(data)
-        foreseen = np.empty((*target.shape[:2], len(self.gain)))
-        estimates, errors = np.empty(foreseen.shape), np.empty(target.shape)
+        v, target = drift.box.inputs.to_deviation(data.u), self.target(data)
+        before = np.empty((len(v) + 1, *x.shape))
+        # without a gain a predictor never corrects its state: its prediction is a simulation
+        after = np.empty(before.shape) if np.any(self.gain) else before
         with np.errstate(all='ignore'):
-            for k in range(len(target)):
-                foreseen[k] = x
-                errors[k] = np.where(data.measured[k], target[k] - x[:, :n_y], 0.0)
-                estimates[k] = x = x + errors[k] @ self.gain.T
+            for k in range(len(before)):
+                before[k] = x
+                if after is not before:
+                    error = np.where(data.measured[k], x[:, :n_y] - target[k], 0.0)
+                    after[k] = x = x - error @ self.gain.T
                 if k < len(v):
                     x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x,
                                          data.steps[k][:, None])
-        return foreseen, estimates, errors
+        return before, after
 
-    def _target(self, data: Segments) -> Array:
+    def _errors(self, data: Segments, before: Array) -> Array:
+        """Return the innovations (K + 1, M, n_y), 0 where nothing was measured."""
+        return np.where(data.measured, self.target(data) - before[..., :self.gain.shape[1]], 0.0)
+
+    def target(self, data: Segments) -> Array:
+        """Return the measurements (K + 1, M, n_y) in deviations."""
         states = self.drift.box.states
         return states.only(states.names[:self.gain.shape[1]]).to_deviation(data.x)
 
@@ -82,12 +93,13 @@ class Predictor(Generic[_Drift]):
                          data.measured[:rows + 1])
         n_x, n_y = self.gain.shape
         home = np.zeros((first.x.shape[1], n_x))
-        home[:, :n_y] = self._target(first)[0]
+        home[:, :n_y] = self.target(first)[0]
         hidden = _APART * np.eye(n_x)[n_y:]
 
         def errors(starts: Array) -> Array:
             """Evaluate the errors, (S, k, M, n_y), from starts (S, M, n_x), side by side."""
-            found = self._filter(first.repeated(len(starts)), starts.reshape(-1, n_x))[2]
+            tiled = first.repeated(len(starts))
+            found = self._errors(tiled, self.states(tiled, starts.reshape(-1, n_x))[0])
             return np.moveaxis(found.reshape(len(found), *starts.shape[:2], n_y), 1, 0)
 
         def best_of(starts: Array) -> tuple[Array, Array]:
@@ -123,11 +135,6 @@ class FilterRun:
     innovations: Array  #: (N, n_y)
 
 
-def _run(data: Segments, values: Sequence[Array]) -> FilterRun:
-    # episode by episode, each in the order of its times
-    return FilterRun(*(np.swapaxes(one, 0, 1)[data.sampled.T] for one in values))
-
-
 def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:
     """Return the same with monomials of the next degree, which have no weight yet."""
     drift = predictor.drift
@@ -137,6 +144,23 @@ def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:
     # those of a degree come before those of the next
     coefficients[:len(drift.coefficients)] = drift.coefficients
     return replace(predictor, drift=replace(higher, coefficients=coefficients))
+
+
+def spanned(predictor: Predictor[Any], xi: Array) -> Predictor[Any]:
+    """
+    Return a predictor whose drift can be moved, with hidden states from -1 to 1.
+
+    :param xi: (N, n_x) states as they were estimated, in deviations.
+    :raises ValueError: for a hidden state that is constant.
+    """
+    old, n_y = predictor.drift.box.states, predictor.gain.shape[1]
+    low, high = (old.to_physical(end(xi, axis=0)) for end in (np.min, np.max))
+    if not np.all(high[n_y:] > low[n_y:]):
+        raise ValueError('an unmeasured state is constant: record longer, with steps of the input')
+    low[:n_y], high[:n_y] = old.lower[:n_y], old.upper[:n_y]
+    new = Coordinates.spanning(old.names, old.units, low, high)
+    ratio = new.scale / old.scale
+    return Predictor(predictor.drift.moved(new), predictor.gain / ratio[:, None] * ratio[:n_y])
 
 
 def standardised(predictor: Predictor[DriftModel], xi: Array) -> Predictor[DriftModel]:

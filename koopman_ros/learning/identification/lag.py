@@ -199,10 +199,11 @@ def with_lag(found: Identified, lag: Array, commanded: Collection[str] = ()) -> 
     """
     inputs = found.drift.box.inputs
     moved = [inputs.names.index(name) for name in commanded]
-    fitted, held_out = (tuple(
-        _commanded(_ramped(one, moved, _RAMP * lag[moved].min(initial=np.inf)), lag)
-        for one in some) for some in (found.fitted, found.held_out))
-    u = np.vstack([one.u for one in (*fitted, *held_out)])
+
+    def with_commands(one: Episode) -> Episode:
+        return _commanded(_ramped(one, moved, _RAMP * lag[moved].min(initial=np.inf)), lag)
+
+    u = np.vstack([with_commands(one).u for one in found.episodes])
     u[:, moved] = np.clip(u[:, moved], inputs.lower[moved], inputs.upper[moved])
     commands = replace(
         Coordinates.spanning(inputs.names, inputs.units, u.min(axis=0), u.max(axis=0)),
@@ -213,12 +214,11 @@ def with_lag(found: Identified, lag: Array, commanded: Collection[str] = ()) -> 
     def of_commands(drift: Drift) -> LaggedDrift:
         return LaggedDrift.of(drift, lag, commands, commanded)
 
-    return replace(
-        found, drift=of_commands(found.drift), fitted=fitted, held_out=held_out,
-        linear=of_commands(replace(found.linear, box=replace(
-            found.linear.box, inputs=replace(found.linear.box.inputs,
-                                             characteristics=commands.characteristics)))),
-        alternatives=tuple(map(of_commands, found.alternatives)),
+    linear = found.linear.box.inputs
+    return found.mapped(
+        of_commands, with_commands, linear=of_commands(replace(found.linear, box=replace(
+            found.linear.box, inputs=replace(
+                linear, characteristics=commands.characteristics)))),
         noise=np.append(found.noise, zeros(count)), hidden=found.hidden + count,
         offsets=np.hstack((found.offsets, zeros((len(found.offsets), count)))) if (
             len(found.offsets)) else found.offsets)

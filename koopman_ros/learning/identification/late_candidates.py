@@ -6,17 +6,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.dead_time import LinearModels, LONGEST, Sampled, SHARE
-from koopman_ros.learning.identification.output_error import Refinable, Refined
+from koopman_ros.learning.identification.output_error import (
+    fitted_by_simulation,
+    Refinable,
+    Refined,
+)
 from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
 from koopman_ros.learning.identification.structure_candidates import (
     candidate_of,
-    fitted_by_simulation,
     StructureCandidate,
 )
 
@@ -32,8 +34,8 @@ def late_linear(search: PolynomialSearch, linear: StructureCandidate, manipulate
     for late in _dead_times(search.record, linear, manipulated, monitor):
         if monitor():
             break
-        tried.append(PolynomialSearch(search.record.later(late), search.samples, late=late
-                                      ).linear(linear.hidden, monitor))
+        tried.append(PolynomialSearch(search.record.later(late), search.samples).linear(
+            linear.hidden, monitor))
     return min(filter(None, tried), key=lambda one: one.score.cost, default=None)
 
 
@@ -53,14 +55,14 @@ def _dead_times(record: SplitRecord, linear: StructureCandidate, manipulated: Se
     return [late for late in (best, *neighbours) if any(late) and min(late) >= 0]
 
 
-def late_as_suits(one: StructureCandidate, record: SplitRecord, manipulated: Sequence[bool],
-                  samples: int, monitor: Callable[..., bool]) -> StructureCandidate | None:
+def late_as_suits(one: StructureCandidate, manipulated: Sequence[bool], samples: int,
+                  monitor: Callable[..., bool]) -> StructureCandidate | None:
     """
     Return a candidate with the dead times near its own that suit it best; None for the same.
 
-    :param record: with inputs that are not late.
     :param samples: longest piece that is simulated.
     """
+    record = one.record
     longest = _longest(record)
     here = own = one.late or (0,) * len(record.plant.input_names)
     found = dict[tuple[int, ...], Refined[Refinable]]()
@@ -69,8 +71,8 @@ def late_as_suits(one: StructureCandidate, record: SplitRecord, manipulated: Seq
         if late not in found:
             near = found.get(here)
             found[late] = fitted_by_simulation(
-                near.model if near else one.model, one.gain, record.later(late).pieces(samples),
-                near.starts if near else one.starts, monitor, _FEW_STEPS)
+                near.model if near else one.model, record.later(late).pieces(samples),
+                near.starts if near else one.starts, iterations=_FEW_STEPS, monitor=monitor)
         return found[late].cost
 
     cost(own)
@@ -85,10 +87,9 @@ def late_as_suits(one: StructureCandidate, record: SplitRecord, manipulated: Seq
         return None
     moved, best = record.later(here), found[here]
     data = moved.pieces(samples)
-    other = candidate_of(
-        fitted_by_simulation(best.model, one.gain, data, best.starts, monitor), one.start, data,
-        moved, one.hidden)
-    return other and replace(other, offsets=one.offsets, late=here)
+    return candidate_of(
+        fitted_by_simulation(best.model, data, best.starts, monitor=monitor), one.start, data,
+        moved)
 
 
 def _longest(record: SplitRecord) -> int:

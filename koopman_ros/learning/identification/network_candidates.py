@@ -7,18 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import time
 
 from koopman_ros.core.datasets import Array
 from koopman_ros.execution import Backend, Tell
 from koopman_ros.learning.identification.drift import DriftModel, Segments
 from koopman_ros.learning.identification.network_drift import NetworkDrift
-from koopman_ros.learning.identification.output_error import Refined
+from koopman_ros.learning.identification.output_error import fitted_by_simulation, Refined
 from koopman_ros.learning.identification.structure_candidates import (
     candidate_of,
     Choice,
-    fitted_by_simulation,
     StructureCandidate,
 )
 
@@ -48,9 +47,7 @@ class Shared:
 
     def candidate(self, network: Refined[NetworkDrift]) -> StructureCandidate | None:
         """Return the candidate of a network."""
-        linear = self.linear
-        found = candidate_of(network, linear.start, self.data[0], linear.record, linear.hidden)
-        return found and replace(found, offsets=linear.offsets, late=linear.late)
+        return candidate_of(network, self.linear.start, self.data[0], self.linear.record)
 
 
 def add_networks(choice: Choice, shared: Shared, items: Mapping[str, tuple[int, int]],
@@ -92,5 +89,5 @@ def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[Netwo
     found = fitted_by_simulation(
         NetworkDrift.added_to(drift, units, seed, ridge=_RIDGE,
                             learn_input_matrix=shared.learn_input_matrix),
-        shared.linear.gain, *shared.data, monitor)
+        *shared.data, monitor=monitor)
     return found if shared.allowed(found.model) else None

@@ -61,11 +61,9 @@ def identify_non_affine(plant: PlantDescription, episodes: Sequence[Episode],
         return NonAffineDrift(
             Box(box.states, box.inputs.only(plant.input_names), box.time_unit), drift, functions)
 
-    fitted, held_out = (tuple(replace(one, u=one.u[:, :m], linear=one.linear[:m]) for one in some)
-                        for some in (found.fitted, found.held_out))
-    return replace(found, drift=of_inputs(found.drift), linear=linear.drift, fitted=fitted,
-                   held_out=held_out, alternatives=tuple(map(of_inputs, found.alternatives)),
-                   dead_time=np.zeros(()), warnings=linear.warnings)
+    return found.mapped(
+        of_inputs, lambda one: replace(one, u=one.u[:, :m], linear=one.linear[:m]),
+        linear=linear.drift, dead_time=np.zeros(()), warnings=linear.warnings)
 
 
 def _functions(inputs: Coordinates, names: Sequence[str]) -> Legendre:

@@ -18,6 +18,8 @@ from torch import Tensor
 from koopman_ros.core.datasets import Array
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
+from koopman_ros.learning.identification.innovations_form import Predictor
+from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.lift.levenberg_marquardt import (
     minimise,
     normal_equations,
@@ -97,21 +99,36 @@ _Model = TypeVar('_Model', bound=Refinable)
 def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: bool,
                  monitor: Callable[[int, float], bool] | None = None) -> DriftModel:
     """
-    Refine a drift model, B and the starts of all segments until its predictions fit best.
+    Refine a drift model, B and the starts of all segments by :func:`fitted_by_simulation`.
+
+    :param learn_input_matrix: whether B is refined, too.
+    :param monitor: called with the step and the cost after each step; True ends it.
+    """
+    return fitted_by_simulation(
+        PolynomialCoefficients(model, learn_input_matrix), segments, tolerance=1e-6,
+        iterations=_MAX_ITERATIONS, monitor=monitor).model.drift
+
+
+def fitted_by_simulation(model: _Model, segments: Segments, starts: Array | None = None, *,
+                         tolerance: float = 1e-5, iterations: int = 200,
+                         monitor: Callable[[int, float], bool] | None = None) -> Refined[_Model]:
+    """
+    Refine a model and the starts of all segments until its simulations err least.
 
     The maximum-likelihood estimate where the noise of the measurements is white and nothing else
     disturbs the plant (Ljung 1999, chapter 7). Levenberg-Marquardt with the exact derivatives of
     the Runge-Kutta steps; its normal equations are gathered step by step.
 
-    :param learn_input_matrix: whether B is refined, too.
-    :param monitor: called with the step and the cost after each step; True ends it.
+    :param starts: (M, n_x) to begin with, in deviations; as measured by default.
+    :param tolerance: like `iterations` and `monitor` of :func:`innovations_form`.
     """
-    n_x = len(model.box.states)
+    states, n_y = model.drift.box.states, segments.x.shape[2]
     # without a gain a predictor never corrects its state: its prediction is a simulation
     return innovations_form(
-        PolynomialCoefficients(model, learn_input_matrix), np.zeros((n_x, n_x)), segments,
-        model.box.states.to_deviation(segments.x[0]), np.ones(n_x), smooth=True,
-        tolerance=1e-6, monitor=monitor).model.drift
+        model, np.zeros((len(states), n_y)), segments,
+        states.to_deviation(segments.x[0]) if starts is None else starts, np.ones(n_y),
+        smooth=True, tolerance=tolerance, iterations=iterations, monitor=monitor,
+        penalty=model.penalty if isinstance(model, NetworkDrift) else None)
 
 
 @dataclass(frozen=True)
@@ -225,8 +242,7 @@ class _Problem(Generic[_Model]):
 
     @cached_property
     def _target(self) -> Array:
-        states = self.model.drift.box.states
-        return states.only(states.names[:self.segments.x.shape[2]]).to_deviation(self.segments.x)
+        return Predictor(self.model.drift, self.gain).target(self.segments)
 
     @cached_property
     def _counted(self) -> NDArray[np.bool_]:
@@ -238,7 +254,7 @@ class _Problem(Generic[_Model]):
         """Add the scaled prediction errors at given parameters."""
         model, K, starts = self.split(theta.numpy())
         with np.errstate(all='ignore'):
-            before, after = self._path(model.drift, K, starts)
+            before, after = Predictor(model.drift, K).states(self.segments, starts)
             errors = self._weighed(before[..., :self._target.shape[2]] - self._target)
             cost = 0.5 * float(np.sum(errors ** 2)) / self.count
             if not np.isfinite(cost):
@@ -257,7 +273,7 @@ class _Problem(Generic[_Model]):
         """Return the errors as :meth:`Refined.left_out` has them."""
         model, K, starts = self.split(theta)
         p, (M, n_x), n_y = len(self.model.theta), starts.shape, self._target.shape[2]
-        before, after = self._path(model.drift, K, starts)
+        before, after = Predictor(model.drift, K).states(self.segments, starts)
         errors = self._weighed(before[..., :n_y] - self._target)
         J = np.concatenate([self._weighed(S, rows) for rows, S in self._sensitivities(
             model, K, before, after, p + n_x)])
@@ -281,21 +297,6 @@ class _Problem(Generic[_Model]):
         counted, deviation = self._counted[rows], self.deviation
         return np.where(counted.reshape(*counted.shape, *more),
                         values / deviation.reshape(*deviation.shape, *more), 0.0)
-
-    def _path(self, drift: Drift, K: Array, x: Array) -> tuple[Array, Array]:
-        """Return the states (K + 1, M, n_x) before and after the corrections by a gain."""
-        data, v, n_y = self.segments, self._inputs, self._target.shape[2]
-        before = np.empty((len(v) + 1, *x.shape))
-        # without a gain a predictor never corrects its state: its prediction is a simulation
-        after = np.empty(before.shape) if np.any(K) else before
-        for k in range(len(before)):
-            before[k] = x
-            if after is not before:
-                error = np.where(data.measured[k], x[:, :n_y] - self._target[k], 0.0)
-                after[k] = x = x - error @ K.T
-            if k < len(v):
-                x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x, data.steps[k][:, None])
-        return before, after
 
     def _sums(self, model: _Model, K: Array, before: Array, after: Array, errors: Array
               ) -> tuple[Array, Array]:

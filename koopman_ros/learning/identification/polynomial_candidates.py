@@ -18,6 +18,7 @@ from koopman_ros.learning.identification.innovations_form import (
     standardised,
 )
 from koopman_ros.learning.identification.output_error import (
+    fitted_by_simulation,
     innovations_form,
     PolynomialCoefficients,
 )
@@ -26,7 +27,6 @@ from koopman_ros.learning.identification.structure_candidates import (
     candidate_of,
     Choice,
     compared,
-    fitted_by_simulation,
     not_measured,
     StructureCandidate,
 )
@@ -45,17 +45,12 @@ class PolynomialSearch:
     """
     Candidates of polynomial drifts.
 
-    :param offsets: whether the inputs of the record are constant disturbances, too.
-    :param late: dead times by which its inputs are later, in samples.
-    :ivar late: those dead times.
     :ivar deviation: (n_y,) standard deviations of the innovations of the last filter.
     :ivar samples: longest piece that is simulated; 0 until a model shows the plant's memory.
     """
 
-    def __init__(self, record: SplitRecord, samples: int = 0, *, offsets: bool = False,
-                 late: tuple[int, ...] = ()) -> None:
+    def __init__(self, record: SplitRecord, samples: int = 0) -> None:
         self.record, self._plant, self.samples = record, record.plant, samples
-        self._offsets, self.late = offsets, late
         self.deviation = np.ones(len(self._plant.state_names))
         self.learn_B = self._plant.B is None
 
@@ -82,7 +77,7 @@ class PolynomialSearch:
         samples = self.samples
         for begin in (self._realised, self.from_filters):
             start = begin(hidden, monitor)
-            found = None if start is None else self.simulated(start, hidden, monitor)
+            found = None if start is None else self.simulated(start, monitor)
             # an unstable plant in a closed loop has no realisation of its own
             if found is not None and (begin == self.from_filters
                                       or found.model.drift.growth_rate < 0.0):
@@ -100,7 +95,7 @@ class PolynomialSearch:
             return found
         return replace(found, model=replace(found.model, drift=start.drift), start=start)
 
-    def simulated(self, start: _Polynomial, hidden: int, monitor: Callable[..., bool]
+    def simulated(self, start: _Polynomial, monitor: Callable[..., bool]
                   ) -> StructureCandidate | None:
         """Return the candidate whose simulations err least; None where they diverge."""
         # a realisation or a filter may forget faster than the plant
@@ -111,16 +106,15 @@ class PolynomialSearch:
             except ValueError:
                 return None
             refined = fitted_by_simulation(
-                PolynomialCoefficients(start.drift, self.learn_B), start.gain, data, starts,
-                monitor)
+                PolynomialCoefficients(start.drift, self.learn_B), data, starts,
+                monitor=monitor)
             if not np.isfinite(refined.cost):
                 return None
             if not self.samples:
                 self.samples = self.record.memory(refined.model.drift)
                 if self.samples == samples:
                     break
-        found = candidate_of(refined, start, data, self.record, hidden)
-        return found and replace(found, offsets=self._offsets, late=self.late)
+        return candidate_of(refined, start, data, self.record)
 
     def extended(self, linear: StructureCandidate) -> _Polynomial:
         """Return a linear model with further inputs of the record, which do nothing yet."""
@@ -172,7 +166,7 @@ class PolynomialSearch:
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
             PolynomialCoefficients(start.drift, self.learn_B), start.gain,
-            record.segments(parts), record.foreseen(start, parts), self.deviation,
+            *record.simulated(start, parts=parts), self.deviation,
             settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost
 

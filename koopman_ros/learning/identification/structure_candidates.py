@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -19,12 +19,9 @@ from koopman_ros.learning.identification.drift import Drift, DriftModel, Segment
 from koopman_ros.learning.identification.identify import OUTPUT_ERROR, Score
 from koopman_ros.learning.identification.innovations_form import Predictor, SETTLING
 from koopman_ros.learning.identification.network_drift import NetworkDrift
-from koopman_ros.learning.identification.output_error import innovations_form, Refinable, Refined
+from koopman_ros.learning.identification.output_error import Refinable, Refined
 
 _MOST = 2.0  # times the least squared error that a smaller model may have
-ITERATIONS, _TOLERANCE = 200, 1e-5  # of simulations
-
-_Model = TypeVar('_Model', bound=Refinable)
 
 
 @dataclass(frozen=True)
@@ -33,14 +30,21 @@ class StructureCandidate:
 
     model: Refinable
     start: Predictor[DriftModel]  #: where its search began, in the same coordinates
-    record: SplitRecord  #: of the plant, its inputs later where `late`
-    hidden: int
+    record: SplitRecord  #: of the plant
     #: (N, n_y) in deviations, of simulations by models that were not fitted there, or from starts
     #: that are fitted to the first samples where those err more
     errors: Array
     starts: Array  #: of its simulations, in deviations of where its search began
-    offsets: bool = False  #: whether each episode has a constant disturbance
-    late: tuple[int, ...] = ()  #: dead times (n_u,) of the inputs in samples, where there are any
+
+    @property
+    def hidden(self) -> int:
+        """Number of unmeasured states."""
+        return len(self.start.gain) - self.errors.shape[1]
+
+    @property
+    def late(self) -> tuple[int, ...]:
+        """Dead times (n_u,) of the inputs in samples, where there are any."""
+        return self.record.late
 
     @property
     def gain(self) -> Array:
@@ -69,8 +73,8 @@ class StructureCandidate:
         drift = self.model.drift
         form = 'linear drift' if isinstance(drift, DriftModel) and drift.degree == 1 else (
             drift.form)
-        more = ', an offset of each episode' * self.offsets
-        if any(self.late):
+        more = ', an offset of each episode' * self.record.offsets
+        if self.late:
             more += f', dead times of {", ".join(map(str, self.late))} samples'
         return f'{form} with {not_measured(self.hidden)}{more}: ' + ', '.join(
             f'{error:.4g} {unit}' for error, unit in zip(
@@ -120,18 +124,8 @@ class Choice:
         return (*self.steps, f'selected: {best.text}')
 
 
-def fitted_by_simulation(model: _Model, gain: Array, data: Segments, starts: Array,
-                         monitor: Callable[..., bool], iterations: int = ITERATIONS
-                         ) -> Refined[_Model]:
-    """Return a model whose simulations err least."""
-    penalty = model.penalty if isinstance(model, NetworkDrift) else None
-    return innovations_form(model, 0.0 * gain, data, starts, np.ones(gain.shape[1]), smooth=True,
-                            tolerance=_TOLERANCE, penalty=penalty, iterations=iterations,
-                            monitor=monitor)
-
-
 def candidate_of(refined: Refined[Any], start: Predictor[DriftModel], data: Segments,
-                 record: SplitRecord, hidden: int) -> StructureCandidate | None:
+                 record: SplitRecord) -> StructureCandidate | None:
     """Return the candidate of a model; None where it diverges or hangs on a few samples."""
     if not np.isfinite(refined.cost):
         return None
@@ -146,8 +140,8 @@ def candidate_of(refined: Refined[Any], start: Predictor[DriftModel], data: Segm
         others = free.along(data, free.starts(data, refined.starts)).innovations
         errors = np.where(np.mean(errors ** 2, axis=0) > np.mean(others ** 2, axis=0),
                           errors, others)
-    return StructureCandidate(refined.model, start, record, hidden, errors, refined.starts
-                              ) if np.all(np.abs(errors) < LOST) else None
+    return StructureCandidate(refined.model, start, record, errors, refined.starts) if (
+        np.all(np.abs(errors) < LOST)) else None
 
 
 def equals(best: StructureCandidate, able: Sequence[StructureCandidate]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.core.characteristic import Characteristic
-from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.execution import Backend
 from koopman_ros.learning.identification.base import IdentificationMethod
 from koopman_ros.learning.identification.characteristics import (
@@ -126,7 +126,7 @@ def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Epi
     """Return whether simulations of the record err by noise alone, or a share of the motion."""
     drift = found.drift
     record = SplitRecord(plant, episodes, 0, hidden=False)
-    data = Segments.of(cut(episodes, record.memory(drift)), record.step)
+    data = record.pieces(record.memory(drift))
     squares = prediction_error(drift.rate, data, drift.box.states.scale) ** 2
     spread = np.nanvar(np.concatenate([episode.x for episode in episodes]), axis=0)
     return bool(np.all(squares <= np.fmax(
@@ -136,7 +136,7 @@ def _explains(found: Identified, plant: PlantDescription, episodes: Sequence[Epi
 def free_run_errors(found: Identified) -> tuple[Array, Array]:
     """Return the errors (N, n_x) of free runs of all segments, and of those held out, scaled."""
     rate, scale = found.drift.rate, found.drift.box.states.scale
-    data = Segments.of([*found.fitted, *found.held_out], longest_step(found.fitted))
+    data = Segments.of(found.episodes, longest_step(found.fitted))
     errors = data.errors(rate, fitted_starts(rate, data, scale)[0]).swapaxes(0, 1) / scale
     # one segment after the other
     sampled, first = data.sampled.T, len(found.fitted)

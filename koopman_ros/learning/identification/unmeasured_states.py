@@ -37,6 +37,7 @@ from koopman_ros.learning.identification.innovations_form import (
     Predictor,
     raised,
     SETTLING,
+    spanned,
     standardised,
 )
 from koopman_ros.learning.identification.late_candidates import late_as_suits, late_linear
@@ -46,7 +47,6 @@ from koopman_ros.learning.identification.network_candidates import (
     network_starts,
     Shared,
 )
-from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import innovations_form
 from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
 from koopman_ros.learning.identification.structure_candidates import (
@@ -57,7 +57,6 @@ from koopman_ros.learning.identification.structure_candidates import (
     smallest_adequate,
     StructureCandidate,
 )
-from koopman_ros.model import Coordinates
 
 HIGHEST_DEGREE = 3
 BUDGET = 300.0  # s of processor time of a search
@@ -142,22 +141,21 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     if choice.gains(late):
         # without the dead time some of the states may have stood for it
         assert late is not None
-        search = PolynomialSearch(late.record, first.samples, late=late.late)
+        search = PolynomialSearch(late.record, first.samples)
         rising = [*search.rising(range(least, late.hidden), choice, stage), late]
         linear = smallest_adequate(rising)
-    extended = record
     if plant.B is None and 1 < len(episodes) <= MOST_EPISODES:
         monitor = stage('constant offset of each episode')
-        extended = SplitRecord(*with_episode_inputs(plant, episodes), seed, hidden=True)
-        more = PolynomialSearch(
-            extended.later(search.late), first.samples, offsets=True, late=search.late)
-        if choice.gains(more.simulated(more.extended(linear), linear.hidden, monitor),
+        extended = SplitRecord(
+            *with_episode_inputs(plant, episodes), seed, hidden=True, offsets=True)
+        more = PolynomialSearch(extended.later(search.record.late), first.samples)
+        if choice.gains(more.simulated(more.extended(linear), monitor),
                         'constant offset of each episode'):
             search, linear = more, choice.candidates[-1]
     kept = None
     if measured is not None and isinstance(measured.drift, DriftModel):
-        kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))), 0,
-                                stage(measured.drift.form))
+        kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))),
+                               stage(measured.drift.form))
         choice.gains(kept, measured.drift.form)
     count = linear.hidden
     monitor = stage(f'filter with {not_measured(count)}')
@@ -171,7 +169,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             EXPLAINED * float(np.mean(np.fmin(search.deviation, noise) ** 2)))
 
     for degree in usual_degrees(n_y + count)[1:highest_degree] if (
-            count or search.late or not measured) else ():
+            count or search.record.late or not measured) else ():
         # of a linear drift the errors of its filter do not say what noise alone would leave
         if last is None or (degree > 2 and explained()):
             break
@@ -179,10 +177,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         monitor = stage(name)
         if not monitor():
             last = search.filtered(raised(last), monitor)
-            choice.gains(None if last is None else search.simulated(last, count, monitor), name)
+            choice.gains(None if last is None else search.simulated(last, monitor), name)
     if sizes and not explained():
         # in coordinates of a filter, whose hidden states have the range of those in the record
-        base = None if begin is None else search.simulated(begin, count, monitor)
+        base = None if begin is None else search.simulated(begin, monitor)
         linear = base or linear
 
         def shared(one: StructureCandidate, begun: StructureCandidate | None = None) -> Shared:
@@ -195,7 +193,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
 
         add_networks(choice, shared(linear, base), sizes, stage_with(count),
                      backend or Serial())
-        others = [] if linear.offsets else [
+        others = [] if linear.record.offsets else [
             *([] if least_late is None else [least_late]), *_nearly_equal(linear, rising)]
         for other in others:
             if stage(f'networks with {not_measured(other.hidden)}')():
@@ -208,9 +206,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     # a linear model may need a dead time to stand for what is not linear
     if any(manipulated) and (best.late or not explained()) and not (
             isinstance(best.model.drift, DriftModel) and best.model.drift.linear):
-        choice.gains(late_as_suits(
-            best, extended if best.offsets else record, manipulated, search.samples,
-            stage(f'dead time of the {best.model.drift.form}')))
+        choice.gains(late_as_suits(best, manipulated, search.samples, stage(
+            f'dead time of the {best.model.drift.form}')))
     # with as many as are allowed, more may be better
     searched = ('input_matrix_degree', *['unmeasured_states'] * (linear.hidden < hidden))
     able = choice.candidates
@@ -235,7 +232,7 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                 raise
     result = replace(result, alternatives=in_coordinates_of(
         predictor, equals(best, able), best.record))
-    if best.offsets:
+    if best.record.offsets:
         result = without_episode_inputs(result, len(plant.input_names))
     return replace(
         result, warnings=warnings, searched=searched, steps=choice.ended(best),
@@ -257,26 +254,13 @@ def _with_gain(best: StructureCandidate, monitor: Callable[..., bool]) -> Predic
     parts = sorted([*record.fit, *record.choose])
     start = Predictor(best.model.drift, best.gain)
     found = innovations_form(
-        _Known(start.drift), best.gain, record.segments(parts), record.foreseen(start, parts),
+        _Known(start.drift), best.gain, *record.simulated(start, parts=parts),
         np.std(record.innovations(start), axis=0),
         settling=min(SETTLING, min(len(record.parts[i]) for i in parts) // 3), monitor=monitor)
     predictor = Predictor(start.drift, found.gain)
     estimates = record.estimates(predictor)
-    if isinstance(start.drift, DriftModel):
-        return standardised(Predictor(start.drift, found.gain), estimates)
-    assert isinstance(start.drift, NetworkDrift)
-    return _spanned(Predictor(start.drift, found.gain), estimates)
-
-
-def _spanned(predictor: Predictor[NetworkDrift], xi: Array) -> Predictor[NetworkDrift]:
-    """Return the same with hidden states from -1 to 1, where they were estimated at xi."""
-    old, n_y = predictor.drift.box.states, predictor.gain.shape[1]
-    low, high = old.to_physical(xi.min(axis=0)), old.to_physical(xi.max(axis=0))
-    low[:n_y], high[:n_y] = old.lower[:n_y], old.upper[:n_y]
-    new = Coordinates.spanning(old.names, old.units, low, high)
-    return Predictor(predictor.drift.moved(new),
-                     predictor.gain * old.scale[:, None] / new.scale[:, None] * (
-                         new.scale[:n_y] / old.scale[:n_y]))
+    return standardised(Predictor(start.drift, found.gain), estimates) if (
+        isinstance(start.drift, DriftModel)) else spanned(predictor, estimates)
 
 
 @dataclass(frozen=True)

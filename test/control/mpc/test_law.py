@@ -28,6 +28,7 @@ from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.evaluation.simulate import at, simulate, Simulation
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance
 from koopman_ros.plants import Actuator, ControlAffineSystem, plant_class, Process, steady_state
+from support.random_lifts import random_lift
 
 PERIOD = 0.1  # s
 Q = np.array([1.0, 0.1])
@@ -502,3 +503,13 @@ def test_plan_is_shifted_by_a_sample():
     # at 1, 2, 2.5, 4 and beyond the end
     np.testing.assert_allclose(nodes, [[1.0, 4.0], [3.0, 2.0], [4.0, 1.0], [7.0, -2.0],
                                        [7.0, -2.0]])
+
+
+def test_a_plan_that_a_lift_cannot_follow_costs_one_sample():
+    """Where the derivative of a free lift is not finite it has no pseudo-inverse."""
+    one = law(random_lift(2, identity=False, n_u=1))
+    lengths = one.planner.grid(PERIOD).lengths
+    N = len(lengths)
+    plan = np.zeros((N, 1)), np.full((N + 1, 2), np.inf), lengths
+    found = compute(one, [0.0, 0.0], memory=plan)
+    assert (found.u, found.failure.code, found.passing) == (None, StatusCode.PLAN_NOT_SOLVED, True)

@@ -45,7 +45,7 @@ def record(samples, dead_time):
 @pytest.mark.parametrize('given', [2, 9])
 def test_a_network_gets_the_dead_time_of_the_plant(given):
     whole = SplitRecord(PLANT, [record(400, LATE)], 0, hidden=True)
-    search = PolynomialSearch(whole.later((given,)), late=(given,))
+    search = PolynomialSearch(whole.later((given,)))
     linear = search.linear(0, lambda *_: False)
     choice = Choice(())
     add_networks(choice, Shared(
@@ -53,11 +53,11 @@ def test_a_network_gets_the_dead_time_of_the_plant(given):
         {'network': (3, 0)}, lambda _: lambda *_: False, Serial())
     (network,) = choice.candidates
     assert network.late == (given,)
-    found = late_as_suits(network, whole, (True,), search.samples, lambda *_: False)
+    found = late_as_suits(network, (True,), search.samples, lambda *_: False)
     assert found.late == (LATE,)
     assert found.score.cost < 0.5 * network.score.cost
     # a known dead time, or that of a measured disturbance, is kept
-    assert late_as_suits(network, whole, (False,), search.samples, lambda *_: False) is None
+    assert late_as_suits(network, (False,), search.samples, lambda *_: False) is None
 
 
 def test_dead_time_and_network_are_found_together(monkeypatch):
