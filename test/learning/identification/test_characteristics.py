@@ -14,7 +14,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_with_characteristics
-from koopman_ros.learning.identification.characteristics import NotMonotoneError
+from koopman_ros.learning.identification.characteristics import NotMonotoneError, smoothed
 from koopman_ros.learning.identification.input_functions import NonAffineDrift
 from koopman_ros.learning.identification.structure_search import with_characteristics
 from koopman_ros.model import load
@@ -45,6 +45,27 @@ def record(rate, low, high, seed=0):
 def identified(episode, plant=PLANT, **options):
     return identify_with_characteristics(plant, [episode], degrees=(1,), methods=methods(20),
                                          **options)
+
+
+@pytest.mark.parametrize(('g', 'exact'), [
+    (lambda u: (30.0 ** u - 1.0) / 29.0, 1e-3),
+    (lambda u: np.maximum(u - 0.3, 0.0) / 0.7, 1e-2),
+    (lambda u: 0.5 + 0.5 * np.tanh(5.0 * (u - 0.5)) / np.tanh(2.5), 1e-3)],
+    ids=['equal percentage', 'dead zone', 'between two ends'])
+def test_a_smoothed_characteristic_rises_with_the_slope_of_the_true_one(g, exact):
+    u = np.linspace(0.0, 1.0, 21)
+    assert np.max(np.abs(smoothed(u, g(u)) - g(u))) < exact
+    errors, largest = [], []
+    for seed in range(10):
+        noisy = g(u) + 0.01 * np.random.default_rng(seed).standard_normal(len(u))
+        found = smoothed(u, noisy)
+        assert np.all(np.diff(found) >= 0.0)
+        rising = [np.maximum.accumulate(noisy), found]
+        errors.append([np.std(np.diff(one - g(u)) / np.diff(u)) for one in rising])
+        largest.append([np.max(np.abs(one - g(u))) for one in rising])
+    by_estimates, by_smoothed = np.mean(errors, axis=0)
+    assert by_smoothed < 0.75 * by_estimates
+    assert np.max(largest, axis=0)[1] < 1.1 * np.max(largest, axis=0)[0]
 
 
 @pytest.mark.parametrize(('g', 'low', 'high'), [
