@@ -35,6 +35,9 @@ from koopman_ros.learning.identification.output_error import (
 from koopman_ros.learning.identification.weak_form import weak_form
 
 _POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions next to states
+# Coefficients of products of states and functions. The 880 of ten states and two inputs take 2 s a
+# step, and rarely does a record determine so many.
+_MOST_PRODUCTS = 300
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
 _FEW_STEPS, _MOST_STEPS, _TOLERANCE = 10, 40, 1e-4  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
@@ -53,8 +56,9 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
     Functions of an input are added to the drift as further inputs, piecewise linear between the
     quantiles of the record. They are kept if they lower the errors at samples that are left out of
     the fit by more than two standard errors; the part that all states have in common is the
-    characteristic. At last products of such functions and states are tried in the same way. A
-    drift with them is not affine in the inputs, and competes as an alternative.
+    characteristic. At last products of such functions and states are tried in the same way, unless
+    there are too many. A drift with them is not affine in the inputs, and competes as an
+    alternative.
 
     :param plant: see :func:`identify`, like the options. Where it knows B nothing is tried.
     :param given: inputs whose characteristic the plant has already.
@@ -67,7 +71,15 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
         if name not in given and (one := characteristic_of(found, name)) is not None:
             plant = replace(plant, characteristics={**plant.characteristics, name: one})
             found = identify(plant, episodes, **options)
-    other = _not_affine(found)
+    functions = _hats(found, plant.input_names, _FEW_POINTS)
+    if functions is None:
+        return found
+    n_x = len(plant.state_names)
+    if (count := n_x * (1 + n_x) * len(functions.coordinates())) > _MOST_PRODUCTS:
+        return replace(found, steps=(
+            *found.steps, f'left out: {count} products of states and functions of the inputs, '
+            f'above the limit of {_MOST_PRODUCTS}'))
+    other = _not_affine(found, functions)
     return found if other is None else replace(
         found, alternatives=(other, *found.alternatives), warnings=(
             *found.warnings, f'a {other.form} explains the record better than static '
@@ -131,15 +143,14 @@ def smoothed(u: Array, g: Array) -> Array:
     return np.asarray(np.maximum.accumulate(rises @ found))
 
 
-def _not_affine(found: Identified) -> NonAffineDrift | None:
+def _not_affine(found: Identified, functions: Hats) -> NonAffineDrift | None:
     """Return a drift with products of states and functions of the inputs, if it is better."""
     drift = found.drift
     assert isinstance(drift, DriftModel)
-    functions = _hats(found, drift.box.inputs.names, _FEW_POINTS)
     products = drift if drift.varying_input_matrix else replace(drift, B=np.hstack(
         [drift.B] + [0.0 * drift.B] * len(drift.box.states)))
-    better = functions and _better(found, functions, products)
-    return NonAffineDrift(drift.box, better, functions) if functions and better else None
+    better = _better(found, functions, products)
+    return NonAffineDrift(drift.box, better, functions) if better else None
 
 
 def _hats(found: Identified, names: Sequence[str], count: int) -> Hats | None:

@@ -157,3 +157,18 @@ def test_a_drift_that_is_not_affine_in_the_input_competes():
     x, u = (np.random.default_rng(0).uniform(-0.4, 0.4, (2, 50, 1)))
     errors = [np.std(one.rate(x, u) - rate(x, u)) for one in (other, found.drift)]
     assert errors[0] < 0.5 * errors[1]
+
+
+def test_products_of_many_states_are_left_out_and_said():
+    """As their number rises with the square of the states, they would take minutes."""
+    rng = np.random.default_rng(0)
+    names = tuple(f'level_{k}' for k in range(6))
+    plant = PlantDescription('line', names, ('m',) * 6, ('valve', 'pump'), ('1', '1'), 's',
+                             np.full(6, np.nan), np.full(2, np.nan), None)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (125, 2)), 6, axis=0)
+    x = np.zeros((750, 6))
+    for k in range(749):
+        x[k + 1] = x[k] + PERIOD * (np.append(u[k, 0], x[k, :-1]) - x[k] + 0.5 * u[k, 1])
+    time = PERIOD * np.arange(750)
+    (said,) = identified(Episode(time, x, time, u), plant, given=plant.input_names).steps
+    assert said.startswith('left out: 336 products')
