@@ -20,7 +20,6 @@ from koopman_ros.learning.identification import (
     Stopped,
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
-from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
 from support.known_plants import box
 
 PLANT = PlantDescription('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
@@ -81,7 +80,7 @@ def test_modes_and_gain_of_a_linear_plant():
 @pytest.mark.parametrize(('rate', 'hidden'), [
     (oscillator, 1), (lambda x, u: np.array([u - 0.4 * x[0] - 0.1 * x[0] ** 3, -x[1]]), 0)])
 def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate, hidden):
-    found = identify_structure(PLANT, [record(rate, samples=500)])
+    found = identify_structure(PLANT, [record(rate, samples=320)])
     assert found.hidden == hidden
     assert bool(found.steps) == bool(hidden)
     # with a state more the plant is explained no better
@@ -90,7 +89,7 @@ def test_states_are_added_where_the_measured_ones_do_not_explain_the_record(rate
 
 def test_an_input_may_act_by_a_product_with_the_state():
     found = identify_structure(PLANT, [record(
-        lambda x, u: np.array([-x[0] + (1.0 + 0.5 * x[0]) * u, -x[1]]), samples=500)])
+        lambda x, u: np.array([-x[0] + (1.0 + 0.5 * x[0]) * u, -x[1]]), samples=320)])
     assert found.hidden == 0
     assert found.drift.input_matrix_at(np.array([[0.5], [-0.5]])).ravel() == pytest.approx(
         [1.25, 0.75], rel=0.05)
@@ -102,15 +101,6 @@ def test_the_best_so_far_is_taken_when_the_time_is_over():
     found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
     assert found.hidden == 1
     assert any('stopped after 0 s: drift of degree 1 with 2' in step for step in found.steps)
-
-
-def test_an_order_whose_simulations_diverge_is_said(monkeypatch):
-    linear = PolynomialSearch.linear
-    monkeypatch.setattr(PolynomialSearch, 'linear', lambda self, hidden, monitor: (
-        None if hidden == 1 else linear(self, hidden, monitor)))
-    found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
-    assert found.hidden == 2
-    assert 'drift of degree 1 with 1 state not measured: diverges' in found.steps
 
 
 def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
@@ -132,7 +122,7 @@ def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
 
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
-    found = identify_unmeasured(PLANT, [record(saddle, samples=900, gain=2.0, size=1.5)], 1,
+    found = identify_unmeasured(PLANT, [record(saddle, samples=700, gain=2.0, size=1.5)], 1,
                                 highest_degree=2, dead_times=False)
     drift = found.drift
     assert drift.degree >= 2
@@ -160,12 +150,6 @@ def test_a_known_input_matrix_is_kept():
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
 
-def outlet(x, u):
-    """Overflow at a level: no polynomial has the corner."""
-    y, w = x
-    return np.array([w - 0.4 * y - 2.0 * max(0.0, y - 0.3), 1.5 * (u - w)])
-
-
 def duffing(x, u):
     """Oscillate on a spring that hardens; the speed is not measured."""
     y, w = x
@@ -173,7 +157,7 @@ def duffing(x, u):
 
 
 @pytest.mark.parametrize(('rate', 'degree', 'kind', 'samples'), [
-    (outlet, 1, NetworkDrift, 1000), (duffing, 3, DriftModel, 700)])
+    (duffing, 3, DriftModel, 500)])
 def test_the_simulation_of_a_nonlinear_plant_is_good_on_other_days(
         monkeypatch, rate, degree, kind, samples):
     # one of all networks
