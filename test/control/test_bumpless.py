@@ -4,14 +4,13 @@
 """Range and rate limits of the inputs, and hand-overs that the input does not feel."""
 
 from copy import copy
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from koopman_ros.control import InputLimits, Mode, ModeChange, State
-from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
+from koopman_ros.control.bumpless import BumplessTransfer, limit
 from koopman_ros.evaluation import exchange, restart
 from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
@@ -21,7 +20,6 @@ from support.closed_loops import (
     Reactor,
     SETPOINT,
     settled,
-    shipped,
     START,
 )
 
@@ -61,12 +59,6 @@ def test_an_offset_fades_by_its_formula_however_it_is_sampled(steps):
     for seconds in steps:
         transfer = transfer.after(seconds, 30.0)
     np.testing.assert_allclose(transfer.offset, [3.0 * faded(10.0, 30.0)], rtol=1e-12)
-
-
-def test_offsets_add_up():
-    transfer = with_step(step(2.0).after(10.0, 30.0), np.array([-1.0])).after(20.0, 30.0)
-    expected = 2.0 * faded(30.0, 30.0) - faded(20.0, 30.0)
-    np.testing.assert_allclose(transfer.offset, [expected], rtol=1e-12)
 
 
 def test_an_offset_ends():
@@ -109,19 +101,6 @@ def test_automatic_to_manual_and_back_at_rest():
     assert largest_step(loop.samples[480:]) < 1e-6
 
 
-def test_from_a_coolant_that_the_law_would_not_choose():
-    loop = loop_at(START)
-    loop.manual(loop.samples[-1].command - 4.0)
-    before = loop.run(600)[-1]
-    loop.do(ModeChange(Mode.AUTOMATIC))
-    samples = loop.run(420)
-    assert abs(samples[0].command - before.command) < 0.01
-    assert abs(samples[1].command - samples[0].command) < 0.01
-    # and smoothly on its way from there
-    assert largest_step(samples) < 0.12
-    assert settled(samples, START, 1e-3) < 420
-
-
 @pytest.mark.parametrize('change', [
     {'input_weight': np.array([0.05])}, {'state_weight': np.array([0.1])},
     {'observer_bandwidth': 12.0 / 60.0}, {'bumpless_transfer_time': 5.0},
@@ -138,36 +117,6 @@ def test_retuning(change):
     loop.do(exchange(controller()))
     after = loop.run(2)
     assert abs(after[0].command - before[-1].command) < 0.2 + largest_step(before[-2:])
-
-
-def test_a_storm_of_tunings_does_not_stop_the_feedback():
-    tunings = [controller(), controller(input_weight=np.array([0.05]))]
-    loop = Reactor(tunings[0])
-    loop.run(10)
-    loop.ask(SETPOINT)
-    for second in range(300):
-        loop.do(exchange(tunings[second % 2]))
-        loop.run(1)
-    assert settled(loop.samples[10:], SETPOINT, 0.05) < 290
-
-
-LINEAR = shipped('reactor_linear')
-SCALED = replace(LINEAR, B=LINEAR.B / 2.0, states=replace(
-    LINEAR.states, scale=LINEAR.states.scale * 2.0))
-
-
-@pytest.mark.parametrize(('other', 'more'), [('reactor_nz3', 0.0), (SCALED, 0.5)],
-                         ids=['reactor_nz3', 'in other units of scale'])
-def test_another_model_at_rest(other, more):
-    loop = loop_at(SETPOINT, DRIFTED)
-    before = loop.samples[-1].report.estimate.disturbance
-    for model in (other, 'reactor_nz4', other):
-        loop.do(exchange(controller(model)))
-        samples = loop.run(100)
-        assert largest_step(samples) < 1e-6
-        assert settled(samples, SETPOINT, 1e-3) == 0
-    # the linear model leaves more to the disturbance
-    assert abs(float(samples[0].report.estimate.disturbance[0] - before[0])) > more
 
 
 @pytest.mark.parametrize('at_rest', [True, False])

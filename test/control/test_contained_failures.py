@@ -21,7 +21,6 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.control.laws import LawResult, Linear
-from koopman_ros.control.recovery import SafeStateRecovery
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import (
@@ -240,7 +239,7 @@ def test_random_events_on_every_law_and_estimator_end_in_a_command_that_a_replay
 
         write(records.START, records.snapshot(
             run.state, values, {'name': name, 'digest': 'of the model'}))
-        for event in random_events(run.controller, rng, 25):
+        for event in random_events(run.controller, rng, 12):
             outcome = run.do(event)
             if outcome.command is not None:
                 commands.append(outcome.command.tobytes())
@@ -312,25 +311,8 @@ def test_an_interrupt_is_not_contained(plugin):
         run.do(Measurement(SECOND, run.controller.model.states.center))
 
 
-def test_requests_and_a_hand_over_contain_a_failing_estimator(plugin):
-    good = tuned('two_tanks')
-    run = Checked(good)
-    center = good.model.states.center
-    for k in range(3):
-        run.do(Measurement((10 + k) * SECOND, center + 1e-4 * k))
-    failing_one = plugin(DisturbanceObserver, 'transferred', TypeError('bad'))
-    bad = tuned('two_tanks', estimator=failing_one)
-    state = bad.switch_to(good, run.state)
-    assert state.command is run.state.command
-    run.controller, run.state = bad, state
-    run.do(ModeChange(Mode.MANUAL))
-    run.do(ModeChange(Mode.AUTOMATIC))
-    run.do(SetpointRequest(0, center))
-    run.do(Measurement(20 * SECOND, center))
-
-
 @pytest.mark.parametrize('kind', [ExtendedKalmanFilter, UnscentedKalmanFilter])
-@pytest.mark.parametrize('seconds', [0.01, 0.1, 0.3, 1.0, 3.0, 100.0, 1e5])
+@pytest.mark.parametrize('seconds', [0.01, 1.0, 1e5])
 def test_the_covariance_stays_positive_definite_over_any_gap(kind, seconds):
     """At the pendulum's unstable top a gap multiplies variances by up to exp(40)."""
     controller = tuned('pendulum', 'angle')
@@ -352,13 +334,6 @@ def test_the_covariance_stays_positive_definite_over_any_gap(kind, seconds):
         # one disturbance for two states: it is singular in the other direction, but for rounding
         assert values[0] > -1e-12 * values[-1]
         assert np.all(np.diag(estimate.covariance)[:2] > 0.0)
-
-
-def test_a_recovery_that_has_come_to_the_training_data_by_itself_is_over():
-    began = SafeStateRecovery(1.0, 1.0, 0)
-    assert began.moved(0.0, SECOND, 10.0) is None
-    led = SafeStateRecovery(1.0, 1.0, 0, led=True).moved(0.0, SECOND, 10.0)
-    assert led.share == 1.0
 
 
 @pytest.mark.parametrize('levels', [('mpc', 'sdre', 'linear'), ('mpc', 'linear')])

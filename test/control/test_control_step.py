@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, State, Tuning
-from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, rejection, request, Setpoint
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
-from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
+from support.closed_loops import content, say, SETPOINT, shipped, START
 
 NOW = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 280.0, 304.0, 0.8
@@ -61,12 +60,6 @@ def test_at_its_setpoint_the_loop_rests():
     assert (report.command.at_range, report.command.at_rate) == (False, False)
     assert not report.measurement.clock_went_back
     assert (state.time_ns, state.command) == (NOW, command)
-
-
-def test_a_start_away_from_the_nominal_point_holds_the_measured_state():
-    _, command, report = controller().step(State(), np.array([SETPOINT]), NOW)
-    np.testing.assert_array_equal(report.target.setpoint, [SETPOINT])
-    np.testing.assert_allclose(command, [COOLANT], rtol=0, atol=1e-3)
 
 
 def test_the_input_of_a_law_is_remembered_within_the_range():
@@ -171,36 +164,7 @@ def test_two_clocks_in_turn_move_the_command_no_faster_than_one(offset):
     assert commands[-1] < commands[0] - 10.0 * RATE
 
 
-@pytest.mark.parametrize(('countable', 'seconds'), [
-    (None, 1.0), (5.0, 1.0), (0.25, 0.25), (0.0, 0.0)])
-def test_ramp_and_rate_limit_count_no_more_than_another_clock_allows(countable, seconds):
-    for ramp, read in ((np.inf, lambda command, report: command[0] - 300.0),
-                       (0.1, lambda command, report: (report.target.setpoint[0] - START) * 8.0)):
-        loop = controller(setpoint_ramp=np.array([ramp]))
-        state = measured(loop, started(loop, (START,)), START, 1)[0]
-        state = loop.request_setpoint(state, np.array([306.0]))[0]
-        _, command, report = loop.step(
-            state, np.array([START]), NOW + 2 * SECOND, None, countable)
-        assert read(command, report) == pytest.approx(-RATE * seconds, abs=1e-6)
-
-
 # Without measurements.
-
-def test_a_setpoint_is_acted_on_from_the_estimate_while_nothing_is_measured():
-    loop = controller()
-    state = measured(loop, started(loop), START, 1)[0]
-    state = loop.request_setpoint(state, np.array([START - 2.0]))[0]
-    commands = [state.command[0]]
-    # first after a quarter of an hour
-    for second in np.arange(900.0, 3600.0, 5.0):
-        state, command, report = loop.hold(state, NOW + round(second * SECOND), None)
-        assert (report.level, report.reason) == (next(iter(loop.levels)), None)
-        assert abs(command[0] - commands[-1]) <= 2.0 * RATE + 1e-9
-        commands.append(command[0])
-    wanted = loop.steady_state(state.setpoint.active)
-    assert state.setpoint.active[0] == START - 2.0
-    assert loop.model.states.to_physical(state.estimate.x) == pytest.approx(wanted, abs=0.01)
-    assert commands[-1] == commands[-2] < commands[0] - 0.5
 
 
 def test_a_hold_without_measurements_rejects_setpoints():
@@ -354,22 +318,6 @@ def moved(setpoint, now_ns=NOW, *, measured=320.0, ramp=np.inf, seconds=1.0, lag
     return advance(setpoint, kelvin(measured), MODEL.states, kelvin(ramp), now_ns, seconds, lag)
 
 
-@pytest.mark.parametrize(('ramp', 'lag'), [(np.inf, 0.0), (0.5, 0.0), (np.inf, 4.0)])
-def test_the_setpoints_ahead_are_those_that_will_be_active(ramp, lag):
-    setpoint = replace(Setpoint(), requested=kelvin(310.0), active=kelvin(310.0), scheduled=(
-        (NOW + 4 * SECOND, kelvin(314.0)), (NOW + 9 * SECOND, kelvin(312.0)),
-        (NOW + 60 * SECOND, kelvin(320.0))))
-    found = setpoints.ahead(setpoint, MODEL.states, kelvin(ramp), lag, NOW, 30.0)
-    if np.isinf(ramp) and not lag:
-        assert [(seconds, float(value[0])) for seconds, value in found] == [
-            (4.0, 314.0), (9.0, 312.0)]
-    for seconds, value in found:
-        setpoint = moved(setpoint, NOW + round(seconds * SECOND), ramp=ramp, lag=lag,
-                         seconds=30.0 / setpoints.MAX_AHEAD)
-        assert value == pytest.approx(setpoint.active)
-    assert not setpoints.ahead(setpoint, MODEL.states, kelvin(ramp), lag, NOW, 3.0)
-
-
 def schedule(setpoint):
     return [(time_ns, float(value[0])) for time_ns, value in setpoint.scheduled]
 
@@ -417,14 +365,6 @@ def test_scheduled_requests_take_effect_in_time_order():
     assert schedule(setpoint) == []
 
 
-def test_a_request_at_once_ends_the_schedule():
-    setpoint = request(Setpoint(), kelvin(310.0), NOW + SECOND, NOW)
-    setpoint = request(setpoint, kelvin(316.0), 0, NOW)
-    assert schedule(setpoint) == []
-    np.testing.assert_array_equal(moved(setpoint, NOW).active, [316.0])
-    np.testing.assert_array_equal(moved(setpoint, NOW + SECOND).active, [316.0])
-
-
 @pytest.mark.parametrize(('measured', 'held'), [
     (320.0, 320.0), (400.0, MODEL.states.upper[0]), (200.0, MODEL.states.lower[0])])
 def test_the_first_measurement_is_held(measured, held):
@@ -433,13 +373,6 @@ def test_the_first_measurement_is_held(measured, held):
     np.testing.assert_array_equal(setpoint.requested, [held])
     # and stays when the temperature moves on
     np.testing.assert_array_equal(moved(setpoint, NOW + SECOND, measured=310.0).active, [held])
-
-
-def test_without_a_ramp_the_setpoint_steps_and_without_a_request_it_stays():
-    before = Setpoint(active=kelvin(320.0))
-    np.testing.assert_array_equal(
-        moved(request(before, kelvin(310.0), 0, NOW), seconds=1e-9).active, [310.0])
-    np.testing.assert_array_equal(moved(before, measured=310.0).active, [320.0])
 
 
 @pytest.mark.parametrize('goal', [310.0, 324.0])

@@ -13,8 +13,7 @@ from scipy.linalg import expm
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
 from koopman_ros.core.status import StatusCode
-from koopman_ros.estimation import AppliedInputs, largest_bandwidth
-from koopman_ros.estimation.kalman_filters import uncertainty
+from koopman_ros.estimation import AppliedInputs
 from koopman_ros.evaluation import at, exchange, perfect, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, Task
 from koopman_ros.event_log.records import decoded, encoded
@@ -57,8 +56,7 @@ def step(loop, plant, state, duration, *events):
 
 
 @pytest.mark.parametrize(('seconds', 'known', 'estimator'), [
-    (30.5, 27.0, ''), (120.0, 108.0, ''),
-    (60.0, 54.0, 'extended_kalman_filter')])
+    (30.5, 27.0, ''), (60.0, 54.0, 'extended_kalman_filter')])
 def test_a_late_coolant_brings_no_overshoot(seconds, known, estimator):
     run = step(*late_reactor(seconds, known, estimator=estimator), 150.0 + 2.0 * seconds)
     assert SETPOINT - run.states.min() < 0.3
@@ -75,12 +73,6 @@ def test_a_late_coolant_brings_no_overshoot(seconds, known, estimator):
 def test_a_late_coolant_leaves_no_offset_on_a_changed_plant():
     run = step(*late_reactor(10.0, 11.0, FOULED), 400)
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
-
-
-def test_a_dead_time_twice_as_long_as_known_leaves_the_loop_stable():
-    run = step(*late_reactor(20.0, 10.0), 400)
-    assert np.ptp(run.states[-60:]) < 0.1 < np.ptp(run.states[100:200])
-    assert abs(run.states[-1, 0] - SETPOINT) < 0.1
 
 
 def test_a_takeover_a_record_and_a_fallback_keep_the_inputs_under_way():
@@ -127,23 +119,6 @@ def test_the_default_bandwidth_falls_with_the_dead_time(known, given, bandwidth)
     assert loop.tuning.observer_bandwidth == pytest.approx(bandwidth)
     seconds = given.get('dead_time', -1.0)
     assert loop.estimation.dead_ns == (round((known if seconds < 0.0 else seconds) * SECOND),)
-
-
-def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
-    loop, outputs = late_reactor(0.0)[0], late_reactor(0.0)[0].measured
-    noise, usual, _ = uncertainty(loop.model, outputs, loop.tuning)
-    for seconds in (60.0, 120.0):
-        model = replace(REACTOR_MODEL, dead_time=np.array([seconds]))
-        slowest = -float(model.drift_jacobian(np.zeros(1))[0, 0]) / 60.0
-        # K/s of the temperature for a coolant of one scale more
-        gain = float((model.B[0, 0] * model.states.scale[0]) / 60.0)
-        limited = uncertainty(model, outputs, loop.tuning)[1]
-        assert limited < usual
-        assert limited == pytest.approx(
-            0.5 * largest_bandwidth(seconds, slowest) ** 2 * noise / gain)
-        own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
-        np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
-                                      uncertainty(loop.model, outputs, own)[1])
 
 
 @pytest.mark.parametrize(('levels', 'estimator'), [

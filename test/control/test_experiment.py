@@ -81,35 +81,6 @@ def test_steps_begin_at_the_present_values() -> None:
     assert progress.command[0] > 281.0
 
 
-def test_a_seed_gives_the_same_steps_and_another_seed_others() -> None:
-    again, other = replace(PLAN), replace(PLAN, seed=4)
-    np.testing.assert_array_equal(PLAN.steps, again.steps)
-    assert not np.array_equal(PLAN.steps[0][1][:5], other.steps[0][1][:5])
-    np.testing.assert_array_equal([progress.command for progress in run()],
-                                  [progress.command for progress in run(again)])
-
-
-def test_steps_of_a_single_input_stay_those_of_its_seed() -> None:
-    (ends, levels), = PLAN.steps
-    assert ends[:3].tolist() == [22.56947501430873, 49.67379021219172, 93.71202416838362]
-    assert levels[:3].tolist() == [283.63534884307666, 293.8890012137021, 298.76634938534437]
-
-
-def test_each_signal_has_steps_of_its_own_and_a_further_one_leaves_them() -> None:
-    plan = replace(PAIR, duration=2e5)
-    (ends, levels), (other_ends, other_levels) = plan.steps
-    alone, = replace(PLAN, duration=2e5, hold_shortest=45.0, hold_longest=80.0).steps
-    np.testing.assert_array_equal(alone, (ends, levels))
-    assert not np.isin(ends, other_ends).any()
-    assert 0.1 <= other_levels.min() < 0.101 < 0.899 < other_levels.max() <= 0.9
-    # further apart than the longest hold, so that each step counts once at most
-    times = np.arange(0.0, plan.duration, 100.0)
-    both = [values[np.searchsorted(until, times, side='right')]
-            for until, values in plan.steps]
-    # independent: within four standard errors
-    assert abs(np.corrcoef(both)[0, 1]) < 4.0 / math.sqrt(len(times))
-
-
 @pytest.mark.parametrize(('plan', 'measured'), [
     (PLAN, INSIDE), (PAIR, PAIR_INSIDE), (SETPOINT, INSIDE)], ids=['input', 'inputs', 'setpoint'])
 def test_each_level_is_reached_along_its_rate_and_home_at_the_end(
@@ -157,11 +128,6 @@ def test_a_bad_measurement_aborts_and_rejects_a_start(
             assert words in write(after.reason)
 
 
-def test_a_measurement_of_another_number_of_signals_is_rejected() -> None:
-    with pytest.raises(ValueError, match='shorter'):
-        PAIR.rejection(INSIDE)
-
-
 @pytest.mark.parametrize(('bad', 'last'), [((400.0, 2e5), (299.5, 0.4)),
                                            ((315.0, 1e6), (291.0, 0.2))])
 def test_aborted_signals_return_each_at_its_rate(
@@ -176,16 +142,6 @@ def test_aborted_signals_return_each_at_its_rate(
         np.testing.assert_allclose(progress.command, home + np.sign(start - home) * left,
                                    rtol=0.0, atol=1e-12)
     assert progress.phase is ExperimentPhase.ABORTED
-
-
-def test_ended_input_returns_and_the_first_end_counts() -> None:
-    progress = end(run(seconds=300)[-1], ExperimentPhase.ENDED)
-    progress = end(progress, ExperimentPhase.ABORTED, 'too late')
-    assert (progress.phase, progress.reason) == (ExperimentPhase.ENDED, None)
-    assert level(PLAN, progress) == 292.0
-    for k in range(301, 320):
-        progress = advance(PLAN, progress, np.array([400.0]), START + k * SECOND)
-    assert (progress.phase, progress.command) == (ExperimentPhase.ENDED, 292.0)
 
 
 def test_input_returns_without_measurements() -> None:

@@ -12,16 +12,14 @@ from scipy.linalg import solve_continuous_are
 from koopman_ros.control import Tuning
 from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.core.solvers import RiccatiStatus, solve_riccati
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import run_closed_loop
-from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.model import Coordinates, linearised_model, NetworkObservables, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
 from studies.paper.optimal_control import exact_two_state_model, scalar_optimal_cost
 from support.closed_loops import (
-    COOLANT,
     REACTOR,
     reactor_weights,
     run_reactor,
@@ -160,33 +158,6 @@ def test_weights_on_the_input_stay_so_under_a_pre_feedback(reference):
 
 # Choice of the law.
 
-@pytest.mark.parametrize(('mu', 'adds', 'form'), [
-    (-0.1, False, Form.RECENTRED),
-    # x1^2 grows by itself, and no input reaches it
-    (0.1, True, Form.AVERAGED)])
-def test_a_lift_with_unstable_modes_of_its_own_is_controlled_by_the_averaged_law(mu, adds, form):
-    model = exact_two_state_model(mu, -1.0)
-    assert model.adds_unstable_modes is adds
-    target = steady_state_target(model, np.zeros(2))
-    # x1 is not moved by the input either
-    found = feedback(model, np.array([0.5, 0.3]), target,
-                     Weights(np.diag([0.0, 1.0]), np.eye(1)))
-    assert found.form is form
-
-
-@pytest.mark.parametrize(('rate', 'form'), [(-0.2, Form.RECENTRED), (-0.25, Form.AVERAGED)])
-def test_a_lift_that_is_not_closed_is_controlled_by_the_averaged_law(rate, form):
-    """x1^2 of x1' = -0.1 x1 decays at twice that rate."""
-    model = exact_two_state_model()
-    A = np.array(model.A)
-    assert A[2, 2] == pytest.approx(-0.2)
-    A[2, 2] = rate
-    model = replace(model, A=A)
-    assert not model.adds_unstable_modes
-    found = feedback(model, np.array([0.5, 0.3]), steady_state_target(model, np.zeros(2)),
-                     Weights(np.eye(2), np.eye(1)))
-    assert found.form is form
-
 
 def test_the_averaged_law_takes_over():
     model = shipped('reactor_nz4')
@@ -282,45 +253,6 @@ def test_a_free_lift_and_one_that_is_not_closed_take_the_averaged_law(identity, 
 
 
 # The sampled loop.
-
-def sampled_loop(law, seconds, R, interval):
-    """Step the true reactor to the set-point by a held input; return task, states and inputs."""
-    model, h = shipped('reactor_nz4'), seconds / 60.0
-    weights, target = reactor_weights(model, R), setpoint_target(model)
-    task = Task(REACTOR, np.array([START]), np.array([SETPOINT]), np.array([COOLANT]),
-                np.full(1, UNIT ** -2), np.full(1, R * UNIT ** -2), h, round(15.0 / h))
-    states, inputs = [task.x0], []
-    for _ in range(task.samples):
-        found = law(model, model.states.to_deviation(states[-1]), target, weights,
-                    interval=interval)
-        assert found.solved
-        inputs.append(model.inputs.to_physical(found.u))
-        x = states[-1]
-        for _ in range(task.substeps):
-            x = runge_kutta_step(lambda x: REACTOR.derivative(x, inputs[-1]), x,
-                                 h / task.substeps)
-        states.append(x)
-    return task, np.array(states), np.array(inputs)
-
-
-@pytest.mark.parametrize('law', [recentred, averaged])
-def test_a_sampled_law_is_nearly_optimal_at_long_intervals(law):
-    task, states, inputs = sampled_loop(law, 15.0, 0.1, interval=0.25)
-    least = optimum(task).cost
-    assert least * (1.0 - 1e-6) < cost_along(task, states, inputs) < 1.002 * least
-    assert states[-1][0] == pytest.approx(SETPOINT, abs=1e-3)
-    unaware = sampled_loop(law, 15.0, 0.1, interval=0.0)
-    assert cost_along(*unaware) > 1.5 * least
-
-
-def test_an_interval_makes_gains_smaller_and_predictions_stable():
-    model = shipped('reactor_nz4')
-    arguments = (model, np.array([-0.5]), setpoint_target(model), reactor_weights(model, 1e-6))
-    unaware, aware = (feedback(*arguments, interval=h, max_gain=1e9) for h in (0.0, 1.0 / 60.0))
-    assert unaware.solved
-    assert aware.solved
-    assert aware.riccati.gain < 0.5 * unaware.riccati.gain
-    assert aware.growth(1.0 / 60.0) < 1.0 < unaware.growth(1.0 / 60.0)
 
 
 def test_the_linear_law_is_solved_for_the_interval():

@@ -69,21 +69,6 @@ def test_a_measured_step_of_the_feed_is_compensated_before_it_moves_the_state(se
     assert abs(found.reports[-1].estimate.disturbance[0]) < 0.01
 
 
-def test_an_unmeasured_step_moves_it_further():
-    found, error = run(Controller(PLAIN, USUAL))
-    assert np.abs(error).max() == pytest.approx(UNMEASURED_PEAK, rel=1e-3)
-    assert found.loop.state.disturbances is None
-    # what a model does not have counts for nothing
-    np.testing.assert_array_equal(found.commands, run(
-        Controller(PLAIN, USUAL), lambda *_: math.nan)[0].commands)
-
-
-def test_the_holding_input_includes_the_initial_feed():
-    found, error = run(controller(), before=NOMINAL + 4.0)
-    assert np.abs(error).max() < 0.1 * UNMEASURED_PEAK
-    assert abs(found.reports[0].estimate.disturbance[0]) < 1e-3
-
-
 def lost_from(second, value=math.nan):
     return lambda kelvin, seconds: kelvin if seconds < second else value
 
@@ -150,21 +135,6 @@ def test_a_model_takes_over_and_a_record_keeps_the_disturbance():
     assert np.abs(np.diff(found.commands[65:, 0])).max() < 0.05
     assert np.abs(error[65:]).max() < 0.05
     assert abs(found.reports[-1].estimate.disturbance[0]) < 0.05
-
-
-def test_a_set_point_is_feasible_where_the_feed_allows_it():
-    loop = controller()
-    for kelvin, rejected in ((NOMINAL, False), (NOMINAL + 60.0, True)):
-        state = loop.step(loop.initialise(State(), np.array([290.0])), np.array([START]), SECOND,
-                          disturbances=np.array([kelvin]))[0]
-        state = replace(state, estimate=replace(state.estimate, w=np.zeros(1)))
-        why = loop.request_setpoint(state, np.array([START - 12.0]))[1]
-        assert (why is not None) is rejected
-
-
-def test_another_number_of_disturbances_is_rejected():
-    with pytest.raises(ValueError, match='one number for each of feed_temperature, got'):
-        controller().step(State(), np.array([START]), SECOND, disturbances=np.ones(2))
 
 
 @pytest.mark.parametrize(('value', 'age', 'code', 'held'), [

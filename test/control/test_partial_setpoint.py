@@ -4,24 +4,21 @@
 """Set-points for some of the states: tanks, and other models, whose steady states are known."""
 
 from dataclasses import replace
-import math
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.optimize import lsq_linear
 
-from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning
 from koopman_ros.control.setpoint import advance, Setpoint
 from koopman_ros.control.steady_state import reachable_target
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
-from koopman_ros.evaluation import at, run_closed_loop, simulate
+from koopman_ros.evaluation import at, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.model.observables import PolynomialObservables
-from koopman_ros.plants import Actuator, Process
-from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from support.closed_loops import EPOCH
 
 LEVELS, FLOWS = ('h1', 'h2', 'h3'), ('q1', 'q2')
@@ -128,25 +125,6 @@ def parabola(**others):
     return loop(model, 'y', lower=-5.0, upper=5.0, **others)
 
 
-@pytest.mark.parametrize('y', [0.01, 0.25, 1.0, 2.25, 3.9])
-def test_a_steady_state_that_is_not_linear_in_the_setpoint(y):
-    controller = parabola()
-    state, rejected = asked(controller, y)
-    assert rejected is None
-    report = stepped(controller, state, [1.0, 1.0], 0)[2]
-    np.testing.assert_allclose(report.target.state, [math.sqrt(y), y], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(report.target.input, [math.sqrt(y)], rtol=0, atol=1e-8)
-
-
-def test_of_two_steady_states_the_one_before_is_followed():
-    controller = parabola()
-    for sign in (1.0, -1.0):
-        target = controller.levels['sdre'].target(
-            np.array([0.81]), np.zeros(2), np.array([sign, 1.0, sign]))
-        np.testing.assert_allclose(
-            controller.model.states.to_physical(target.x), [0.9 * sign, 0.81], atol=1e-8)
-
-
 def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
     controller = parabola()
     # y = x^2 + w2 is never below w2
@@ -196,18 +174,6 @@ def test_a_rejection_names_the_nearest_level_and_the_required_pump_input(
     assert asked(controller, rejected.values['nearest'], state)[1] is None
 
 
-def test_another_level_that_would_overflow_rejects_too():
-    # h1 - 1 = (0.1 (h2 - 1) - w2) / 0.2 may go to 2 m and by the margin of 0.1 half-ranges beyond
-    controller = loop(SERIES, 'h2', lower=-9.0, upper=9.0)
-    state = disturbed(controller, [1.0, 1.0], [0.0, -0.2])
-    rejected = asked(controller, 1.6, state)[1]
-    assert rejected.code is StatusCode.SETPOINT_NOT_HELD
-    assert rejected.cause.code is StatusCode.STATE_LEAVES
-    assert rejected.cause.values['signal'] == 'h1'
-    assert rejected.cause.values['value'] == pytest.approx(2.3, abs=1e-9)
-    assert rejected.values['nearest'] == pytest.approx(1.2, abs=1e-5)
-
-
 def test_a_limit_tightened_afterwards_withdraws_nothing():
     wide, narrow = loop(SERIES, 'h2'), loop(SERIES, 'h2', upper=3.5)
     state, rejected = asked(wide, 1.9)
@@ -217,30 +183,6 @@ def test_a_limit_tightened_afterwards_withdraws_nothing():
     state, command, report = stepped(narrow, state, [1.0, 1.0], 1)
     np.testing.assert_array_equal(report.target.setpoint, [1.9])
     assert command[0] <= 3.5
-
-
-def test_every_level_with_one_pump_has_to_be_a_steady_state():
-    controller = loop(SERIES)
-    # 2 (h1 - 1) = h2 - 1
-    assert asked(controller, [1.2, 1.4])[1] is None
-    rejected = asked(controller, [1.4, 1.4])[1]
-    assert (rejected.code, rejected.cause.code) == (
-        StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_STEADY_STATE)
-    held = dict(rejected.values['held'])
-    # the foot of the perpendicular: (0.4, 0.4) . (1, 2) / 5 = 0.24
-    assert held == pytest.approx({'h1': 1.24, 'h2': 1.48}, abs=1e-4)
-
-
-def test_the_nearest_of_two_levels_is_that_of_least_squares():
-    # q1 - 3 = h1 - 1 = a and q2 - 3 = b = (h2 - 1) - a: with b at 0.2, a^2 + (a + 0.2 - 0.9)^2 is
-    # least at a = 0.35
-    controller = loop(BOTH, upper=[3.5, 3.2])
-    rejected = asked(controller, [1.0, 1.9])[1]
-    assert dict(rejected.values['held']) == pytest.approx({'h1': 1.35, 'h2': 1.55}, abs=1e-5)
-    # one alone leaves the other where it is
-    state = stepped(controller, State(), [1.0, 1.0], 0)[0]
-    rejected = asked(controller, 1.9, state, signals=('h2',))[1]
-    assert dict(rejected.values['held']) == pytest.approx({'h1': 1.0, 'h2': 1.2}, abs=1e-5)
 
 
 # Several signals.
@@ -258,25 +200,6 @@ def test_a_setpoint_for_one_of_two_signals_keeps_the_other():
     # 0.05 (h2 - 1) - 0.1 (h3 - 1) + 0.1 (q2 - 3) = 0
     np.testing.assert_allclose(report.target.state, [1.1, 1.2, 0.9], rtol=0, atol=1e-9)
     np.testing.assert_allclose(report.target.input, [3.2, 2.8], rtol=0, atol=1e-9)
-
-
-def test_one_signal_rejected_is_brought_nearest_by_itself():
-    # q2 - 3 = (h3 - 1) - 0.5 (h2 - 1) is at most 0.5
-    controller = loop(THREE, 'h2', 'h3', upper=3.5)
-    state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
-    state, rejected = asked(controller, 1.4, state, signals=('h2',))
-    assert rejected is None
-    rejected = asked(controller, 1.9, state, signals=('h3',))[1]
-    assert rejected.values['signal'] == 'h3'
-    assert dict(rejected.values['held']) == pytest.approx({'h2': 1.4, 'h3': 1.7}, abs=1e-5)
-
-
-def test_before_the_first_measurement_the_other_signal_stays_open():
-    controller = loop(THREE, 'h2', 'h3')
-    state, rejected = asked(controller, 1.3, signals=('h3',))
-    assert rejected is None
-    report = stepped(controller, state, [0.9, 1.1, 1.0], 0)[2]
-    np.testing.assert_array_equal(report.target.setpoint, [1.1, 1.3])
 
 
 def test_schedules_are_kept_per_signal():
@@ -373,51 +296,6 @@ def test_the_controlled_levels_arrive_and_the_others_where_they_are_needed():
     np.testing.assert_allclose(run.reports[-1].target.state, [1.25, 1.3, 0.8], rtol=0, atol=1e-6)
     # 0.1 (q1 - 3) = 0.2 * 0.25 - 0.01, 0.1 (q2 - 3) = -0.1 * 0.2 - 0.05 * 0.3 - 0.015
     np.testing.assert_allclose(run.commands[-1], [3.4, 2.5], rtol=0, atol=1e-6)
-
-
-def test_the_lower_two_of_four_tanks_under_a_model_that_is_not_the_plant():
-    tank = QuadrupleTank()
-    plant = tank.system()
-    x, u = plant.nominal_state, plant.nominal_input
-    states, inputs = (Coordinates(names, units, center, 0.5 * center, 0.2 * center, 1.8 * center)
-                      for names, units, center in (
-                          (plant.state_names, plant.state_units, x),
-                          (plant.input_names, plant.input_units, u)))
-    model = linearised_model(plant.drift_jacobian(x), plant.B, states, inputs, 's',
-                             Provenance('four tanks'))
-    controller = loop(model, 'level_1', 'level_2', upper=6.0)
-    wanted = x[:2] * [1.2, 0.85]
-    run = simulate(controller, Process(plant, 0, x, u, Actuator(), u), [
-        at(10.0, SetpointRequest(0, wanted[:1], ('level_1',))),
-        at(300.0, SetpointRequest(0, wanted[1:], ('level_2',)))], duration=2500.0, period=5.0)
-    # what leaves a tank, a sqrt(2 g h), fills the one below, beside what the pumps give
-    flow = np.array([tank.orifice_1, tank.orifice_2]) * np.sqrt(2.0 * 9.81 * wanted)
-    k = np.array([tank.pump_gain_1, tank.pump_gain_2])
-    pumps = np.linalg.solve(np.array([[tank.split_1, 1.0 - tank.split_2],
-                                      [1.0 - tank.split_1, tank.split_2]]) * k, flow)
-    upper = np.array([(1.0 - tank.split_2) * k[1] * pumps[1] / tank.orifice_3,
-                      (1.0 - tank.split_1) * k[0] * pumps[0] / tank.orifice_4])
-    rest = np.array([*wanted, *upper ** 2 / (2.0 * 9.81)])
-    np.testing.assert_allclose(run.states[-1], rest, rtol=1e-4)
-    np.testing.assert_allclose(run.reports[-1].target.state, rest, rtol=1e-4)
-    np.testing.assert_allclose(run.commands[-1], pumps, rtol=1e-4)
-    np.testing.assert_array_equal(run.setpoints[30], [wanted[0], x[1]])
-
-
-def test_a_continuous_loop_settles_at_the_steady_state_of_its_setpoint():
-    weights = Weights(np.eye(2), np.eye(1))
-    centers = SERIES.states.center, SERIES.inputs.center
-
-    def rate(x, u):
-        return np.array([[-0.2, 0.0], [0.2, -0.1]]) @ (x - 1.0) + np.array([0.1, 0.0]) * (u - 3.0)
-
-    run = run_closed_loop(SERIES, rate, centers[0], np.array([1.4]), weights, 300.0,
-                          controlled=('h2',))
-    np.testing.assert_allclose(run.states[-1], [1.2, 1.4], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(run.inputs[-1], [3.4], rtol=0, atol=1e-5)
-    with pytest.raises(ValueError, match=r'no steady state with y at \[-0\.5\]'):
-        run_closed_loop(parabola().model, rate, np.ones(2), np.array([-0.5]), weights, 1.0,
-                        controlled=('y',))
 
 
 @pytest.mark.parametrize(('model', 'controlled', 'asked', 'w'), [

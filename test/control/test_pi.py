@@ -3,7 +3,6 @@
 
 """The PI law: its equation, limits without windup, hand-over, and a plant without a model."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,9 +20,8 @@ from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.evaluation import at, simulate
-from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
-from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
-from studies.general.systems import SADDLE
+from koopman_ros.model import Coordinates, linearised_model, Provenance
+from koopman_ros.plants import ControlAffineSystem, Process
 
 GAIN, TIME = 2.0, 20.0
 PLANT = ControlAffineSystem(
@@ -98,15 +96,6 @@ def test_it_begins_where_another_law_ended():
     assert abs(loop.states[-1, 0]) < 0.3
 
 
-def test_it_takes_no_memory_of_another_law():
-    loop = run(controller(), seconds=20.0).loop
-    fresh, foreign = (
-        loop.controller.step(replace(loop.state, law='mine', law_memory=memory), np.array([4.0]),
-                             loop.state.time_ns + SECOND)[1]
-        for memory in (None, np.array([100.0])))
-    np.testing.assert_array_equal(foreign, fresh)
-
-
 def test_without_a_gain_the_next_level_acts_with_a_reason():
     loop = run(controller(gain=0.0, laws=('pi',)), seconds=5.0)
     assert set(loop.levels) == {'hold'}
@@ -126,31 +115,3 @@ def test_two_signals_move_two_inputs_each_its_own():
                                              -3.0 * (-2.0 + 8.0 / TIME)])
     with pytest.raises(ValueError, match='2 inputs for the PI laws of x, y, z'):
         controller(model, gain=1.0)
-
-
-def test_signals_alone_are_a_model_file(tmp_path):
-    save(signals_alone(), tmp_path / 'signals.safetensors')
-    loop = run(controller(load(tmp_path / 'signals.safetensors')), seconds=300.0)
-    assert loop.states[-1, 0] == pytest.approx(10.0, abs=1e-3)
-
-
-def test_the_reactor_is_held_at_its_saddle_for_an_hour():
-    system = two_state_reactor(nominal_state=SADDLE)
-    model = linearised_model(
-        np.zeros((1, 1)), np.zeros((1, 1)),
-        Coordinates.spanning(('temperature',), ('K',), np.array([320.0]), np.array([380.0])),
-        Coordinates.spanning(('coolant_temperature',), ('K',), np.array([253.15]),
-                             np.array([373.15])), 'min', Provenance('signals alone'))
-    one = controller(model, lower=253.15, upper=373.15, rate=1.0, gain=8.0, time=120.0,
-                     setpoint_ramp=np.array([0.05]))
-    x0, u0 = steady_state(system, {'temperature': 350.0})
-    rng = np.random.default_rng(0)
-    loop = simulate(one, Process(system, 0, x0, u0), [
-        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
-        *(at(300.0 * k, SetpointRequest(0, np.array([rng.uniform(340.0, 360.0)])))
-          for k in range(1, 12))],
-        duration=3600.0, C=np.array([[0.0, 1.0]]), noise=np.array([0.1]), seed=0)
-    T = loop.states[:, 1]
-    assert set(loop.levels) == {'pi'}
-    assert np.max(np.abs(T - loop.setpoints[:, 0])[10:]) < 6.0
-    assert np.ptp(T) > 10.0

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control.mpc import own_drift
 from koopman_ros.control.mpc.condensing import condense, drift, roll_out
 from koopman_ros.control.mpc.model_arrays import model_arrays
 from koopman_ros.model import InputTerms, LiftedModel, PolynomialObservables
@@ -96,17 +95,6 @@ def test_roll_out_with_its_sensitivities_and_cost(model: LiftedModel) -> None:
         np.testing.assert_allclose(cost[k, 0, 0], exact[n], rtol=1e-4)
         np.testing.assert_allclose(2.0 * cost[k, 1:, 0], slope[n], rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(cost[k], cost[k].T)
-
-
-@pytest.mark.parametrize('model', MODELS.values(), ids=MODELS)
-def test_roll_out_by_the_methods_of_a_model_is_the_same(model: LiftedModel) -> None:
-    n, m = model.B.shape
-    given = (RNG.normal(size=(3, m)), 0.3 * RNG.normal(size=(4, n)), RNG.normal(size=n),
-             RNG.normal(size=(3, n)), RNG.normal(size=(3, m)), np.array([0.01, 0.02, 0.03]), 2,
-             np.diag(1.0 + np.arange(n)), np.diag(2.0 + np.arange(m)))
-    for here, there in zip(roll_out(model_arrays(model), *given),
-                           own_drift.roll_out(model, *given), strict=True):
-        np.testing.assert_allclose(here, there, rtol=1e-8, atol=1e-10)
 
 
 def test_condensed_cost_is_that_of_the_simulated_plan() -> None:

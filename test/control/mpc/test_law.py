@@ -3,16 +3,15 @@
 
 """The predictive law against independent optima, its limits, and its failures."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 import math
 import sys
 import time
-from types import ModuleType
 
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
-from scipy.optimize import lsq_linear, minimize
+from scipy.optimize import minimize
 
 from koopman_ros.control import Controller, InputLimits, Tuning
 from koopman_ros.control.events import SetpointRequest
@@ -125,49 +124,6 @@ def test_without_limits_it_is_the_sampled_regulator_of_a_linear_plant(pair, inte
     assert found.failure is None
     # it integrates by Runge and Kutta, and its cost by Simpson
     np.testing.assert_allclose(found.u, -K @ x, rtol=3e-3, atol=1e-3 * np.max(np.abs(K @ x)))
-
-
-class Doubled(LiftedModel):
-    """A model with a drift of its own."""
-
-    def drift(self, x: np.ndarray) -> np.ndarray:
-        return 2.0 * super().drift(x)
-
-    def drift_and_jacobian(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        f, J = super().drift_and_jacobian(x)
-        return 2.0 * f, 2.0 * J
-
-
-def test_drift_of_a_subclass_is_planned_with():
-    _, model = OSCILLATOR
-    own = Doubled(**{item.name: getattr(model, item.name) for item in fields(model)})
-    _, same = linear_plant(2.0 * model.A, model.B)
-    np.testing.assert_allclose(compute(law(own), [0.7, -0.4]).u,
-                               compute(law(same), [0.7, -0.4]).u, rtol=1e-6)
-
-
-def test_range_is_planned_for_optimally():
-    """Against bounded least squares over a long horizon with an input of its own each sample."""
-    system, model = OSCILLATOR
-    x0, most, samples = np.array([2.0, 0.0]), 0.4, 300
-    Ad, Bd, Qd, S, Rd = sampled(model.A, model.B, np.diag(Q), np.eye(1), PERIOD)
-    root = np.linalg.cholesky(np.block([[Qd, S], [S.T, Rd]])).T
-    rows, right, power, reach = [], [], x0, np.zeros((2, samples))
-    for k in range(samples):
-        pick = np.zeros((1, samples))
-        pick[0, k] = 1.0
-        rows.append(root @ np.vstack([reach, pick]))
-        right.append(-root @ np.concatenate([power, [0.0]]))
-        power, reach = Ad @ power, Ad @ reach + Bd @ pick
-    best = lsq_linear(np.concatenate(rows), np.concatenate(right), (-most, most), tol=1e-14)
-    assert np.sum(np.abs(best.x) > most - 1e-6) > 10
-    loop = run(OSCILLATOR, [2.0, 0.0], [0.0, 0.0], samples, limits=limits(most))
-    assert set(loop.levels) == {'mpc'}
-    assert np.max(np.abs(loop.commands)) <= most
-    task = Task(system, x0, np.zeros(2), np.zeros(1), Q, np.ones(1), PERIOD, samples)
-    # the first sample's input is of the Riccati equation
-    assert cost_along(task, loop.states, loop.commands[:-1]) / (2.0 * best.cost) == pytest.approx(
-        1.0, abs=2e-3)
 
 
 @pytest.mark.parametrize('change_after', [None, 75.0])
@@ -309,13 +265,6 @@ def test_limits_of_the_states_are_kept():
     assert highest['kept'] <= most + 1e-3
 
 
-def test_state_beyond_its_limit_is_brought_back():
-    loop = run(OSCILLATOR, [2.0, 0.5], [0.5, 0.0], 150, limits=limits(2.0),
-               own=MPCParameters(upper=np.array([1.0, np.inf])))
-    assert set(loop.levels) == {'mpc'}
-    assert np.all(loop.states[60:, 0] <= 1.0 + 1e-3)
-
-
 def test_input_outside_a_narrowed_range_returns_at_its_rate():
     found = compute(law(OSCILLATOR[1], limits=limits(1.0, 2.0)), [0.0, 0.0], previous=3.0)
     assert found.failure is None
@@ -353,30 +302,6 @@ def test_plan_is_the_motion_of_the_plant_under_its_inputs():
     assert not any(side.any() for side in (plan.at_range, plan.at_rate, plan.at_state))
 
 
-def test_plan_is_in_the_units_of_the_signals():
-    model = shipped('reactor_nz4')
-    found = compute(law(model, state_weight=1.0), 2.0 / model.states.scale, (0.0,), interval=1.0)
-    assert found.plan.states[0] == pytest.approx(model.states.center + 2.0)
-    assert found.plan.times[1] == pytest.approx(1.0)
-    np.testing.assert_array_equal(found.plan.inputs[0], found.u)
-
-
-@pytest.mark.parametrize('side', [-1.0, 1.0])
-@pytest.mark.parametrize(('most', 'rate', 'state', 'active'), [
-    (50.0, 1e3, math.inf, (0.0, 0.0, 0.0)), (2.0, 1e3, math.inf, (1.0, 0.0, 0.0)),
-    (50.0, 5.0, math.inf, (0.0, 1.0, 0.0)),
-    # a limit that the unconstrained path would exceed
-    (50.0, 1e3, 1.01, (0.0, 0.0, 1.0))])
-def test_plan_names_the_active_limits(side, most, rate, state, active):
-    bound = np.array([state, math.inf])
-    one = law(OSCILLATOR[1], MPCParameters(lower=-bound, upper=bound), limits=limits(most, rate),
-              state_weight=np.array([1.0, 0.0]), input_weight=0.05)
-    plan = compute(one, [0.0, 0.0], (side, 0.0), previous=0.0).plan
-    at_range, at_rate, at_state = side * np.array(active)
-    assert (plan.at_range.tolist(), plan.at_rate.tolist()) == ([at_range], [at_rate])
-    assert plan.at_state.tolist() == [at_state, 0.0]
-
-
 # Failures.
 
 
@@ -390,18 +315,6 @@ def test_without_a_package_the_next_level_acts_with_the_advice(monkeypatch, pack
     why = loop.reports[-1].reason
     assert (why.code, why.cause.code) == (StatusCode.LAW_FAILED, StatusCode.PACKAGE_MISSING)
     assert why.cause.values['package'] == 'numba daqp'
-
-
-def test_where_nothing_can_be_compiled_the_next_level_acts_with_the_reason(monkeypatch):
-    class Broken(ModuleType):
-        def __getattr__(self, name: str) -> object:
-            raise RuntimeError('cannot cache function: no locator available')
-
-    monkeypatch.setitem(sys.modules, 'koopman_ros.control.mpc.planner', Broken('planner'))
-    found = law(OSCILLATOR[1])
-    assert found.unusable().code is StatusCode.LAW_RAISED
-    assert 'locator' in found.unusable().values['error']
-    assert compute(found, [1.0, 0.0]).failure == found.unusable()
 
 
 def test_plan_that_takes_too_long_costs_one_sample(monkeypatch):
@@ -443,22 +356,6 @@ def test_state_that_is_not_finite_has_no_plan(x):
     assert found.failure is not None
 
 
-def test_infeasible_quadratic_program_costs_one_sample():
-    one = law(OSCILLATOR[1], limits=limits(1.0))
-    one.planner._lower = np.full(1, 2.0)
-    found = compute(one, [0.0, 0.0])
-    assert (found.u, found.failure.code, found.passing) == (None, StatusCode.PLAN_NOT_SOLVED, True)
-
-
-def test_target_beyond_the_range_is_approached_to_the_limit():
-    """An infeasible target leaves an offset and a saturated input, not a failure."""
-    loop = run(OSCILLATOR, [0.0, 0.0], [0.0, 0.0], 3, limits=limits(0.4))
-    one = law(OSCILLATOR[1], limits=limits(0.4))
-    found = compute(one, loop.states[-1], (1.0, 0.0), previous=0.0)
-    assert found.failure is None
-    assert found.u == pytest.approx([0.4])
-
-
 # Memory.
 
 
@@ -470,41 +367,7 @@ def test_warm_start_converges_to_the_plan_of_a_cold_one():
     np.testing.assert_allclose(warm.u, cold.u, rtol=1e-6)
 
 
-@pytest.mark.parametrize('memory', [
-    (np.zeros((5, 1)), np.zeros((6, 3)), np.full(5, PERIOD)), (1, 2), 'text', {'plan': None}])
-def test_memory_of_another_model_or_law_is_ignored(memory):
-    one = law(OSCILLATOR[1])
-    assert compute(one, [0.7, -0.4], memory=memory).u.tobytes() == compute(
-        one, [0.7, -0.4]).u.tobytes()
-
-
-def test_first_sample_is_that_of_the_riccati_equation():
-    found = compute(law(OSCILLATOR[1]), [0.6, -0.4], interval=0.0)
-    assert found.failure is None
-    assert (found.memory, found.plan) == (None, None)
-    assert found.info.form != 'planned'
-
-
 # The grid.
-
-
-@pytest.mark.parametrize('interval', [0.01, 0.1, 1.0, 10.0])
-def test_horizon_grows_from_the_sample_and_ends_in_time(interval):
-    lengths = law(UNSTABLE[1]).planner.grid(interval).lengths
-    assert lengths[0] == interval
-    assert np.all(np.diff(lengths) >= 0.0)
-    assert 3 <= len(lengths) <= 30
-    # eight time constants of the growing mode, or three samples
-    assert np.sum(lengths) <= max(8.0 / 0.5, 3.0 * interval) + interval
-
-
-@pytest.mark.parametrize(('horizon', 'count', 'longest', 'total'), [
-    (10.0, 5, math.inf, 10.0), (5.0, 5, math.inf, 5.0), (1.0, 3, math.inf, 3.0),
-    (1e6, 30, math.inf, 1e6), (7.0, 1, math.inf, 1.0), (100.0, 4, 2.0, 7.0)])
-def test_grid_reaches_its_horizon(horizon, count, longest, total):
-    lengths = HorizonGrid.growing(horizon, 1.0, count, longest).lengths
-    assert (lengths[0], len(lengths)) == (1.0, count)
-    assert np.sum(lengths) == pytest.approx(total)
 
 
 def test_plan_is_shifted_by_a_sample():
