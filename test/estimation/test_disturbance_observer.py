@@ -17,7 +17,7 @@ from koopman_ros.estimation import (
     Estimate,
 )
 from koopman_ros.evaluation import perfect
-from koopman_ros.plants import Actuator, two_state_reactor
+from koopman_ros.plants import Actuator
 from studies.robustness.disturbances import CHANGED
 from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
@@ -119,15 +119,6 @@ def asked(*arguments, **others):
     return loop
 
 
-def test_nominal_step_response():
-    loop = asked()
-    samples = loop.run(RESPONSE + MORE)
-    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE
-    assert min(s.temperature for s in samples) > SETPOINT - 0.1
-    # the model is so good that there is next to nothing to estimate
-    assert max(abs(float(s.report.estimate.disturbance[0])) for s in samples) < 0.01
-
-
 CHANGED_HERE = [*CHANGED][::2]
 
 
@@ -143,16 +134,6 @@ def test_the_law_controls_a_plant_that_differs_from_its_model(plant, others):
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
     assert plant is REACTOR or abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
-
-
-def test_two_state_reactor_under_the_lift_of_the_one_state_one():
-    plant = two_state_reactor()
-    loop = Reactor(controller(), plant, kelvin=float(plant.nominal_state[1]))
-    loop.run(10)
-    setpoint = float(plant.nominal_state[1]) - 3.0
-    loop.ask(setpoint)
-    # its own slow mode, -1.05/min, takes 224 s to fade to a fiftieth
-    assert settled(loop.run(420), setpoint, 1e-3) <= 224 + 130
 
 
 def test_the_panel_shows_a_sensor_bias():
@@ -192,21 +173,6 @@ def test_an_actuator_that_reaches_less_than_is_commanded(tells):
     below = SETPOINT - min(s.temperature for s in samples)
     assert below < 0.5 if tells else below > 1.0
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE or not tells
-
-
-def test_without_the_observer_the_offset_stays():
-    loop = asked(controller(observer_bandwidth=0.0), CHANGED['UA −20 %'])
-    assert abs(loop.run(300)[-1].temperature - SETPOINT) > 3.0
-
-
-@pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (6.0, 0.04, 0.09),
-                                                        (12.0, 0.09, 0.4)])
-def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
-    loop = Reactor(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
-    commands = np.array([s.command for s in loop.run(600)[200:]])
-    assert low < np.std(commands) < high
-    # the filter adds no offset
-    assert abs(np.mean([s.temperature for s in loop.samples[200:]]) - START) < 0.02
 
 
 # Which measurements are accepted.
@@ -291,25 +257,6 @@ def test_a_sensor_that_reports_on_change_neither_jumps_nor_is_stuck(heartbeat, e
     assert set(levels(samples)) == expected
     if heartbeat:
         assert all(abs(s.temperature - SETPOINT) < 2.5 for s in samples[200:])
-
-
-def test_a_plant_that_rests_where_the_model_was_not_trained_is_not_frozen():
-    """As an empty tank, which the extrapolated model expects to go on falling."""
-    own = controller()
-    loop, outside = asked(own), float(own.model.states.lower[0]) - 3.0
-    # when the jump there is believed
-    assert levels(loop.run(100, lambda _: outside)[40:]) == ['linear']
-
-
-def test_rare_measurements_are_not_taken_for_a_gap():
-    loop = controller()
-    state = loop.initialise(State(), np.array([300.0]))
-    for k in range(30):
-        state, command, report = loop.step(
-            state, np.array([START + 1e-9 * k]), EPOCH + 60 * k * SECOND)
-        assert report.measurement.missed == 0
-        assert report.level == 'sdre'
-    assert command[0] == pytest.approx(300.0, abs=1e-3)
 
 
 def test_missed_measurements_are_counted():

@@ -23,7 +23,6 @@ from koopman_ros.control import (
     Supervisor,
     Tuning,
 )
-from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import StatusCode
@@ -36,12 +35,12 @@ from koopman_ros.estimation import (
 )
 from koopman_ros.estimation.kalman_filters import uncertainty
 from koopman_ros.evaluation import at, exchange, Loop, simulate
-from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.model import LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from studies.general.systems import SADDLE
 from studies.true_model import TrueModel
-from support.closed_loops import content, SECOND, shipped
+from support.closed_loops import content, SECOND
 from support.random_lifts import coordinates, random_lift
 
 FILTERS = [ExtendedKalmanFilter, UnscentedKalmanFilter]
@@ -78,7 +77,7 @@ def oscillator() -> LiftedModel:
 
 
 @pytest.mark.parametrize('kind', FILTERS)
-@pytest.mark.parametrize('seconds', [2.0, 20.0])
+@pytest.mark.parametrize('seconds', [20.0])
 def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
     model = oscillator()
     one = kalman(kind, model, first(model, 1))
@@ -97,16 +96,6 @@ def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
     spread = np.block([[np.eye(2), np.zeros((2, 1))], [np.zeros((2, 2)), model.B]])
     expected = spread @ expected @ spread.T
     assert predicted == pytest.approx(expected, abs=1e-4 * np.max(np.abs(expected)))
-
-
-def test_sigma_points_of_one_state_have_the_mean_and_covariance_of_a_linear_flow():
-    """Of so few, the one in the middle has a weight as well."""
-    model = linear([[-0.4]], [[0.7]])
-    start, u = Estimate(np.array([0.6]), np.array([0.3])), np.array([0.5])
-    expected, found = (kalman(kind, model, first(model, 1)).predict(start, u, 20.0)
-                       for kind in FILTERS)
-    assert found.x == pytest.approx(expected.x, rel=1e-9)
-    assert found.covariance == pytest.approx(expected.covariance, rel=1e-9)
 
 
 @pytest.mark.parametrize('kind', FILTERS)
@@ -194,7 +183,6 @@ def changed(**constants: float):
 
 @pytest.mark.parametrize(('estimator', 'constants', 'known'), [
     ('unscented_kalman_filter', {'heat_transfer_coefficient': 0.85 * 5e4}, True),
-    ('extended_kalman_filter', {'feed_temperature': 355.0}, True),
     # one output has one disturbance: it is taken for one of the heat balance
     ('extended_kalman_filter', {'feed_concentration': 1.1}, False)])
 def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known):
@@ -217,7 +205,7 @@ def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known
     assert not known or np.all(np.abs(error) < 5.0 * deviation[500:])
 
 
-@pytest.mark.parametrize('wrong', [-0.2, 0.1])
+@pytest.mark.parametrize('wrong', [-0.2])
 def test_a_wrong_initial_estimate_of_an_unmeasured_state_is_corrected(wrong):
     x0, u0 = held(350.0)
     x0 = np.array([x0[0] + wrong, x0[1]])
@@ -259,44 +247,12 @@ def test_a_state_transfers_to_a_model_in_other_units():
     assert abs(float(loop.commands[100, 0] - loop.commands[99, 0])) <= 1.0
 
 
-def test_a_model_with_other_hidden_states_starts_from_the_measurement():
-    # the same plant, its concentration in other words
-    names = ('conversion', 'temperature')
-    other = replace(TRUTH, states=Coordinates(
-        names, ('1', 'K'), TRUTH.states.center, TRUTH.states.scale, TRUTH.states.lower,
-        TRUTH.states.upper))
-    x0, u0 = held(350.0)
-    loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
-        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
-        at(100.0, exchange(saddle(other)))],
-        duration=250.0, noise=np.array([NOISE]), seed=5)
-    assert set(loop.levels) == {'sdre'}
-    assert abs(np.mean(loop.states[200:, 1]) - 350.0) < 0.05
-
-
 def test_more_inputs_than_outputs_and_fewer():
     # one disturbance for each output, whatever the inputs: no offset where the plant differs
     for n_u, n_y in ((2, 1), (1, 2), (1, 1)):
         model = random_lift(2, n_u=n_u, seed=1)
         one = kalman(ExtendedKalmanFilter, model, first(model, n_y))
         assert np.linalg.matrix_rank(one.initial_covariance[2:, 2:]) == n_y
-
-
-def test_a_start_up_from_far_outside_the_data_arrives():
-    # a PI law, which asks nothing of the model, until the data begin
-    limits = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
-    one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), fallback_order=('sdre', 'pi'),
-                 linear_model_margin=3.0, plugins={'pi': PIParameters([0.0, 8.0], [1.0, 120.0])})
-    u0 = np.array([300.0])
-    loop = simulate(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
-        at(0.0, Initialisation(u0)), at(5.0, SetpointRequest(0, np.array([350.0])))],
-        duration=1100.0, noise=np.array([NOISE]), seed=7)
-    levels = loop.levels
-    assert set(levels) == {'pi', 'sdre'}
-    taken_over = levels.index('sdre')
-    assert set(levels[taken_over:]) == {'sdre'}
-    assert np.max(loop.states[:, 1]) < 351.0
-    assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
 
 
 def test_noise_that_is_not_given_is_that_of_the_record():
@@ -387,63 +343,6 @@ def test_late_values_correct_the_filter_at_their_own_times_in_any_order(dead_tim
             state, model.states.names[signal], model.states.center[signal], round(time * SECOND))
         assert (unchanged, rejected.code) == (state, StatusCode.ANALYSIS_REJECTED)
     assert loop.set_mode(state, Mode.MANUAL).history == History()
-
-
-def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_all():
-    model, rng = oscillator(), np.random.default_rng(0)
-    outputs = first(model, 1)
-    one = Controller(model, Tuning.for_model(
-        model, state_weight=np.ones(2), input_weight=np.ones(1), controlled=(outputs.names[0],),
-        limits=InputLimits(model.inputs.lower, model.inputs.upper, np.ones(1)),
-        measurement_noise=np.array([0.1]),
-        disturbance_noise=0.05 * np.sqrt(60.0) * model.inputs.scale,
-        initial_error=0.3 * model.states.scale, estimator='extended_kalman_filter'), outputs)
-    own = kalman(ExtendedKalmanFilter, model, outputs)
-    state, now, expected, before = State(), 10 ** 12, None, None
-    for k in range(60):
-        seconds = float(rng.choice([0.4, 1.0, 2.5]))
-        elapsed = round(seconds * 1e9)
-        now += elapsed
-        y = model.states.center[:1] + rng.normal(0.0, 0.3, 1)
-        lost = k % 7 == 3
-        state, command, _ = one.step(state, np.full(1, np.nan) if lost else y, now)
-        deviation = (y - model.states.center[:1]) / model.states.scale[:1]
-        if expected is None:
-            expected = own.restart(None, np.append(deviation, 0.0), None)
-        else:
-            expected = own.predict(expected, before, elapsed / 1e9)
-            if not lost:
-                expected = own.correct(expected, np.append(deviation, expected.x[1]), 0.0)
-        if k:
-            # first guesses differ
-            assert state.estimate.x == pytest.approx(expected.x, abs=1e-9)
-        else:
-            expected = state.estimate
-        assert state.estimate.covariance == pytest.approx(expected.covariance, rel=1e-9, abs=1e-12)
-        before = model.inputs.to_deviation(command)
-        # the same again, and one that was overtaken
-        for late in (0, 10 ** 8):
-            state, repeated, _ = one.step(state, y + 5.0, now - late)
-            assert repeated == command
-
-
-def test_another_fallback_order_keeps_the_estimated_rate():
-    """From a PI law to levels of which the last has another model than the first."""
-    model, plant = shipped('two_state'), two_state_reactor()
-
-    def with_levels(*levels: str, **plugins: object) -> Controller:
-        return Controller(model, Tuning.for_model(
-            model, controlled=('temperature',), fallback_order=levels, plugins=plugins,
-            measurement_noise=np.array([0.02]), disturbance_noise=np.array([0.1])), TEMPERATURE)
-
-    x0, u0 = steady_state(plant, {'temperature': 312.15})
-    loop = simulate(
-        with_levels('pi', pi=PIParameters([0.0, 3.0], [1.0, 60.0])), Process(plant, 0, x0, u0), [
-            at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([312.15]))),
-            at(20.0, exchange(with_levels('sdre', 'linear')))],
-        duration=80.0, noise=np.array([0.02]), seed=9)
-    assert set(loop.levels[22:]) == {'sdre'}
-    assert np.max(np.abs(loop.states[:, 1] - 312.15)) < 0.3
 
 
 def test_an_estimate_that_strayed_from_the_data_is_corrected():
