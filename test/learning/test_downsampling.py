@@ -36,17 +36,6 @@ def test_means_of_a_ramp_lie_on_it() -> None:
         averaged(episode(np.zeros(15)), 8)
 
 
-@pytest.mark.parametrize('linear', [(), (True, False)])
-def test_input_that_changes_often_keeps_its_integral(linear: tuple[bool, ...]) -> None:
-    rng = np.random.default_rng(0)
-    one = Episode(np.arange(200.0), rng.standard_normal((200, 1)), np.arange(-1.0, 200.0),
-                  rng.standard_normal((201, 2)), linear)
-    found = averaged(one, 8)
-    assert (len(found), len(found.u), found.linear) == (25, 24, ())
-    area = one.input_integral(found.time)
-    assert found.input_integral(found.time) == pytest.approx(area - area[0])
-
-
 def survey(*episodes: Episode) -> RecordStatistics:
     found = RecordStatistics.empty(episodes[0].x.shape[1], episodes[0].u.shape[1])
     for one in episodes:
@@ -77,21 +66,6 @@ def test_samples_are_averaged_as_far_as_the_motion_is_straight() -> None:
     assert found.group(1) > survey(episode(wave(10_000, 0.01))).group(1)
     # no more than what is needed
     assert [found.group(most) for most in (100_000, 60_000, 30_000, 10_000)] == [1, 1, 2, 8]
-
-
-def test_a_rest_does_not_hide_the_pace() -> None:
-    rng = np.random.default_rng(1)
-    rest = episode(0.1 * rng.standard_normal(200_000))
-    moving = episode(wave(200, 0.1, 4000))
-    assert survey(rest).group(1) > 100
-    assert survey(rest, moving).group(1) <= 2 * survey(moving).group(1)
-
-
-@pytest.mark.parametrize('values', [
-    pytest.param(wave(100, 0.0), id='no noise'), pytest.param(np.zeros(60_000), id='nothing'),
-    pytest.param(np.round(wave(5000, 0.0), 1), id='a coarse sensor')])
-def test_without_white_noise_nothing_is_averaged(values: np.ndarray) -> None:
-    assert survey(episode(values)).group(1) == 1
 
 
 def test_surveys_of_parts_are_that_of_the_whole() -> None:
@@ -143,18 +117,3 @@ def test_the_selection_covers_every_cell() -> None:
     np.testing.assert_array_equal(np.max(highs, axis=0), found.upper)
     tenths = {int(10 * one.time[0] / whole.time[-1]) for one in chosen}
     assert len(tenths) >= 8
-
-
-def test_the_seed_determines_the_selection() -> None:
-    parts = [long_rest(20_000), long_rest(30_000)]
-    starts = [[one.time[0] for one in select(parts, seed=seed).episodes()] for seed in (0, 0, 1)]
-    assert starts[0] == starts[1] != starts[2]
-
-
-def test_short_parts_are_left_out() -> None:
-    whole = survey(long_rest())
-    found = Selection(whole.lower, whole.upper, 16, 4000)
-    found.offer(0, episode(np.zeros(159)), np.random.default_rng(0))
-    assert (found.offered, found.episodes()) == (0, [])
-    found.offer(0, episode(np.zeros(160)), np.random.default_rng(0))
-    assert [len(one) for one in found.episodes()] == [10]

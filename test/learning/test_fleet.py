@@ -3,7 +3,6 @@
 
 """Retraining of many plants in one call, some of them from a sibling's lift."""
 
-from dataclasses import replace
 
 import pytest
 
@@ -60,16 +59,6 @@ def test_a_lift_begins_from_that_of_the_first_sibling(tasks, ended):
     steps = {name: by_name[name].summary['classes']['identity lift']['steps']
              for name in ('first', 'second')}
     assert 0 < steps['second'] < steps['first']
-
-
-def test_a_request_to_end_leaves_the_rest_alone(tasks, tmp_path):
-    asked = {name: replace(tasks[name], output=str(tmp_path / f'{name}.safetensors'),
-                           warm_start_model='')
-             for name in ('first', 'second')}
-    outcomes = dict(retrain_fleet(asked, on_progress=lambda *_: True))
-    assert all(one.stopped and not one.error for one in outcomes.values())
-    assert set(outcomes) == set(asked)
-    assert not list(tmp_path.glob('*.safetensors'))
 
 
 def test_invalid_arguments_are_rejected_before_the_start(tasks):

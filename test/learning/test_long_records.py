@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from koopman_ros.learning import retrain, TrainingTask
-from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.record import read_record, reduced
 from koopman_ros.plants import describe
-from koopman_ros.records import loop_episodes, read, Record
+from koopman_ros.records import loop_episodes, Record
 from support.long_records import bags_of, drift_error, source, SYSTEM, task
 from support.long_records import SAMPLES as LENGTH
 from support.quick_retraining import page_of, quick_retraining
@@ -59,16 +58,6 @@ def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Pa
     assert found.reduction.text() in page_of(found)
 
 
-def test_a_short_record_is_taken_whole(bags: list[Path]) -> None:
-    found = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH, 0)
-    assert found.reduction is None
-    assert [len(one) for one in found.episodes] == [LENGTH, LENGTH]
-    # a bag that is named twice is read once, here and there
-    twice = read_record(source([*bags[:2], bags[0]]), 2 * LENGTH - 1000, 0)
-    assert twice.account.notes[0] == f'{bags[0]} is listed twice: read once'
-    assert twice.account.used == 2 * LENGTH
-
-
 def test_a_record_in_memory_is_reduced_to_the_same_segments(bags: list[Path]) -> None:
     one = source(bags[:1])
     episodes, account = loop_episodes(one.bags, one.states, one.inputs)
@@ -77,27 +66,3 @@ def test_a_record_in_memory_is_reduced_to_the_same_segments(bags: list[Path]) ->
     assert found.reduction == streamed.reduction
     for own, other in zip(found.episodes, streamed.episodes, strict=True):
         assert np.array_equal(own.x, other.x)
-
-
-def test_a_record_with_missing_values_is_reduced_without_averages() -> None:
-    time = 0.1 * np.arange(4000)
-    lab = np.where(np.arange(4000) % 20 == 0, np.cos(0.01 * time), np.nan)
-    record = read({'time': time, 'level': np.sin(0.01 * time), 'lab': lab, 'pump': time},
-                  ['level', 'lab'], 'pump')
-    found = reduced(record, 1000, 0)
-    assert found.reduction is not None
-    assert (found.reduction.group, found.reduction.samples) == (1, 4000)
-    assert found.reduction.used <= 1000
-    every = np.concatenate([one.x for one in found.episodes])
-    # the extremes are among them
-    assert np.nanmax(every, axis=0) == pytest.approx(np.nanmax(record.episodes[0].x, axis=0))
-    assert np.isnan(every[:, 1]).mean() == pytest.approx(0.95, abs=0.01)
-
-
-def test_reading_can_be_stopped(bags: list[Path], tmp_path: Path) -> None:
-    told: list[float] = []
-    with pytest.raises(Stopped):
-        retrain(small(bags, tmp_path / 'x.safetensors'),
-                lambda share, _: told.append(share) or len(told) == 4)
-    assert 0.0 < told[-1] < 0.05
-    assert list(tmp_path.iterdir()) == []

@@ -9,7 +9,6 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.control import Controller, Tuning
 from koopman_ros.core.datasets import split_by_episode
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import (
@@ -18,27 +17,19 @@ from koopman_ros.learning import (
     evaluate,
     fit,
     IncrementalTraining,
-    learn_lift,
     model_selection,
     ModelCandidate,
     NeuralDrift,
-    simulate,
-    train,
     TrainingFailed,
 )
-from koopman_ros.learning.identification import identify
-from koopman_ros.learning.lift.neural_drift import with_units_of
 from koopman_ros.learning.model_selection import plainest
 from koopman_ros.model import Box
-from support.random_lifts import random_lift
 from support.small_plants import (
     BENT,
     bent_samples,
     SMALL,
     TWO_STATE,
     two_state_samples,
-    UNFORCED,
-    unforced_samples,
 )
 
 RECIPES = {'neural drift': NeuralDrift(3, max_iterations=40), 'identity lift': SMALL}
@@ -59,16 +50,6 @@ def test_the_plainest_within_a_factor_of_two_is_taken(errors, rejected, chosen):
     those = [contender(str(i), rx, 'rejected' if i in rejected else '')
              for i, rx in enumerate(errors)]
     assert plainest(those) is those[chosen]
-
-
-@pytest.mark.parametrize('swapped', [
-    lambda: train(bent_samples(), BENT, SMALL), lambda: compare(bent_samples(), BENT),
-    lambda: identify([], BENT), lambda: learn_lift(BENT, None, 3, seed=0, starts=1),
-    lambda: simulate(None, random_lift()),
-    lambda: Controller(Tuning.for_model(random_lift()), random_lift())])
-def test_swapped_arguments_are_named(swapped):
-    with pytest.raises(TypeError, match='check the order of the arguments'):
-        swapped()
 
 
 @pytest.fixture(scope='module')
@@ -97,15 +78,6 @@ def test_a_polynomial_drift_is_found_and_taken(bent):
     np.testing.assert_array_equal(linear.model.A, Edmd(1).learn(BENT, training, box).A)
 
 
-@pytest.mark.parametrize(('asked', 'words'), [
-    ({'alone': True}, 'choose must be one of .*, got None'),
-    ({'choose': 'lift'}, "choose must be one of linear, .*, identity lift, got 'lift'"),
-    ({'starts': 0}, 'starts must be at least 1, got 0')])
-def test_incomparable_models_are_an_error(asked, words):
-    with pytest.raises(ValueError, match=words):
-        compare(BENT, bent_samples(), RECIPES, **asked)
-
-
 def test_a_class_that_cannot_be_learned_has_its_reason():
     found = compare(BENT, bent_samples(), {'lift': IncrementalTraining(1)}, degrees=(40,),
                     starts=1, loops=0)
@@ -129,60 +101,6 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     found = compare(BENT, bent_samples(), {}, loops=16)
     assert found.chosen.name == chosen
     assert f'the law fails in {failing[2]} of 16' in found.contenders[1].rejection
-
-
-def test_all_laws_are_tried_where_the_data_are(monkeypatch):
-    tried = []
-
-    def noted(model, *_, **__):
-        tried.append(model.training_states)
-
-    monkeypatch.setattr(model_selection, 'evaluate_closed_loops', noted)
-    found = compare(TWO_STATE, two_state_samples(), {'drift': NeuralDrift(3, max_iterations=5)},
-                    degrees=(2,), starts=1)
-    assert len(tried) == 3
-    for known, one in zip(tried, found.contenders, strict=True):
-        np.testing.assert_array_equal(known.states, tried[-1].states)
-        assert one.model.training_states is known
-
-
-def test_a_plant_without_inputs_has_no_law():
-    assert compare(UNFORCED, unforced_samples(), {}).chosen.law_check is None
-
-
-def test_units_of_a_drift_leave_the_lift_as_it_is():
-    lift, other = random_lift(2, 4), random_lift(2, 5, seed=5)
-    joined = with_units_of(other, lift)
-    x = np.random.default_rng(0).normal(size=(10, 2))
-    np.testing.assert_allclose(joined.lift(x), lift.lift(x), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(joined.drift(x), lift.drift(x), rtol=0, atol=1e-12)
-    phi = joined.observables.features.lift(x)
-    for model, at in ((lift, slice(2, 6)), (other, slice(6, None))):
-        np.testing.assert_allclose(phi[:, at], model.observables.features.lift(x)[:, 2:],
-                                   rtol=0, atol=1e-14)
-
-
-def test_a_lift_is_at_least_as_close_as_the_drift_before_it(bent):
-    _, _, drift, lift = bent.contenders
-    assert lift.rx <= 1.5 * drift.rx
-    assert lift.model.readout.shape == (1, 1 + 3 + 3)
-
-
-def test_starts_that_run_out_of_time_are_kept_and_said():
-    recipes = {'neural drift': NeuralDrift(3), 'identity lift': replace(SMALL, n_z=3)}
-    seen = []
-    found = compare(BENT, bent_samples(), recipes, starts=2, loops=0, budget=1e-9,
-                    watch=lambda now: seen.append((now.name, now.finished)) or False)
-    linear, polynomial, *networks = found.contenders
-    assert not linear.limit
-    assert not polynomial.limit
-    for one in networks:
-        # none is left out
-        assert max(count for name, count in seen if name == one.name) == (
-            2 if one.name == 'neural drift' else 6)
-        assert one.model is None or 'limit of processor time' in one.limit
-    assert any(one.model is not None for one in networks)
-    assert 'limit of processor time' in str(found)
 
 
 def test_a_polynomial_has_fewer_monomials_than_there_are_samples(monkeypatch):

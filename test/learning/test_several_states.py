@@ -15,10 +15,8 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.execution.training import constant_lines, scalars
-from koopman_ros.learning import pipeline as task_module
 from koopman_ros.learning import retrain, TrainingTask, write_report
-from koopman_ros.learning.identification import identify, identify_unmeasured
-from koopman_ros.learning.task import resolve_signals
+from koopman_ros.learning.identification import identify
 from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
 from koopman_ros.plants.library.two_tanks import TwoTanks
@@ -36,7 +34,6 @@ STATES = tuple(RecordedState(name, 'm', MessageField('/tanks', JOINTS, f'positio
                for name in ('level_2', 'level_1'))
 INPUTS = tuple(RecordedInput(name, 'V', MessageField('/pumps', ARRAY, f'data[{k}]', 'mV'))
                for k, name in ((1, 'pump_2'), (0, 'pump_1')))
-FEWER = {'highest_degree': 2, 'dead_times': False}  # drifts that are tried
 
 
 def write_tanks(path, seconds=1000.0):
@@ -85,7 +82,7 @@ def retrained(bag, tmp_path_factory):
     folder = tmp_path_factory.mktemp('tanks')
     present = replace(present_model(), B=1.5 * present_model().B)
     save(present, folder / 'present.safetensors')
-    with quick_retraining(32):
+    with quick_retraining(16):
         return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
                                     str(folder / 'present.safetensors'), STATES, INPUTS,
                                     coordinates=4, starts=1, model_class='identity lift'))
@@ -95,7 +92,7 @@ def test_lift_of_two_states_and_two_inputs_is_accepted(retrained):
     assert retrained.reasons == ()
     decision = retrained.decision
     assert decision.warnings == ()
-    assert decision.law_check.loops == decision.law_check.arrived > 25
+    assert decision.law_check.loops == decision.law_check.arrived > 12
     # nothing but noise is left of the drift's error, in either state, and little of the lift's
     assert decision.drift_rmse == pytest.approx([LEVEL_NOISE] * 2, rel=0.1)
     assert np.all(decision.rmse < 2.0 * LEVEL_NOISE)
@@ -173,28 +170,6 @@ def test_a_measured_input_replaces_the_command(lagging, measured):
         assert drift > 3.0
 
 
-def test_a_level_that_is_in_no_bag_is_learned_with_the_other(short_bag, tmp_path, monkeypatch):
-    """Tank 1 flows into tank 2, so that what it holds shows there."""
-    monkeypatch.setattr(task_module, 'identify_unmeasured', lambda *given, **others:
-                        identify_unmeasured(*given, **{**others, **FEWER}))
-    with quick_retraining(16):
-        found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '',
-                                     STATES[:1], INPUTS, model_class='polynomial',
-                                     unmeasured_states=1))
-    assert found.reasons == ()
-    assert not any('hidden_1' in warning for warning in found.decision.warnings)
-    model = load(found.model_file)
-    assert model.states.names == ('level_2', 'hidden_1')
-    assert model.states.units == ('m', '1')
-    modes = np.linalg.eigvals(model.drift_jacobian(np.zeros(2))).real
-    truth = np.linalg.eigvals(TANKS.drift_jacobian(TANKS.nominal_state)).real
-    assert np.sort(modes) == pytest.approx(np.sort(truth), rel=0.25)
-    assert found.decision.rmse[0] < 2.0 * LEVEL_NOISE
-    page = page_of(found)
-    assert 'Errors of simulations, at samples left out of the fit' in page
-    assert ', 1 state not measured' in page
-
-
 @pytest.fixture(scope='module')
 def by_equations(short_bag, tmp_path_factory):
     """Return what the equations make of eight minutes of the lower level alone."""
@@ -224,23 +199,3 @@ def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
     for words in ('| constant | unit | estimate | standard error |', '| pump_gain | m^3/(s V) |',
                   'of the predicted next measurement'):
         assert words in page
-
-
-@pytest.mark.parametrize(('given', 'words'), [
-    ({'physical_model': 'two_tanks', 'unmeasured_states': 1}, 'set unmeasured_states to 0'),
-    ({'physical_model': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
-    ({'constants': {'orifice_1': None}},
-     'constants name orifice_1, but no physical_model')])
-def test_a_task_whose_equations_do_not_fit_is_rejected(given, words):
-    with pytest.raises(ValueError, match=words):
-        resolve_signals(replace(TrainingTask((), '', '', STATES, INPUTS), **given), None)
-
-
-def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
-    present = present_model()
-    task = TrainingTask((), '', 'present', STATES[:1], INPUTS)
-    plant, states, inputs = resolve_signals(replace(task, physical_model='two_tanks'), present)
-    assert plant.state_names == tuple(state.name for state in states) == ('level_2',)
-    assert plant.input_names == tuple(one.name for one in inputs) == TANKS.input_names
-    with pytest.raises(ValueError, match=r'has the states level_1 \[m\], level_2 \[m\]'):
-        resolve_signals(task, present)

@@ -3,20 +3,15 @@
 
 """Characteristics of inputs that records show, and drifts that are not affine in the inputs."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
-from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_with_characteristics
-from koopman_ros.learning.identification.characteristics import NotMonotoneError
 from koopman_ros.learning.identification.input_functions import NonAffineDrift
-from koopman_ros.learning.identification.structure_search import with_characteristics
 from koopman_ros.model import load
 from koopman_ros.records import read, RecordedInput, RecordedState
 from support.known_plants import methods
@@ -63,13 +58,6 @@ def test_a_characteristic_is_found(g, low, high):
     assert not any(isinstance(one, NonAffineDrift) for one in found.alternatives)
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_a_linear_input_has_none(seed):
-    found = identified(record(lambda x, u: -x + u, -1.0, 1.0, seed))
-    assert not found.drift.box.inputs.characteristics
-    assert (found.warnings, found.alternatives) == ((), ())
-
-
 @pytest.mark.parametrize('given', [{}, {'valve': [0.0, 0.0, 0.5, 0.25, 1.0, 1.0]}],
                          ids=['found', 'given'])
 def test_the_model_file_has_it_and_the_free_run_uses_it(given, tmp_path):
@@ -89,35 +77,6 @@ def test_the_model_file_has_it_and_the_free_run_uses_it(given, tmp_path):
     assert len(model.inputs.characteristics['valve'].values) == (3 if given else 21)
     assert retrained.summary()['characteristics'].keys() == {'valve'}
     assert retrained.free_runs['record'].fit[0] > (90.0 if given else 98.0)
-
-
-def test_one_that_acts_on_a_state_that_is_not_measured_is_found():
-    """A valve fills a tank that drains into the measured one."""
-    rng = np.random.default_rng(0)
-    step = expm(PERIOD * np.array([[-1.0, 1.0, 0.0], [0.0, -0.5, 1.0], [0.0, 0.0, 0.0]]))[:2]
-    u = np.repeat(rng.uniform(0.0, 1.0, 100), 8)
-    x = np.zeros((len(u), 2))
-    for k in range(len(u) - 1):
-        x[k + 1] = step @ np.append(x[k], 30.0 ** (u[k] - 1.0))
-    time = PERIOD * np.arange(len(u))
-    noise = NOISE * np.std(x[:, 0]) * rng.standard_normal(len(u))
-    episode = Episode(time, (x[:, 0] + noise)[:, None], time, u[:, None])
-    # to the measured state alone the effect seems to rise and fall
-    with pytest.raises(NotMonotoneError):
-        identified(episode)
-    found = with_characteristics(PLANT, [episode], ['valve'], dead_times=False
-                                  ).characteristics['valve']
-    u = np.linspace(found.values[0], found.values[-1], 101)
-    true = (30.0 ** u - 30.0 ** u[0]) / (30.0 ** u[-1] - 30.0 ** u[0])
-    assert (found.effect(u) - u[0]) / (u[-1] - u[0]) == pytest.approx(true, abs=0.04)
-
-
-def test_one_that_is_given_is_kept():
-    episode = record(lambda x, u: -x + u * u, 0.0, 1.0)
-    line = {'valve': Characteristic.of([0.0, 1.0], [0.0, 1.0])}
-    found = identified(episode, replace(PLANT, characteristics=line), given=line)
-    assert found.drift.box.inputs.characteristics.keys() == line.keys()
-    assert len(found.drift.box.inputs.characteristics['valve'].values) == 2
 
 
 def test_an_effect_that_rises_and_falls_is_rejected():

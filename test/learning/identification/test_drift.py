@@ -11,13 +11,12 @@ from koopman_ros.learning.identification import (
     box_of,
     DriftModel,
     fitted_starts,
-    longest_step,
     prediction_error,
     Segments,
 )
 from koopman_ros.learning.identification.weak_form import regress
 from koopman_ros.plants import one_state_reactor, simulate, two_state_example
-from support.known_plants import box, CUBIC, PAIR
+from support.known_plants import box, CUBIC
 
 BOX = box([300.0, 0.2], [330.0, 0.9], [280.0], [305.0])
 
@@ -80,40 +79,6 @@ def test_regression_needs_enough_that_moves():
         regress(BOX, 3, np.ones((4, 10)), np.ones((4, 1)), np.ones((4, 2)), np.ones((2, 1)))
 
 
-def test_grid_has_samples_changes_and_steps_between():
-    record = Episode(np.array([0.0, 1.0, 3.5]), np.array([[1.0], [2.0], [3.0]]),
-                     np.array([-1.0, 0.25, 9.0]), np.array([[5.0], [6.0], [7.0]]))
-    grid = Segments.of([record], 1.0)
-    # 2.5 from the second to the third sample is halved twice at most 1 apart
-    assert np.concatenate(([0.0], np.cumsum(grid.steps[:, 0]))) == pytest.approx(
-        [0.0, 0.25, 1.0, 1.0 + 2.5 / 3, 1.0 + 5.0 / 3, 3.5])
-    assert grid.u[:, 0, 0].tolist() == [5.0, 6.0, 6.0, 6.0, 6.0]
-    assert grid.sampled[:, 0].tolist() == [True, False, True, False, False, True]
-    assert grid.x[grid.sampled[:, 0], 0, 0].tolist() == [1.0, 2.0, 3.0]
-
-
-def test_longest_step_is_two_usual_periods_and_one_that_fits_is_not_halved():
-    record = Episode(np.array([0.0, 1.0, 2.0, 3.0, 30.0]), np.zeros((5, 1)), np.zeros(1),
-                     np.zeros((1, 1)))
-    assert longest_step([record]) == 2.0
-    even = Episode(0.1 * np.arange(4), np.ones((4, 1)), np.zeros(1), np.ones((1, 1)))
-    assert Segments.of([even], 0.1).steps.shape == (3, 1)
-
-
-def test_shorter_stretches_are_padded():
-    records = [CUBIC.excited(30, 0.1), CUBIC.excited(11, 0.1, seed=1)]
-    both = Segments.of(records, 0.2)
-    x0 = np.stack([record.x[0] for record in records])
-    path = both.path(CUBIC.rate, x0)
-    for j, record in enumerate(records):
-        alone = Segments.of([record], 0.2)
-        k = len(alone.steps)
-        assert np.array_equal(path[:k + 1, j], alone.path(CUBIC.rate, x0[[j]])[:, 0])
-        # it stands still to the end, and nothing is measured there
-        assert np.all(path[k:, j] == path[k, j])
-        assert not np.any(both.measured[k + 1:, j])
-
-
 @pytest.mark.parametrize('system', [one_state_reactor(), two_state_example()],
                          ids=lambda system: system.name)
 def test_path_against_the_plants_integrator(system):
@@ -148,23 +113,3 @@ def test_starts_are_fitted_to_all_measurements():
     # Runge-Kutta steps of 0.1 are exact to 0.1^5 / 120
     assert starts == pytest.approx(np.array([[expected]]), abs=1e-6)
     assert squares == pytest.approx(np.array([[np.mean((expected * basis - x) ** 2)]]), rel=1e-5)
-
-
-def test_starts_do_not_depend_on_units():
-    record = PAIR.excited(60, 0.1, noise=0.05)
-    segments = Segments.of([record], 0.1)
-    units = np.array([1e3, 1e-3])
-    other = Segments.of([Episode(record.time, record.x * units, record.input_time, record.u)], 0.1)
-    starts, squares = fitted_starts(PAIR.rate, segments, np.ones(2))
-    scaled, scaled_squares = fitted_starts(
-        lambda x, u: units * PAIR.rate(x / units, u), other, units)
-    # differences of 1e-4 of the scale are exact to 1e-8 of the slope
-    assert scaled / units == pytest.approx(starts, abs=1e-7)
-    assert scaled_squares / units ** 2 == pytest.approx(squares, rel=1e-6)
-
-
-def test_prediction_error_weighs_stretches_by_their_measurements():
-    records = [CUBIC.excited(30, 0.1, noise=0.1), CUBIC.excited(90, 0.1, noise=0.2, seed=1)]
-    both = prediction_error(CUBIC.rate, Segments.of(records, 0.2), np.ones(1))
-    single = [prediction_error(CUBIC.rate, Segments.of([r], 0.2), np.ones(1)) for r in records]
-    assert both == pytest.approx(np.sqrt((30 * single[0] ** 2 + 90 * single[1] ** 2) / 120))

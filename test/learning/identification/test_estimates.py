@@ -28,7 +28,6 @@ from koopman_ros.learning.identification import (
     weak_form,
 )
 from koopman_ros.learning.identification.output_error import _Problem, PolynomialCoefficients
-from koopman_ros.learning.identification.total_variation import smoothed
 from koopman_ros.learning.identification.weak_form import _input_integral
 from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from support.known_plants import box, CUBIC, PAIR
@@ -165,22 +164,6 @@ def test_recovers_the_drift(method, plant, degree, known):
     assert found.input_matrix == pytest.approx(plant.B, abs=1e-12 if known else 2e-2)
 
 
-@pytest.mark.parametrize('method', ['weak form', 'total variation'])
-def test_irregular_samples_with_inputs_between_them(method):
-    record = PAIR.irregular(800, 100, (0.01, 0.09), seed=5)
-    assert PAIR.misfit(estimate(method, PAIR, [record], 2)) < 3e-2
-
-
-def test_total_variation_bears_a_rough_input_matrix():
-    record = CUBIC.excited(600, 0.05)
-    box = box_of(CUBIC.plant, [record])
-    rough = box.input_matrix(1.2 * CUBIC.B)
-    found = total_variation([record], box, 3, None, rough)
-    assert CUBIC.misfit(found) < 5e-2
-    # it is taken off again, not believed
-    assert found.input_matrix == pytest.approx(CUBIC.B, rel=5e-2)
-
-
 def test_noise_level():
     clean = PAIR.excited(1500, 0.02, hold=60)
     box = box_of(PAIR.plant, [clean])
@@ -199,28 +182,6 @@ def test_noise_level():
                      np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))
     model = DriftModel(box_of(CUBIC.plant, [record]), 1, np.zeros((2, 1)), np.zeros((1, 1)))
     assert noise_level([record], model) == pytest.approx([0.02], rel=0.12)
-
-
-def test_smoothing_takes_away_noise_alone():
-    rng = np.random.default_rng(0)
-    t = np.linspace(0.0, 6.0, 400)
-    # the derivative of the second one bends sharply
-    true = np.column_stack([np.sin(t), np.where(t < 3.0, t, 6.0 - t) ** 2])
-    sigma = np.array([0.02, 0.1])
-    found = smoothed([(t, true + sigma * rng.standard_normal(true.shape))])[0]
-    # two thirds of the noise go; what is taken away has its size (discrepancy principle)
-    assert np.all(np.sqrt(np.mean((found - true) ** 2, axis=0)) < sigma / 3.0)
-
-
-def test_smoothing_recovers_a_parabola_and_keeps_noise_free_data():
-    t = np.arange(240) / 60.0
-    true = (0.1 + 0.2 * t + 0.3 * t ** 2)[:, None]
-    for seed in range(3):
-        noisy = true + 0.01 * np.random.default_rng(seed).standard_normal((240, 1))
-        # third differences of a parabola are zero, so that any weight is right but the smallest
-        assert np.max(np.abs(smoothed([(t, noisy)])[0] - true)) < 0.015
-    assert np.max(np.abs(smoothed([(t, true)])[0] - true)) < 1e-8
-    assert np.array_equal(smoothed([(t, np.ones((240, 1)))])[0], np.ones((240, 1)))
 
 
 @pytest.mark.parametrize(('call', 'words'), [

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.learning.identification import estimate_parameters, EstimateStatus, Stopped
+from koopman_ros.learning.identification import estimate_parameters, EstimateStatus
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.plants import (
     constant,
@@ -20,11 +20,8 @@ from koopman_ros.plants import (
     constants_of,
     ControlAffineSystem,
     estimated_parameters_of,
-    random_steps,
-    RandomStepDesign,
 )
 from koopman_ros.plants.library.reactor import FedReactor, TwoStateReactor
-from koopman_ros.plants.library.two_tanks import TwoTanks
 
 
 @dataclass(frozen=True)
@@ -100,32 +97,6 @@ def test_of_a_disturbed_plant_a_filter_is_found_too():
     assert estimate_parameters(VESSEL, [vessel(3)], Vessel).method == 'output error'
 
 
-def test_two_tanks_all_of_which_is_measured():
-    truth = TwoTanks(orifice_1=0.2e-4, orifice_2=0.16e-4, pump_gain=3e-6)
-    system = truth.system()
-    plant = description(system.state_names[::-1], system.input_names[::-1],
-                        state_units=('m', 'm'), input_units=('V', 'V'))
-    design = RandomStepDesign([3.0, 0.0], [9.0, 4.0], 0.4 * system.nominal_state,
-                              1.8 * system.nominal_state, (15.0, 45.0), 4.0, rtol=1e-9)
-    run = random_steps(system, design, 800.0, 0)
-    noisy = run.x + 1e-3 * np.random.default_rng(0).standard_normal(run.x.shape)
-    time = 4.0 * np.arange(len(noisy))
-    # in an order of the record's own
-    found = estimate_parameters(plant, [Episode(time, noisy[:, ::-1], time[:-1], run.u[:, ::-1])],
-                                TwoTanks)
-    off = errors(found, truth)
-    assert set(off) == {'orifice_1', 'orifice_2', 'pump_gain'}
-    assert np.max(np.abs(list(off.values()))) < 3.0
-    assert max(one.standard_error / one.value for one in found.constants) < 0.01
-    assert found.hidden == 0
-    assert found.drift.box.states.names == ('level_2', 'level_1')
-    x, u = np.array([0.12, 0.15]), np.array([2.0, 6.0])
-    true_rate = system.derivative(x[::-1], u[::-1])[::-1]
-    assert found.drift.rate(x, u) == pytest.approx(true_rate, abs=3e-5)
-    assert found.drift.input_matrix == pytest.approx(system.B[::-1, ::-1], rel=0.02)
-    assert found.noise == pytest.approx([1e-3, 1e-3], rel=0.3)
-
-
 def saddle(truth, seed, minutes=16.0, period=3.0):
     """Record temperatures, in K, of the reactor that a PI law holds at its saddle."""
     system = truth.system(np.array([0.5, 350.0]))
@@ -187,16 +158,6 @@ def test_an_estimate_at_the_end_of_its_range_is_reported():
     assert np.isnan(gain.standard_error)
     assert 'upper end of its range' in str(gain)
     assert leak.standing is EstimateStatus.ESTIMATED
-
-
-def test_indistinguishable_constants_are_reported():
-    found = estimate_parameters(VESSEL, [vessel(0)], Vessel,
-                                {'gain': None, 'strength': (0.5, 2.0), 'leak': None})
-    gain, strength, leak = found.constants
-    assert gain.standing is strength.standing is EstimateStatus.NOT_IDENTIFIABLE
-    assert gain.value * strength.value == pytest.approx(1.2, rel=0.02)
-    assert abs(leak.value - 0.4) < 3.0 * leak.standard_error
-    assert 'its value, or that of' in str(gain)
 
 
 def test_derivatives_by_constants_and_states_against_those_by_hand():
@@ -269,10 +230,3 @@ class Silent(Constants):
 def test_what_does_not_fit_is_rejected(plant, equations, ranges, words):
     with pytest.raises(ValueError, match=words):
         estimate_parameters(plant, [vessel(0)], equations, ranges)
-
-
-def test_training_can_be_cancelled_and_rejects_a_short_record():
-    with pytest.raises(Stopped):
-        estimate_parameters(VESSEL, [vessel(0)], Vessel, watch=lambda *_: True)
-    with pytest.raises(ValueError, match='record at least 160'):
-        estimate_parameters(VESSEL, [vessel(0, 100)], Vessel)

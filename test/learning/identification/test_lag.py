@@ -15,7 +15,6 @@ from koopman_ros.learning.identification import (
     find_dead_times,
     find_lags,
     identify,
-    identify_with_characteristics,
     lagged,
     with_lag,
 )
@@ -90,37 +89,6 @@ def test_a_lag_is_found_and_none_where_there_is_none(lags):
     found = find_lags(plant_of(len(lags)), [record(lags)[0]], np.zeros(len(lags)),
                       range(len(lags)))
     np.testing.assert_allclose(found, lags, rtol=0.15)
-
-
-@pytest.mark.parametrize('lag', [[4.0], [0.0]])
-def test_a_characteristic_behind_a_lag_is_one_of_the_applied_input(lag):
-    """A valve moves slowly, and its flow depends on where it is."""
-    lag = np.array(lag)
-    episode, applied = record(lag, 1000, noise=0.0)
-    x, u = np.zeros(len(episode)), applied[:, 0] if lag[0] else episode.u[:, 0]
-    flow = np.interp(u, [-1.0, 0.0, 1.0], [-0.2, 0.0, 1.0])
-    for k in range(1, len(x)):
-        x[k] = x[k - 1] + RATE * x[k - 1] + 0.5 * (flow[k - 1] + flow[k if lag[0] else k - 1])
-    rng = np.random.default_rng(0)
-    episode = replace(episode, x=x[:, None] + 0.02 * rng.standard_normal((len(x), 1)))
-    found = with_lag(identify_with_characteristics(
-        plant_of(1), [lagged(episode, lag)], degrees=(1,), methods=methods(20)), lag)
-    drift = found.drift
-    one = drift.characteristics['pump']
-    values = np.linspace(-0.9, 0.9, 19)
-    ends = np.interp(one.values[[0, -1]], [-1.0, 0.0, 1.0], [-0.2, 0.0, 1.0])
-    expected = (np.interp(values, [-1.0, 0.0, 1.0], [-0.2, 0.0, 1.0]) - ends[0]) / np.diff(ends)
-    effect = (one.effect(values) - one.values[0]) / np.ptp(one.values)
-    np.testing.assert_allclose(effect, expected, atol=0.04)
-    assert found.linear.characteristics.keys() == drift.box.inputs.characteristics.keys()
-    # behind a lag the command acts linearly
-    assert bool(drift.box.inputs.characteristics) is not lag.any()
-    xi, v = np.array([0.3, -0.4])[:len(drift.box.states)], np.array([0.55])
-    n = len(xi)
-    both = differences(lambda y: drift.scaled_rate(y[..., :n], y[..., n:]), np.append(xi, v),
-                       np.ones(n + 1))
-    np.testing.assert_allclose(drift.scaled_slope(xi, v), both[:, :n], atol=1e-6)
-    np.testing.assert_allclose(drift.scaled_input_matrix(xi), both[:, n:], atol=1e-6)
 
 
 @pytest.mark.parametrize(('lag', 'late', 'count'), [

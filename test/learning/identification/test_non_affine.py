@@ -9,14 +9,12 @@ import pytest
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.core.solvers import differences, runge_kutta_step
-from koopman_ros.learning import retrain, TrainingTask
+from koopman_ros.learning import TrainingTask
 from koopman_ros.learning.identification import identify_non_affine, with_lag
 from koopman_ros.learning.identification.drift import longest_step, Segments
 from koopman_ros.learning.task import resolve_signals
-from koopman_ros.model import load
-from koopman_ros.records import read, RecordedInput, RecordedState
+from koopman_ros.records import RecordedInput, RecordedState
 from support.known_plants import methods
-from support.quick_retraining import quick_retraining
 
 PLANT = PlantDescription('tank', ('level',), ('m',), ('valve',), ('1',), 's', np.full(1, np.nan),
                          np.full(1, np.nan), None)
@@ -77,35 +75,6 @@ def test_with_the_command_as_a_state_it_is_affine_and_simulates_the_same(found):
     np.testing.assert_allclose(simulated[:, :1], path, atol=1e-3)
     np.testing.assert_allclose(simulated[:, 1], measured[:, 1], atol=1e-6)
     assert drift.box.inputs.upper[0] == found.drift.box.inputs.upper[0]
-
-
-def test_a_known_effect_of_the_input_is_rejected():
-    with pytest.raises(ValueError, match='input_matrix'):
-        identify_non_affine(PlantDescription(
-            'tank', ('level',), ('m',), ('valve',), ('1',), 's', np.zeros(1), np.zeros(1),
-            np.ones((1, 1))), [], ('valve',))
-
-
-def test_a_training_with_the_command_as_a_state(episode, tmp_path):
-    task = TrainingTask(
-        (), str(tmp_path / 'model.safetensors'), '',
-        (RecordedState('level', 'm', place('level', 'level', 'm')),),
-        (RecordedInput('valve', '1', place('valve', 'valve', '1')),), model_class='polynomial',
-        dead_time={'valve': 0.0}, as_state=('valve',), condition=1e6)
-    with quick_retraining(4, degrees=(1,)):
-        retrained = retrain(task, record=read({
-            'time [s]': episode.time, 'level [m]': episode.x[:, 0], 'valve [1]': episode.u[:, 0]},
-            'level', 'valve'))
-    assert retrained.accepted, retrained.reasons
-    # commands of the record act at once
-    run = retrained.free_runs['record']
-    assert (run.names, retrained.lag.tolist()) == (('level',), [0.0])
-    assert run.fit[0] > 97.0
-    model = load(retrained.model_file)
-    assert model.states.names == ('level', 'commanded_valve')
-    assert model.commanded == {0: 1}
-    assert 'the law sets the rate of valve' in str(model)
-    assert 'lag of valve' not in str(model)
 
 
 @pytest.mark.parametrize(('wrong', 'words'), [

@@ -47,22 +47,3 @@ def test_an_unstable_record_has_no_realisation():
     time = PERIOD * np.arange(100.0)
     growing = np.exp(0.2 * time)[:, None]
     assert realised([Episode(time, growing, time, np.sin(time)[:, None])], PERIOD, 1) is None
-
-
-@pytest.mark.filterwarnings('error')
-def test_slow_modes_with_a_short_period_are_realised() -> None:
-    """The Gramians of such a model are singular to rounding as a system of equations."""
-    from scipy.signal import lfilter
-
-    def record(seed: int) -> Episode:
-        u = np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, (20, 2)), 100, axis=0)
-        y = u @ gain.T
-        for pole in np.exp(-1.0 / np.array([150.0, 100.0, 60.0, 30.0])):
-            y = lfilter([0.0, 1.0 - pole], [1.0, -pole], y, axis=0)
-        time = np.arange(float(len(u)))
-        return Episode(time, y, time, u)
-
-    gain = np.array([[1.0, 0.5], [0.5, 1.0]])
-    found = realised([record(0), record(1)], 1.0, 6)
-    assert found is not None
-    assert -np.linalg.solve(*found[:2])[:2] == pytest.approx(gain, rel=0.05)

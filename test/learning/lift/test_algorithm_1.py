@@ -67,16 +67,6 @@ def test_a_drift_of_monomials_is_found_exactly(degree, B):
                                rtol=0, atol=1e-10)
 
 
-def test_degree_one_is_linear_regression():
-    samples = two_state_samples()
-    model = Edmd(1).learn(replace(TWO_STATE, B=None), samples)
-    both = np.linalg.lstsq(
-        np.hstack([samples.x, samples.u]), samples.dxdt, rcond=None)[0].T
-    units = np.concatenate([model.states.scale, model.inputs.scale])
-    np.testing.assert_allclose(np.hstack([model.A, model.B]) * model.states.scale[:, None] / units,
-                               both, rtol=0, atol=1e-13)
-
-
 def test_linearisation():
     samples, jacobian = two_state_samples(), np.array([[-0.1, 0.0], [0.0, 1.0]])
     model = Linearisation(jacobian).learn(TWO_STATE, samples)
@@ -99,21 +89,6 @@ def data():
     samples = bent_samples(2)
     x, u = samples.x - 3.0, samples.u - 0.5
     return ScaledSamples(torch.from_numpy(x), torch.from_numpy(samples.dxdt - 2.0 * u))
-
-
-@pytest.mark.parametrize('change', [
-    {'gamma': 1.0}, {'lambda_initial': 0.0}, {'decoder': 0}, {'max_rounds': 0}], ids=str)
-def test_a_recipe_without_sense(change):
-    with pytest.raises(ValueError, match='must be'):
-        Algorithm1(**{**SMALL, **change})
-
-
-def test_there_is_one_round_of_starts():
-    assert Algorithm1(3).rounds(3) == (3,)
-    assert Algorithm1(4, identity=True).rounds(3) == (4,)
-    for n_z, identity in ((2, False), (3, True)):
-        with pytest.raises(ValueError, match=f'n_z = {n_z} is too small for 3 states'):
-            Algorithm1(n_z, identity=identity).rounds(3)
 
 
 def test_all_parameters_start_from_the_standard_normal_distribution():
@@ -149,17 +124,6 @@ def test_lambda_falls_by_gamma_from_one_minimisation_to_the_next(data, initial, 
         there = normal_equations(LiftProblem(grown.layout, data, weights).add_residuals,
                                  grown.theta, derivatives=False)
         assert there.cost == pytest.approx(seen[-1][1], rel=1e-13)
-
-
-@pytest.mark.parametrize(('limits', 'status', 'minimisations'), [
-    ({'tolerance': 1e9}, MinimumStatus.CONVERGED, 1),
-    ({'tolerance': 0.0, 'max_rounds': 4}, MinimumStatus.MAX_ITERATIONS, 4)])
-def test_it_ends_when_parameters_hardly_move_or_after_max_rounds(
-        data, limits, status, minimisations):
-    steps = []
-    grown = Algorithm1(**SMALL, **limits).start(
-        data, 2, None, 0, lambda iteration, cost: steps.append(iteration))
-    assert (grown.status, steps.count(1)) == (status, minimisations)
 
 
 def test_it_lowers_the_residual_of_the_dynamics(data):

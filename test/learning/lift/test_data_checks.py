@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.learning import train
-from koopman_ros.learning.lift.data_checks import check_nominal_point, check_rates
-from koopman_ros.model import Box
+from koopman_ros.learning.lift.data_checks import check_rates
 from support.small_plants import BENT, bent_samples, SMALL, TWO_STATE, two_state_samples
 
 # dx/dt = -2 (x - 3) + u - 0.5
@@ -44,22 +42,6 @@ def test_times_that_do_not_contradict_the_rates(samples):
     check_rates(DECAY, samples)
 
 
-@pytest.mark.parametrize('period', [0.5, 2.5, 5.0])
-@pytest.mark.parametrize('damping', [0.01, 0.5])
-def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period):
-    """The derivatives of dx1/dt = x2, dx2/dt = -x1 - 2 D x2 are exact, however far apart."""
-    plant = replace(TWO_STATE, B=None)
-    A = np.array([[0.0, 1.0], [-1.0, -2.0 * damping]])
-    start = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
-    x = np.stack([start @ expm(A * period * k).T for k in range(6)], axis=1).reshape(-1, 2)
-    samples = DriftSamples(x, x @ A.T, np.zeros((240, 1)), np.repeat(np.arange(40), 6),
-                           np.tile(period * np.arange(6), 40))
-    check_rates(plant, samples)
-    if period == 0.5:
-        with pytest.raises(ValueError, match=r'0\.10\d times as much'):
-            check_rates(plant, replace(samples, time=10.0 * samples.time))
-
-
 @pytest.mark.parametrize('noise', [0.0, 0.005])
 @pytest.mark.parametrize('factor', [10.0, 1.0 / 60.0, -1.0])
 def test_times_or_rates_in_another_unit_are_rejected(factor, noise):
@@ -71,31 +53,6 @@ def test_times_or_rates_in_another_unit_are_rejected(factor, noise):
         train(DECAY, wrong, SMALL, starts=1)
     assert float(str(error.value).split()[2]) == pytest.approx(1.0 / factor, rel=0.1)
     assert 'give time in s and dxdt in m per s, or another time_unit' in str(error.value)
-
-
-# -0.2 at -1, 0.3 at -0.8, 0 from -0.4 to 0, -0.7 at 0.3 and -0.4 from 0.4 on, besides 2 u
-KINKED = replace(bent_samples(), dxdt=2.0 * (bent_samples().u - 0.5) + np.interp(
-    bent_samples().x - 3.0,
-    [-1.0, -0.8, -0.4, 0.0, 0.3, 0.4], [-0.2, 0.3, 0.0, 0.0, -0.7, -0.4]))
-
-
-def look(plant, samples):
-    check_nominal_point(plant, samples, Box.of(plant, samples.x, samples.u))
-
-
-@pytest.mark.parametrize(('plant', 'samples'), [
-    (BENT, bent_samples()), (replace(BENT, B=None), bent_samples()),
-    (TWO_STATE, two_state_samples()), (replace(TWO_STATE, B=None), two_state_samples()),
-    (DECAY, decaying(0.1, 0.5)),
-    # kinks, which no polynomial follows
-    (BENT, KINKED),
-    # as near as a nominal point that was measured may be
-    (replace(BENT, nominal_state=[3.01]), bent_samples()),
-    # too few samples to tell
-    (replace(BENT, nominal_state=[3.1]), bent_samples(3, 3))],
-    ids=['known B', 'learned B', 'two states', 'their B learned', 'noisy', 'kinks', 'near', 'few'])
-def test_a_steady_state_is_accepted(plant, samples):
-    look(plant, samples)
 
 
 RISING = replace(bent_samples(), dxdt=bent_samples().dxdt + 20.0)

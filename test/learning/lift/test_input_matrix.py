@@ -9,20 +9,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from koopman_ros.control import averaged, recentred, steady_state_target, Weights
+from koopman_ros.control import steady_state_target
 from koopman_ros.control.steady_state import partial_target, resting_state
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
-from koopman_ros.evaluation import run_closed_loop
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.evaluation.model_comparison import PredictionWindows
 from koopman_ros.learning import Edmd, fit, IncrementalTraining, NeuralDrift, train
-from koopman_ros.learning.drift_sampling import learn_lift
-from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.model import Box
-from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.plants import (
     advance,
     box_episodes,
@@ -113,28 +109,6 @@ def test_targets_are_steady_states_of_the_plant():
                                rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize('law', [averaged, recentred])
-def test_the_error_obeys_the_equation_of_the_law(law):
-    """Exactly so for a drift of degree 1, whose lift is closed: e' = (A_x + action) e."""
-    model = Edmd(1).learn(UNKNOWN, samples())
-    target = steady_state_target(model, np.array([0.4, -0.3]))
-    x = np.array([-0.6, 0.5])
-    found = law(model, x, target, Weights(np.eye(2), np.eye(2)))
-    assert found.solved
-    rate = model.rate_under(found.u)(x)
-    np.testing.assert_allclose(rate, (found.drift + found.action) @ (x - target.x), rtol=0,
-                               atol=1e-10)
-
-
-def test_the_loop_reaches_a_set_point_that_needs_another_flow():
-    model = quartic(known=True)
-    x_ref, u_ref = steady_state(PLANT, {'temperature': 321.0, 'concentration': 0.88})
-    loop = run_closed_loop(model, PLANT.derivative, PLANT.nominal_state, x_ref,
-                           Weights(np.eye(2), np.eye(2)), 10.0, u_ref=u_ref)
-    assert np.all(np.abs(loop.states[-1] - x_ref) < [1e-4, 0.02])
-    assert abs(u_ref[0] - 100.0) > 10.0
-
-
 def test_observer_and_optimum_use_the_input_matrix_at_each_state():
     model = quartic(known=True)
     x, u = PLANT.nominal_state + 0.5 * HALF_X, PLANT.nominal_input + 0.6 * HALF_U
@@ -169,24 +143,3 @@ def test_lifts_and_drifts_are_learned_with_it():
         assert found.accepted, found
         path = model.predict(fresh.x[0], fresh.u[:5], 0.05)
         assert np.all(np.abs(path[1:5] - fresh.x[1:5]) < [1e-3, 0.1])
-
-
-def test_it_is_identified_and_lifted_from_noisy_samples():
-    rng = np.random.default_rng(4)
-    inputs = np.repeat(PLANT.nominal_input + HALF_U * rng.uniform(-1.0, 1.0, (60, 2)), 4,
-                       axis=0)
-    episode = simulate(PLANT, PLANT.nominal_state, inputs, 0.05)
-    noisy = replace(episode, x=episode.x + rng.normal(0.0, [1e-4, 0.02], episode.x.shape))
-    found = identify(UNKNOWN, [noisy], degrees=(1, 2))
-    drift = found.drift
-    assert drift.input_degree == 1
-    x = episode.x[::25]
-    assert wrong(drift.input_matrix_at(x), x) < 0.2 * wrong(drift.input_matrix, x)
-    lift = learn_lift(found, UNKNOWN, 3, seed=0, starts=1).model
-    np.testing.assert_allclose(matrix_of(lift, x), drift.input_matrix_at(x), rtol=1e-6, atol=1e-9)
-    # it retrains as what it is
-    assert (lift.plant.input_matrix_degree, lift.plant.B) == (1, None)
-    table = trainer_table(lift, {'system': 'fed_reactor'})
-    assert table.snapshot({}).input_matrix_degree == 1
-    given = table.snapshot({'input_matrix': [0.0] * 4})
-    assert table.check(given).startswith('input_matrix_degree is 1, must be 0 if input_matrix')

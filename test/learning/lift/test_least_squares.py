@@ -4,7 +4,6 @@
 """Levenberg-Marquardt, and what it minimises: parameters, a pass, residuals, their derivatives."""
 
 from functools import partial
-import itertools
 import math
 
 import numpy as np
@@ -101,19 +100,6 @@ def test_normal_equations(identity, n_u, weights):
             Layout(n_x, n_x + 2, 4, identity, n_u, 3), weights))
 
 
-LAYOUT = Layout(2, 4, 5, True, n_u=1, decoder=3)
-ALL_TERMS = ResidualWeights(whitening=0.5, decoder=0.2)
-
-
-@pytest.mark.parametrize('chunk', [1, 10, 11, 12])
-def test_any_chunks_and_the_cost_alone(chunk):
-    of, theta = random_problem(LAYOUT, ALL_TERMS, chunk)
-    assert_normal_equations(of, theta)
-    alone = normal_equations(of.add_residuals, theta, derivatives=False)
-    assert alone.cost == normal_equations(of.add_residuals, theta).cost
-    assert not alone.gradient.any()
-
-
 def least_squares(residual):
     """Turn a residual function into what `minimise` takes."""
     def residuals(theta, equations):
@@ -147,26 +133,6 @@ def test_linear_least_squares():
     assert found.cost == pytest.approx(0.5 * float(squares[0]), rel=1e-12)
 
 
-@pytest.mark.parametrize('start', [(-1.2, 1.0), (5.0, -5.0), (-3.0, 10.0)])
-def test_rosenbrock_valley(start):
-    costs = []
-    found = minimise(least_squares(rosenbrock), vector(*start), max_iterations=200,
-                     monitor=lambda iteration, cost: costs.append(cost))
-    assert all(later <= earlier for earlier, later in itertools.pairwise(costs))
-    assert found.status is MinimumStatus.CONVERGED
-    assert found.iterations < 100
-    np.testing.assert_allclose(found.theta.numpy(), [1.0, 1.0], rtol=0, atol=1e-9)
-
-
-def test_units_of_parameters_do_not_matter():
-    units = vector(1e3, 1e-3)
-    one = minimise(least_squares(rosenbrock), vector(-1.2, 1.0), max_iterations=12)
-    other = minimise(least_squares(lambda theta: rosenbrock(theta / units)),
-                     vector(-1.2, 1.0) * units, max_iterations=12)
-    assert other.cost == pytest.approx(one.cost, rel=1e-6)
-    np.testing.assert_allclose((other.theta / units).numpy(), one.theta.numpy(), rtol=1e-6)
-
-
 @pytest.mark.parametrize('place', ['the start', 'the gradient', 'everywhere else'])
 def test_not_a_number_stalls(place):
     start = vector(1.0, 2.0)
@@ -193,23 +159,6 @@ def test_a_limit_or_an_interruption_keeps_the_best_so_far(limit, end, status):
                      monitor=lambda iteration, cost: iteration == end)
     assert (found.status, found.iterations) == (status, min(limit, end))
     assert found.cost == cost(residuals, found.theta) < cost(residuals, vector(-1.2, 1.0))
-
-
-@pytest.mark.parametrize(('share', 'limit', 'status', 'decrease'), [
-    (6e-5, 200, MinimumStatus.MAX_ITERATIONS, 20 * 6e-5),
-    # of fewer steps, all of them
-    (6e-5, 5, MinimumStatus.MAX_ITERATIONS, 5 * 6e-5),
-    (4e-5, 200, MinimumStatus.CONVERGED, math.nan)])
-def test_the_default_tolerance_is_a_thousandth_over_twenty_steps(share, limit, status, decrease):
-    costs = iter(range(10 * limit))
-
-    def residuals(theta, equations):
-        # every trial is taken, and comes with its derivatives
-        equations.add_sums((1.0 - share) ** next(costs), vector(-1e-3), torch.eye(1).double())
-
-    found = minimise(residuals, vector(0.0), max_iterations=limit)
-    assert found.status is status
-    assert found.decrease == pytest.approx(decrease, rel=1e-2, nan_ok=True)
 
 
 @pytest.mark.parametrize('derivatives_too', [True, False])

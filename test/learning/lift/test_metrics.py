@@ -12,16 +12,11 @@ from scipy.linalg import block_diag, expm
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.learning import (
     evaluate,
-    Fit,
     fit,
-    LiftMetrics,
     rollout_rmse,
 )
 from koopman_ros.model import (
-    Coordinates,
-    LiftedModel,
     linearised_model,
-    NetworkObservables,
     Provenance,
 )
 from support.random_lifts import coordinates, random_lift
@@ -33,18 +28,6 @@ B = np.array([[0.3], [2.0]])
 def linear_model(jacobian=JACOBIAN):
     return linearised_model(jacobian, B, coordinates('x', 2), coordinates('u', 1), 's',
                             Provenance('test'))
-
-
-def test_a_wrong_slope_is_measured_and_none_where_the_model_is_exact():
-    """The drift -3 x modelled as -2 x leaves a third of it: squared, 1/9."""
-    samples = linear_episodes()
-    exact = fit(linear_model(), samples.x, samples.dxdt, samples.u)
-    assert max(exact.rw, exact.rx) < 1e-28
-    c = coordinates('x', 1)
-    model = linearised_model([[-2.0]], [[1.0]], c, coordinates('u', 1), 's', Provenance('test'))
-    x, u = np.linspace(c.lower, c.upper, 20), np.linspace(-1.0, 2.0, 20)[:, None]
-    figures = fit(model, x, -3.0 * (x - c.center) + (u - model.inputs.center), u)
-    assert (figures.rw, figures.rx, figures.cond) == pytest.approx((1 / 9, 1 / 9, 1), rel=1e-12)
 
 
 def test_figures_under_a_pre_feedback_are_those_of_the_plant_under_it():
@@ -101,34 +84,11 @@ def test_roll_out_of_a_linear_model_against_the_matrix_exponential():
             np.testing.assert_allclose(state - model.states.center, deviation, rtol=0, atol=1e-7)
 
 
-def test_roll_out_follows_the_projected_drift():
-    """A free lift of n_z = n_x = 1 is a change of variable: z = tanh(x) decays as exp(-t)."""
-    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
-    observables = NetworkObservables(np.eye(1), np.zeros(1), np.eye(1), identity=False)
-    model = LiftedModel(observables, -np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
-    path = model.predict(np.array([1.2]), np.zeros((20, 1)), 0.2)
-    expected = np.arctanh(np.tanh(1.2) * np.exp(-0.2 * np.arange(21)))
-    np.testing.assert_allclose(path[:, 0], expected, rtol=0, atol=1e-8)
-
-
 def test_a_roll_out_without_inputs_and_one_that_diverges():
     x0 = np.array([2.2, 1.7])
     np.testing.assert_array_equal(linear_model().predict(x0, np.zeros((0, 1)), 0.3), [x0])
     with pytest.raises(RuntimeError, match=r'diverged after \d+ samples: keep the inputs within'):
         linear_model(50.0 * np.eye(2)).predict(np.ones(2), np.zeros((40, 1)), 1.0)
-
-
-def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
-    """With dz/dt = z a coordinate leaves its maximum, at x = 1.5, where the drift is infinite."""
-    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
-    observables = NetworkObservables(np.ones((2, 1)), np.array([-0.5, -2.5]),
-                                     np.array([[1.0, -1.0]]), identity=False)
-    model = LiftedModel(observables, np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
-    path = model.predict(np.array([0.5]), np.zeros((7, 1)), 0.1)
-    z = model.lift(path)
-    np.testing.assert_allclose(z, z[0] * np.exp(0.1 * np.arange(8))[:, None], rtol=1e-7)
-    with pytest.raises(RuntimeError, match='diverged after 9 samples'):
-        model.predict(np.array([0.5]), np.zeros((9, 1)), 0.1)
 
 
 @pytest.mark.parametrize('change', [
@@ -139,12 +99,6 @@ def test_a_roll_out_of_mismatched_arguments_is_an_error(change):
     assert linear_model().predict(**usual).shape == (3, 2)
     with pytest.raises(ValueError, match=r'expected|must be above 0 s'):
         linear_model().predict(**{**usual, **change})
-
-
-def test_samples_of_another_plant_are_no_fit():
-    # a single column would stand for both
-    with pytest.raises(ValueError, match='incompatible dxdt'):
-        fit(linear_model(), np.zeros((9, 2)), np.zeros((9, 1)), np.zeros((9, 1)))
 
 
 def test_roll_outs_side_by_side_are_those_one_by_one():
@@ -189,11 +143,3 @@ def test_the_error_of_roll_outs_is_measured_over_all_episodes():
     assert rollout_rmse(linear_model(), replace(samples, time=None)) is None
     assert np.all(np.isinf(rollout_rmse(linear_model(50.0 * np.eye(2)), samples)))
     np.testing.assert_array_equal(evaluate(linear_model(), samples).rollout_rmse, error)
-
-
-def test_finite_figures_by_name():
-    for error, names, expected in ((None, ('T',), {}),
-                                   (np.array([0.5]), ('T',), {'rollout_rmse': 0.5}),
-                                   (np.array([np.inf, 0.1]), ('T', 'c'), {'rollout_rmse_c': 0.1})):
-        figures = LiftMetrics(Fit(0.1, np.nan, 3.0), np.ones(1), error)
-        assert figures.metrics(names) == {'rw': 0.1, 'cond': 3.0, **expected}

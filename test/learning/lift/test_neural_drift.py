@@ -39,31 +39,6 @@ def test_a_drift_in_the_span_of_the_features_is_recovered_to_rounding(identity):
     assert fit(found, fresh.x, fresh.dxdt, fresh.u).rx < 1e-25
 
 
-def test_units_that_say_nothing_and_units_that_say_the_same_do_no_harm():
-    """One unit is 0 everywhere and two are alike, so that the weights are not determined."""
-    lift = random_lift(2, 6)
-    W, b = np.array(lift.observables.W), np.array(lift.observables.b)
-    W[0], W[2], b[2] = 0.0, W[1], b[1]
-    lift = replace(lift, observables=replace(lift.observables, W=W, b=b))
-    truth = replace(lift, readout=np.random.default_rng(2).normal(size=(2, 8)))
-    found, fresh = with_readout(lift, samples_of(truth)), samples_of(truth, seed=3)
-    assert fit(found, fresh.x, fresh.dxdt, fresh.u).rx < 1e-25
-    assert np.max(np.abs(found.readout)) < 10.0
-    np.testing.assert_array_equal(found.readout[:, 2], 0.0)
-
-
-def test_a_saturated_unit_gets_no_weight():
-    """It moves by 1e-14: what it could add to a drift that the others do not span is rounding."""
-    lift = random_lift(2, 6)
-    W, b = np.array(lift.observables.W), np.array(lift.observables.b)
-    b[1] = 17.0
-    lift = replace(lift, observables=replace(lift.observables, W=W, b=b))
-    truth = replace(random_lift(2, 9, seed=4), states=lift.states, inputs=lift.inputs, B=lift.B)
-    found = with_readout(lift, samples_of(truth))
-    np.testing.assert_array_equal(found.readout[:, 3], 0.0)
-    assert np.max(np.abs(found.readout)) < 1e3
-
-
 class Given:
     """A recipe that has its result already, or keeps it."""
 
@@ -134,8 +109,3 @@ def test_a_neural_drift_is_learned(B):
     np.testing.assert_allclose(units, TWO_STATE.B, rtol=0, atol=1e-3)
     # z = x: the lifted A is the linear fit
     np.testing.assert_array_equal(model.lift(np.array([0.3, -0.2])), [0.3, -0.2])
-
-
-def test_a_recipe_without_sense():
-    with pytest.raises(ValueError, match='hidden must be at least 1 unit, got 0'):
-        NeuralDrift(0)

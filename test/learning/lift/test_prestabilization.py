@@ -87,17 +87,6 @@ def test_a_lift_of_an_unstable_plant(plant, drift, half, recipe, promised):
     assert model.identity or law.form is Form.AVERAGED
 
 
-def test_the_same_plant_without_a_pre_feedback_has_another_lift():
-    samples = samples_of(GROWING, growing, np.array([0.8]))
-    model, plain = (learned(GROWING, samples, one)
-                    for one in (RECIPE, replace(RECIPE, pre_feedback=None)))
-    assert plain.pre_feedback is None
-    # A of a change of coordinates has the plant's own eigenvalue
-    assert plain.eigenvalues[0].real == pytest.approx(1.0, abs=0.01)
-    K = model.pre_feedback * model.inputs.scale / model.states.scale
-    assert model.eigenvalues[0].real == pytest.approx(1.0 + 2.0 * K[0, 0], rel=0.01)
-
-
 def a_frame(identity=True, terms=False):
     """Return a frame, samples in scaled deviations, regressors where B is learned, and a lift."""
     rng = np.random.default_rng(2)
@@ -146,26 +135,3 @@ def test_the_frame_is_white_and_stable():
     plain, inside = (np.linalg.eigvals(np.linalg.lstsq(a, b, rcond=None)[0])
                      for a, b in ((given[0], given[1]), (x, f)))
     assert np.max(plain.real) > 0.0 > np.max(inside.real)
-
-
-@pytest.mark.parametrize(('B', 'states', 'message'), [
-    (np.zeros((2, 0)), np.eye(2), 'without inputs'),
-    # x2 decays, and it alone is moved
-    (np.array([[0.0], [1.0]]), np.eye(2), 'no feedback of the inputs stabilises'),
-    (np.array([[1.0], [1.0]]), np.ones((2, 2)), 'do not move independently')])
-def test_samples_without_a_frame_are_an_error(B, states, message):
-    x = np.random.default_rng(0).normal(size=(50, 2)) @ states
-    with pytest.raises(ValueError, match=message):
-        PrestabilizedFrame.of(InputModel(B.shape[1], 0, B), x, x * np.array([1.0, -1.0]), None,
-                              1.0)
-
-
-def test_of_two_whitening_weights_validation_takes_the_better_one():
-    samples = samples_of(GROWING, growing, np.array([0.8]))
-    recipe = IncrementalTraining(3, hidden_first=6, max_iterations=30)
-    both = train(GROWING, samples, replace(recipe, other_whitenings=(1e6,)), starts=2,
-                 reject=False)
-    assert both.starts == 4
-    # nothing is left of the dynamics beside so large a weight
-    poor = learned(GROWING, samples, replace(recipe, whitening=1e6))
-    assert both.figures.fit.rw < 0.1 * poor.provenance.metrics['rw']

@@ -68,14 +68,6 @@ def test_rounds(n_z, identity, n_x, expected):
         recipe.rounds(n_x)
 
 
-@pytest.mark.parametrize('change', [
-    {'n_z': 0}, {'hidden_first': 0}, {'hidden_more': -1}, {'whitening': -1.0},
-    {'other_whitenings': (1.0, -2.0)}, {'pre_feedback': 0.0}], ids=str)
-def test_a_recipe_without_sense(change):
-    with pytest.raises(ValueError, match='must be'):
-        IncrementalTraining(**{'n_z': 2, **change})
-
-
 @pytest.mark.parametrize('identity', [True, False])
 def test_widening_leaves_the_coordinates_as_they_were(identity):
     data = two_state_data()
@@ -103,20 +95,6 @@ def test_a_new_coordinate_starts_near_a_product_that_the_others_do_not_span():
     assert float((lifted(child, data).z[:, 1:] - target).square().mean()) < 1e-3
 
 
-@pytest.mark.parametrize(('n_x', 'identity', 'asked', 'expected'), [
-    (1, False, None, 0), (2, True, None, 0), (2, False, None, 8), (2, True, 5, 5)])
-def test_when_there_is_a_decoder(n_x, identity, asked, expected):
-    data = bent_data() if n_x == 1 else two_state_data()
-    recipe = IncrementalTraining(3, identity=identity, decoder=asked, max_iterations=2)
-    assert grow(recipe, data).layout.decoder == expected
-
-
-def test_a_lift_that_cannot_grow_is_reported():
-    x = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]], dtype=torch.float64)
-    with pytest.raises(ValueError, match='coordinate can be added'):
-        grow(IncrementalTraining(4), ScaledSamples(x, -x))
-
-
 def test_a_free_lift_finds_the_eigenfunction():
     """With dx/dt = -x - 0.3 x^2, z = x / (1 + 0.3 x) obeys dz/dt = -z."""
     data = bent_data()
@@ -126,15 +104,6 @@ def test_a_free_lift_finds_the_eigenfunction():
     cosine = z @ exact / np.sqrt((z @ z) * (exact @ exact))
     assert abs(cosine) > 1.0 - 1e-5
     assert float(grown.layout.split(grown.theta).A[0, 0]) == pytest.approx(-1.0, abs=1e-3)
-
-
-def test_least_squares_of_full_and_of_short_rank():
-    rng = np.random.default_rng(0)
-    a, b = rng.normal(size=(20, 3)), rng.normal(size=(20, 2))
-    for matrix in (a, np.hstack([a, a])):
-        found = least_squares(*tensors(matrix, b))
-        np.testing.assert_allclose(found, np.linalg.lstsq(matrix, b, rcond=None)[0], rtol=0,
-                                   atol=1e-13)
 
 
 @pytest.fixture(scope='module')
@@ -237,15 +206,3 @@ def test_a_plant_without_inputs(B):
     assert trained.law_check is None
     assert (trained.model.n_u, trained.model.B.shape) == (0, (1, 0))
     assert trained.figures.fit.rx < 1e-2 * trained.linear.fit.rx
-
-
-def test_the_time_unit_does_not_matter():
-    samples = bent_samples()
-    recipe = replace(SMALL, max_iterations=30)
-    per_second = train(BENT, samples, recipe, starts=1, loops=16)
-    per_minute = train(replace(BENT, time_unit='min', B=60.0 * BENT.B),
-                       replace(samples, dxdt=60.0 * samples.dxdt), recipe, starts=1,
-                       loops=16)
-    assert per_minute.figures.fit.rw == pytest.approx(per_second.figures.fit.rw, rel=1e-2)
-    np.testing.assert_allclose(per_minute.model.eigenvalues, 60.0 * per_second.model.eigenvalues,
-                               rtol=1e-2)
