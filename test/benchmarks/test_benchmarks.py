@@ -9,20 +9,15 @@ import shutil
 from typing import Any
 import warnings
 
-import casadi
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
-from benchmarks import ipopt, loop, planning, recording, solvers, training
+from benchmarks import loop, planning, recording, training
 from benchmarks.__main__ import main
-from benchmarks.problems import build
 from benchmarks.sqp import solver_of, Sqp, SqpProblem
-from koopman_ros.learning.lift.levenberg_marquardt import normal_equations
 from studies.equations import EQUATIONS
-from studies.general.learners import LEARNERS
-from support.tensors import assert_close
 
 
 @pytest.fixture(scope='module')
@@ -62,21 +57,6 @@ def test_every_part_leaves_its_figures(figures: dict[str, Any]) -> None:
     assert steady['in_order']
 
 
-def test_every_solver_has_a_time_or_a_reason_and_ours_reaches_the_targets(
-        figures: dict[str, Any]) -> None:
-    case, = figures['training']['cases']
-    assert case['best_rw']['ours'] <= 1e-6
-    for name, times in case['seconds'].items():
-        assert set(times) == {'ours', 'ipopt', 'adam'}
-        for solver, seconds in times.items():
-            ratio = case['ratio_to_ours'][name].get(solver)
-            if seconds is None:
-                assert ratio is None
-                assert case['notes'].get(solver) or name in case['not_asked']
-            elif solver != 'ours' and times['ours']:
-                assert ratio == pytest.approx(seconds / times['ours'])
-
-
 def test_plans_that_differ_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     rates = EQUATIONS['pendulum']
     monkeypatch.setitem(EQUATIONS, 'pendulum', lambda x, u: rates(x, 0.8 * u))
@@ -92,33 +72,3 @@ def test_the_plan_of_an_integrator_is_the_known_one_within_its_limits(tmp_path: 
         # least of u^2 T + (x + u T)^2 with T = 1: u = -x / 2
         for x, u in ((1.0, -0.5), (-2.0, 1.0), (8.0, -1.5)):
             assert one.step(np.array([x]), np.zeros(1), np.zeros(1)) == pytest.approx(u, abs=1e-6)
-
-
-def test_all_solvers_have_one_objective(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ipopt, '_COMPILER', {})
-    case = build('two-state example', samples=30, hidden=4)
-    theta = case.theta.clone().requires_grad_(True)
-    cost = solvers.differentiable(case)(theta)
-    cost.backward()
-    ours = normal_equations(case.problem.add_residuals, case.theta)
-    assert cost.item() == pytest.approx(ours.cost, rel=1e-12)
-    assert_close(theta.grad, ours.gradient, rtol=1e-10, atol=1e-12)
-    plain, _ = ipopt._expanded_graph(case)
-    assert float(casadi.Function('cost', [plain['x']], [plain['f']])(case.start)) == pytest.approx(
-        ours.cost, rel=1e-12)
-    _, derivatives = ipopt._compiled_graph(case)
-    hessian, gradient = casadi.hessian(plain['f'], plain['x'])
-    exact = casadi.Function('exact', [plain['x']], [casadi.triu(hessian), gradient])(case.start)
-    for found, true in ((derivatives['hess_lag'](case.start, [], 1.0, []), exact[0]),
-                        (derivatives['grad_f'](case.start, [])[1], exact[1])):
-        np.testing.assert_allclose(found.full(), true.full(), rtol=1e-9, atol=1e-11)
-
-
-def test_the_benchmark_also_trains_models_of_other_classes(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, 'LEARNERS', {
-        label: LEARNERS[label] for label in ('linear', 'SINDy-5')})
-    told: dict[str, Any] = {}
-    training._learn(told.update, 'two_tanks')
-    # the polynomials have the tanks' roots to some digits; no line has them
-    assert told['SINDy-5']['rx'] < 1e-4 < told['linear']['rx']

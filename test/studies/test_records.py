@@ -78,33 +78,3 @@ def test_sets_at_hand_are_run_and_stand_in_the_table(
     assert found['tanks'][study.OWN]['fit']['level'][0] > 90.0
     assert '| `tanks`: level [m] |' in (tmp_path / 'report.md').read_text()
     assert (tmp_path / 'tanks' / 'seed_0.log').is_file()
-
-
-def test_a_folder_that_is_not_there_is_a_sentence(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-        ) -> None:
-    for module in (study, table):
-        monkeypatch.setattr(module, 'SETS', {'hair_dryer': SETS['hair_dryer']})
-    monkeypatch.setattr(study, 'PLANTS', 2)
-    assert study.main(['--records', str(tmp_path / 'none'), '--output', str(tmp_path),
-                       '--scheduler', '']) == 0
-    assert '2 of 2' in (tmp_path / 'report.md').read_text()
-    assert 'there is no folder' in capsys.readouterr().err
-
-
-def test_an_interrupt_ends_the_whole_study(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-        ) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    for module in (study, table):
-        monkeypatch.setattr(module, 'SETS', {
-            'tanks': RecordSet(('level [m]',), ('pump [V]',), frames)})
-    monkeypatch.setattr(study, 'by_baseline', interrupted)
-    monkeypatch.setattr(study, 'learned', interrupted)
-    monkeypatch.setattr(study, 'one_plant', interrupted)
-    assert study.main(['--records', str(tmp_path), '--output', str(tmp_path), '--seeds', '1',
-                       '--scheduler', '']) == 1
-    assert capsys.readouterr().err.count('interrupted') == 1
-    assert not json.loads((tmp_path / 'summary.json').read_text())['complete']

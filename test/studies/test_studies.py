@@ -3,8 +3,6 @@
 
 """The studies: short runs of each, and their references against independent ones."""
 
-from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 import json
 import math
@@ -17,34 +15,20 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control import Initialisation, SetpointRequest
-from koopman_ros.core.paths import model_path
-from koopman_ros.demo.loop import Row
-from koopman_ros.evaluation import at, simulate, Simulation
-from koopman_ros.evaluation.optimal_cost import optimum
-from koopman_ros.learning import IncrementalTraining, Linearisation, NeuralDrift, rollout_rmse
-from koopman_ros.model import Box, load
-from koopman_ros.plants import describe, Process
-from koopman_ros.testing import HarnessError
-from studies import saddle, saddle_act, unstable
-from studies.campaign import Campaign, Experiment, Metrics, Models, run_campaign
+from koopman_ros.learning import IncrementalTraining
+from studies.campaign import Experiment, Metrics, Models, run_campaign
 from studies.equations import EQUATIONS
 from studies.general import coordinates, learners, study
 from studies.general.__main__ import main as general
-from studies.general.systems import CASES, oscillator
-from studies.paper import figures, reactor, report, scalar, two_state
+from studies.general.systems import CASES
 from studies.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,
-    exact_two_state_model,
 )
-from studies.partly_measured import __main__ as partly_measured
 from studies.partly_measured.cases import CASES as PARTLY_MEASURED
-from studies.partly_measured.study import least
-from studies.robustness import disturbances, loop, stability
-from studies.robustness.loop import REACTOR, START
+from studies.robustness import loop, stability
+from studies.robustness.loop import REACTOR
 from studies.true_model import TrueModel
-from studies.unstable import steady
 
 PERIOD = 1.0 / 60.0  # min
 
@@ -109,12 +93,6 @@ def test_expressions_and_the_true_model_are_the_plants_equations(case: Any) -> N
             rtol=1e-9, atol=1e-11)
 
 
-def test_two_methods_find_the_least_cost() -> None:
-    case = PARTLY_MEASURED['pendulum']
-    course = least(case, case.start[0])
-    assert course.cost == pytest.approx(optimum(case.task(case.start[0])).cost, rel=1e-7)
-
-
 @pytest.mark.parametrize('name', CASES)
 def test_cases_rest_at_their_nominal_state_and_are_factorised(name: str) -> None:
     case = CASES[name]
@@ -126,74 +104,6 @@ def test_cases_rest_at_their_nominal_state_and_are_factorised(name: str) -> None
         change = system.drift(x) - system.drift(x0)
         np.testing.assert_allclose(case.factorised(x) @ (x - x0), change,
                                    atol=1e-9 * np.max(np.abs(change)))
-
-
-# The paper.
-
-@pytest.fixture(scope='module')
-def campaign() -> Iterator[Campaign]:
-    """Return a campaign of one seed on few data, exact and shipped lifts in place of learned."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scalar, 'STARTS', 1)
-        patch.setattr(two_state, 'INPUT_WEIGHTS', (1.0,))
-        found = Campaign(complete=True)
-        plant, exact, narrow = (
-            describe(two_state.SYSTEM), exact_two_state_model(), figures.FIGURE_NARROW_BOX)
-        lifts = {'wide': exact, narrow: exact, 'linear': Linearisation(
-            two_state.SYSTEM.drift_jacobian(np.zeros(2))).learn(
-                plant, two_state.samples(two_state.WIDE, 0, episodes=5))}
-        models = {name: load(model_path(f'reactor_{name.replace("=", "")}'))
-                  for name in ('nz=3', 'nz=4', 'linear')}
-        fresh = [reactor.random_steps_of(design, 1, 15.0, 5_000)
-                 for design in (reactor.IN_RANGE, reactor.IN_RANGE, reactor.OUT_OF_RANGE)]
-        for name, (metrics, of) in {
-            'scalar': scalar.run(2),
-            'two_state': ({**two_state.judged(exact, 0), 'edmd_cost_ratio': {'R=1': None},
-                           'linear_cost_ratio': {'R=1': 4.5}}, lifts),
-            'narrow': ({f'{narrow}/{name}': value for name, value in (
-                ('rw_in', 1e-7), ('cost_ratio_to_exact', None), ('left_box', True),
-                ('final_distance', None))}, lifts),
-            'reactor': ({f'{name}/{figure}': value for name, model in models.items()
-                         for figure, value in reactor.judged(model, *fresh).items()}, models),
-        }.items():
-            found.metrics[name], found.models[name] = {0: metrics}, {0: of}  # type: ignore[dict-item]
-        yield found
-
-
-def test_figures_of_the_paper(campaign: Campaign) -> None:
-    found = {name: of[0] for name, of in campaign.metrics.items()}
-    inside, near, far = (found['scalar'][name] for name in ('rw_in', 'rw_5_6', 'rw_6_8'))
-    assert inside < 1e-6  # type: ignore[operator]
-    assert inside < near < far  # type: ignore[operator]
-    assert found['two_state']['eigenvalue_error'] <= 1e-12  # type: ignore[operator]
-    assert found['two_state']['cost_ratio_to_exact'] == {'R=1': pytest.approx(1.0, abs=1e-6)}
-    of_reactor = found['reactor']
-    assert of_reactor['linear/feed_forward_offset_kelvin'] == pytest.approx(3.3009, abs=1e-4)
-    assert of_reactor['linear/tracking_offset_kelvin'] == pytest.approx(1.9334, abs=1e-4)
-    for name in ('nz=3', 'nz=4'):
-        assert of_reactor[f'{name}/tracking_offset_kelvin'] < 1e-3  # type: ignore[operator]
-        assert of_reactor[f'{name}/cost_ratio_to_optimum'] == pytest.approx(1.0, abs=1e-5)
-
-
-def test_report_of_the_paper_has_its_tables_and_eleven_figures(
-        campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = figures.draw_figures(campaign, tmp_path)
-    assert [one.file[:2] for one in drawn] == [f'{number:02d}' for number in range(1, 12)]
-    for one in drawn:
-        # neither blank nor one colour
-        assert np.std(matplotlib.image.imread(tmp_path / one.file)[..., :3]) > 0.02
-    missing = re.compile(r'nz=[25]|R=0\.')
-    monkeypatch.setattr(report, 'TARGETS', [
-        target for target in report.TARGETS if not missing.search(target.path)])
-    monkeypatch.setattr(report, '_EXACT', {
-        label: path for label, path in report._EXACT.items() if not missing.search(path)})
-    report.write_report({'seeds': 1, 'complete': True, 'wall_seconds': 1.0, **campaign.summary()},
-                        drawn, tmp_path)
-    text = (tmp_path / 'report.md').read_text()
-    assert len(re.findall(r'^!\[.*\]\((.*)\)$', text, re.MULTILINE)) == 11
-    assert '| `reactor/nz=3/tracking_offset_kelvin` | 0.001 |' in text
-    assert 'nan' not in text
-    assert report.Criterion('a/b', 1e-6, 1.0).met({'a': {'b': [1.0, 1.1, None, 0.99]}}) == (2, 4)
 
 
 # Other plants.
@@ -239,33 +149,6 @@ def test_a_cubic_drift_is_found_by_cubic_models(van_der_pol: Path) -> None:
     assert np.std(matplotlib.image.imread(van_der_pol / 'general.png')[..., :3]) > 0.02
 
 
-def test_predictions_of_a_linear_plant_are_exact() -> None:
-    """In z as by the drift, and in discrete time with and without delays."""
-    spring = oscillator('spring', lambda x1, x2: x1 - x2, lambda x1, x2: (1.0, -1.0))
-    case = replace(CASES['duffing'], system=spring)
-    samples, held_out = case.samples(0), case.samples(1, 10)
-    np.testing.assert_allclose(coordinates.rolled_in_z(case.truth, held_out),
-                               rollout_rmse(case.truth, held_out), rtol=1e-3, atol=1e-9)
-    box = Box.of(describe(spring), samples.x, samples.u)
-    for delays in (0, 1):
-        assert coordinates.discrete(case, box, samples, held_out, delays) < 1e-6
-
-
-def test_controllers_of_partly_measured_plants_stand_in_one_table(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PARTLY_MEASURED, 'pendulum', replace(
-        PARTLY_MEASURED['pendulum'], stepped_at=0.3125, loaded_at=2.1875, duration=4.375))
-    assert partly_measured.main(['pendulum', '--seeds', '1', '--output', str(tmp_path)]) == 0
-    found = json.loads((tmp_path / 'summary.json').read_text())['plants']['pendulum']
-    assert found.keys() == partly_measured.CONTENDERS.keys()
-    for name, of in found.items():
-        linear = name.startswith('LQG')
-        assert 0.99 < of['cost_worst'] < (1.2 if linear else 1.03)
-        # it knows no disturbance; a window has not yet found all of that one
-        assert (of['offset_under_load'] > 0.2) == linear
-    assert '# Plants measured in part' in (tmp_path / 'report.md').read_text()
-
-
 # Robustness.
 
 def first_order(temperature: float, coolant_weight: float) -> tuple[float, float, float]:
@@ -297,14 +180,6 @@ def test_margins_without_observer_are_those_of_a_first_order_loop() -> None:
         (1.0 + pole) / (learned * gain), rel=1e-6)
 
 
-def test_the_simulated_loop_oscillates_beyond_its_delay_margin() -> None:
-    controller = loop.reactor_controller(bandwidth=10.0, coolant_weight=0.1)
-    margin = stability.margins_at(controller, 316.0).delay
-    assert margin == pytest.approx(8.92, abs=0.05)
-    assert not stability.grows(controller, 316.0, delay=0.95 * margin, seconds=450.0)
-    assert stability.grows(controller, 316.0, delay=1.05 * margin, seconds=450.0)
-
-
 def test_no_coolant_saves_a_start_above_the_boundary() -> None:
     """With the coolant on its way to the coldest as fast as it may, from scipy's integration."""
     boundary = stability.hottest_saved(300.0)
@@ -319,77 +194,3 @@ def test_no_coolant_saves_a_start_above_the_boundary() -> None:
 def test_fallback_widens_the_region_of_attraction(temperature: float, fallback: bool, end: str
                                                   ) -> None:
     assert stability.end_of(temperature, 316.0, fallback=fallback).name == end
-
-
-def test_a_disturbance_leaves_no_offset() -> None:
-    cases = {case.name: case for case in disturbances.cases()}
-    found = disturbances.judge(replace(cases['UA −20 %, in the loop'], seconds=600.0))
-    assert found['final_kelvin'] == pytest.approx(0.0, abs=1e-3)
-    # the coolant that makes up for it: UA (T_c - T) as before, from the heat balance
-    assert found['disturbance_kelvin'] == pytest.approx(0.25 * (START - 300.0), abs=0.01)
-
-
-# The reactor at its saddle.
-
-def test_a_lift_at_the_saddle_that_was_learned_in_a_hurry(
-        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, value in (('EPISODES', 150), ('FRESH_EPISODES', 50), ('STARTS', 1),
-                        ('STEPS', unstable.STEPS[:1]), ('LIMITED_STARTS', 1),
-                        ('LIMITED_SAMPLES', 120)):
-        monkeypatch.setattr(unstable, name, value)
-    monkeypatch.setattr(unstable, 'RECIPES', {
-        'neural drift': NeuralDrift(12, max_iterations=150),
-        'free lift': replace(unstable.LIFT, hidden_first=24, max_iterations=250)})
-    assert unstable.main(['--seeds', '1']) == 0
-    lines = capsys.readouterr().out.splitlines()
-    _, rw, rx, _, by_rates, cost, _ = map(float, lines[2].strip('| ').split(' | '))
-    assert rw < 1e-4
-    assert rx < 1e-5 < by_rates < 0.1
-    assert 1.0 - 1e-3 < cost < 1.01
-    laws = {law: float(cost) for law, cost, _ in (
-        line.strip('| ').split(' | ') for line in lines[-2:])}
-    assert laws['mpc'] <= 1.005 * laws['sdre'] < 50.0
-
-
-def test_without_the_concentration_the_same_law_costs_hardly_more(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (('LAWS', {'sdre': ('sdre',)}), ('COURSE', {0.0: 350.0, 30.0: 345.0}),
-                        ('FOULED', 330.0), ('END', 530.0)):
-        monkeypatch.setattr(saddle, name, value)
-    (row,) = saddle.course_rows([saddle.truth()], periods=(1.0,))
-    _, _, over_true, _, over_full, _, offset, concentration, *lost = row
-    assert over_true == '1.0000'
-    assert 0.9 < float(over_full) < 1.1
-    assert float(offset) < 0.05
-    assert float(concentration) < 2e-3
-    assert lost == ['0 of 1', '1.0000', '0 of 1', '0 of 1']
-
-
-@pytest.fixture(scope='module')
-def fouled_run() -> Simulation:
-    x0, u0 = steady(350.0)
-    return simulate(
-        saddle_act._laws(saddle.truth(), ('sdre',)), Process(saddle.reactor({}), 0, x0, u0),
-        [at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
-         at(10.0, SetpointRequest(0, np.array([352.0]))),
-         at(40.0, saddle.becomes(saddle.reactor(saddle.FOULING)))],
-        duration=90.0, C=np.array([[0.0, 1.0]]), noise=np.array([0.1]), seed=1)
-
-
-@pytest.mark.parametrize('noise', [1.0, 3.0])
-def test_temperatures_are_found_behind_their_noise(fouled_run: Simulation, noise: float) -> None:
-    one = fouled_run
-    measured = one.states[:, 1] + noise * (one.measured[:, 0] - one.states[:, 1])
-    rows = [Row(float(t), {'concentration': float(x[0]), 'temperature': float(y)},
-                {'temperature': float(r[0])}, {'coolant_temperature': float(u[0])})
-            for t, x, y, r, u in zip(one.times, one.states, measured, one.setpoints,
-                                     one.commands, strict=True)]
-    phases = [('lift', 0.0), ('fouling', 40.0)]
-    if noise > 1.0:
-        with pytest.raises(HarnessError, match='K of noise'):
-            saddle_act._reconstructed(rows, {}, saddle.truth(), phases)
-        return
-    found = saddle_act._reconstructed(rows, {}, saddle.truth(), phases)
-    # the last one has no sample after it that would tell
-    assert found.states[:-1] == pytest.approx(one.states[:-1], abs=1e-4)
-    assert found.fouled == 40
