@@ -3,11 +3,8 @@
 
 """The controller as a process: what it answers, and what it tells of itself."""
 
-from dataclasses import replace
 import itertools
 import math
-from pathlib import Path
-import re
 import sys
 import time
 
@@ -15,16 +12,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
-from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
-from koopman_ros.event_log.records import parse, SNAPSHOT
-from koopman_ros.model import load, save
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, STATUS, STEADY, until_read
+from support.controller_bench import Bench, STATUS, STEADY
 from support.nodes import seconds, temperature, value
 
 
@@ -69,15 +62,6 @@ def test_odd_stamps_are_answered_with_themselves_and_a_long_frame_id_is_cut(
     assert 'has 100000 characters; only the first 256 are forwarded' in status.message
     assert bench.measure(STEADY, 3.0).header.frame_id == ''
     bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
-
-
-def test_who_subscribes_is_sent_the_state_twice_where_nothing_happens(bench: Bench) -> None:
-    """The first may come before the subscriber knows the controller, and is lost then."""
-    heard = bench.ros.listen(String, topics.EVENT_LOG)
-    bench.ros.wait_until(lambda: len(heard) > 1)
-    records = [parse(message.data) for message in heard]
-    assert {record.event for record in records} == {SNAPSHOT}
-    assert records[1].number == records[0].number + 1
 
 
 def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
@@ -242,20 +226,6 @@ def measure_on(bench: Bench, count: int, first: float) -> float:
     return first + count - 1
 
 
-def test_a_setpoint_beyond_the_input_limits_is_reported(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', **{
-        'observer_bandwidth': 0.1, 'coolant_temperature.max_disturbance': 100.0})
-    for k in range(60):
-        # a thermometer that does not follow: the observer takes it for a plant that is cooled
-        bench.measure(STEADY - 8.0 - 0.01 * (k % 2), 2.0 + k)
-    status = bench.status(lambda s: 'would have to be' in s.message)
-    assert status.level == DiagnosticStatus.WARN
-    needed = re.search(r'the set-point is not reached: the coolant would have to be ([\d.]+) '
-                       r'degC, but its range is 5 to 32', status.message)
-    assert needed, status.message
-    assert float(needed[1]) > 32.0
-
-
 def test_the_status_has_mode_law_reason_and_figures(bench: Bench) -> None:
     bench.ros.set_parameters('controller', observer_bandwidth=0.1)
     # whole seconds of the clock of the node, so that ages are known
@@ -359,81 +329,3 @@ def test_a_plan_reports_its_active_limits(bench: Bench) -> None:
     bench.measure(STEADY, 5.0)
     bench.ros.meet('controller')
     assert seconds(plans[-1]) == 4.0
-
-
-def test_a_safe_coolant_outside_the_training_range_is_reported(
-        bench: Bench, tmp_path: Path) -> None:
-    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
-    model = load(model_path('reactor_nz4'))
-    lower, upper = model.states.center - 1.5, model.states.center + 1.5
-    narrow = tmp_path / 'narrow.safetensors'
-    save(replace(model, states=replace(model.states, lower=lower, upper=upper)), narrow)
-    # accepted nevertheless
-    assert until_read(lambda: bench.ros.set_parameters_atomically(
-        'controller', model=str(narrow))).successful
-    words = 'under coolant_temperature.safe_value = 5 degC'
-    status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe input'))
-    assert 'leaves the trained range' in value(status, 'safe input')
-    bench.ros.wait_until(lambda: words in bench.process.output())
-    bench.ros.set_parameters('controller', **{'coolant_temperature.safe_value': 27.0})
-    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
-    assert until_read(lambda: bench.ros.set_parameters_atomically(
-        'controller', model='reactor_nz4')).successful
-
-
-def test_two_controllers_report_each_other_while_both_run(ros: Harness) -> None:
-    """Beside a best-effort thermometer, and a coolant that is promised and never told."""
-    ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
-    override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')
-    bench = Bench(ros, arguments=override, qos=QoSProfile(
-        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
-    assert bench.commands[0].temperature > 25.0
-    waited = []
-    for k in range(2, 12):
-        before = time.monotonic()
-        bench.measure(STEADY - 1.0, float(k))
-        waited.append(time.monotonic() - before)
-    # on a busy machine some may be slow, but if they waited for the coolant all would be
-    assert min(waited) < 0.4
-    # the temperature first measured is held
-    assert bench.active == pytest.approx(STEADY)
-    bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))
-
-    second = ros.start('controller', arguments=('-r', '__node:=controller_2', *override))
-    ros.meet('controller_2')
-    bench.measure(STEADY, 12.0)
-    for name in ('controller', 'controller_2'):
-        # names come a moment after their topics
-        status = ros.wait_for_status(f'{name}: control', lambda s: (
-            'stop all but one' in s.message and 'UNKNOWN' not in s.message))
-        assert status.level == DiagnosticStatus.WARN
-        # a busy machine may also complain of the age of the last measurement
-        assert status.message.startswith(
-            '2 nodes command the coolant: /controller, /controller_2; stop all but one')
-    assert '2 nodes command the coolant' in second.output()
-    assert second.stop() == 0
-    ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
-
-
-def test_a_measured_disturbance_that_fails_is_a_warning_and_the_loop_runs_on(
-        ros: Harness) -> None:
-    recorded = ros.listen(String, topics.EVENT_LOG)
-    bench = Bench(ros, {'model': 'reactor_feed', 'feed_temperature.sensor_max': 120.0,
-                        'feed_temperature.timeout': 5.0, 'stuck_sensor_timeout': 0.0})
-    feed = ros.speak(Temperature, 'feed_temperature', to='controller')
-    at = 1.0
-    for celsius, words in (
-            (None, 'no measurement of feed_temperature yet'), (78.0, ''),
-            (math.nan, 'feed_temperature is nan'), (79.0, ''), (130.0, 'outside the range'),
-            (79.5, ''), (None, 'no measurement of feed_temperature for more than 5 s')):
-        for _ in range(8):
-            at += 1.0
-            if celsius is not None:
-                feed.publish(temperature(celsius, at))
-            bench.measure(STEADY, at)
-        bench.status(lambda status, words=words: words in status.message and (
-            status.level == (DiagnosticStatus.WARN if words else DiagnosticStatus.OK)))
-    status = bench.status()
-    assert value(status, 'active law') == 'learned law'
-    assert float(value(status, 'feed_temperature [degC]')) == pytest.approx(79.5)
-    reproduced(recorded)

@@ -208,38 +208,6 @@ def test_another_commander_ends_it_at_once_and_rejects_the_next(shared_bench: Be
     ros.node.destroy_publisher(other)
 
 
-def test_one_input_in_manual_mode_until_the_controller_moves_it_elsewhere(
-        shared_bench: Bench) -> None:
-    bench, ros = shared_bench, shared_bench.ros
-    manual = ros.listen(Temperature, '/unit_1/manual_coolant_setpoint')
-    controller = ros.node.create_publisher(Temperature, JACKET, topics.LOOP_QOS)
-    bench.set(experiment_signal='manual')
-    # until the graph shows the controller to the trainer
-    ros.wait_until(lambda: bench.start() == (True, 'started on /unit_1/manual_coolant_setpoint'))
-
-    def request() -> Temperature:
-        bench.measure()
-        ros.wait_until(lambda: manual and seconds(manual[-1]) == bench.time)
-        return manual[-1]
-
-    # over more than one step
-    while len(manual) < 2 or np.ptp([message.temperature for message in manual]) < 2.0:
-        controller.publish(request())
-    assert value(bench.status('running'), 'topic') == '/unit_1/manual_coolant_setpoint'
-
-    def ignore_request() -> bool:
-        controller.publish(temperature(manual[-1].temperature + 5.0, bench.time))
-        status = ros.last_status(f'unit_1/{STATUS}')
-        return status is not None and 'aborted' in status.message
-
-    ros.wait_until(ignore_request)
-    status = bench.status('switch it to manual mode')
-    assert status.level == DiagnosticStatus.ERROR
-    ros.node.destroy_publisher(controller)
-    bench.ask(False)
-    bench.set(experiment_signal='command')
-
-
 def test_process_that_ends_without_measurements_leaves_the_inputs_where_they_are(
         shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros

@@ -3,7 +3,6 @@
 
 """Experiments with two inputs, and on set-points, across processes: two tanks and their pumps."""
 
-import itertools
 from pathlib import Path
 import re
 from typing import Any
@@ -13,9 +12,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
-from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.ros import topics
-from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
 from support.tanks import LEVELS, linear, PUMPS, TANKS
 
@@ -118,34 +115,3 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('aborted: the controller commands ')
     assert 'switch it to manual mode' in status.message
-
-
-def test_an_experiment_of_setpoints_without_a_controller_is_rejected(
-        ros: Harness, tmp_path: Path) -> None:
-    ros.start('trainer', {
-        **TRAINER, 'model': linear(tmp_path), 'experiment_signal': 'setpoint',
-        'experiment_timeout': 1.0, **{f'{name}.setpoint_{end}': bound for name in LEVELS
-                                      for end, bound in (('min', 0.1), ('max', 0.2))}})
-    sensors = {name: ros.node.create_publisher(JointState, name, topics.LOOP_QOS)
-               for name in LEVELS}
-    ros.meet('trainer')
-    times = itertools.count(1)
-
-    def measure() -> None:
-        stamp = stamp_message(next(times) * NANOSECONDS)
-        for (name, sensor), level in zip(sensors.items(), (0.15, 0.25), strict=True):
-            message = JointState(name=[name], position=[level])
-            message.header.stamp = stamp
-            sensor.publish(message)
-
-    ros.node.create_timer(0.02, measure)
-    assert ros.set_bool(SERVICE, True).message == (
-        'rejected: /pump_1_setpoint is not published: start the controller and switch it to '
-        'automatic mode')
-    ros.node.create_publisher(JointState, 'pump_1_setpoint', topics.LOOP_QOS)
-    # until the graph tells the trainer
-    said = ros.wait_until(lambda: 'unknown' in (
-        said := ros.set_bool(SERVICE, True).message) and said)
-    assert said == (
-        'rejected: the active set-points have been unknown for 1 s: switch the controller to '
-        'automatic mode, and check sensor and plant')

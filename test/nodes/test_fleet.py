@@ -23,6 +23,7 @@ def arguments(folder: Path, bags: dict[str, list[str]], **everywhere: object) ->
         for name, own in bags.items()}
     (folder / 'site.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': {
         'system': 'reactor', 'model': '', 'model_class': 'linear',
+        'identification_methods': ['weak_form'], 'weak_form.windows': [20.0],
         'temperature.topic': '/temperature',
         'coolant_temperature.command_topic': '/coolant_setpoint', **everywhere}}, **loops}))
     return ('--params-file', str(folder / 'site.yaml'), '--', '--loops',

@@ -18,7 +18,6 @@ from koopman_ros.testing import (
     isolated_domain,
     NodeProcess,
     process,
-    reserved_output,
 )
 from support.nodes import TIMEOUT, wait_until_ended
 
@@ -36,15 +35,6 @@ def test_an_unrequested_end_of_a_process_is_reported(
     ros.start('failing', command=('sh', '-c', program)).process.wait()
     with pytest.raises(HarnessError, match=words), ros:
         ros.wait_until(bool, 'the impossible')
-
-
-def test_code_at_the_end_counts_unless_the_process_was_stopped_before(tmp_path: Path) -> None:
-    ros = Harness(tmp_path)
-    ros.start('stopped', command=SLEEPER).stop(signal.SIGKILL)
-    ros.start('left', command=('sleep', '600'))
-    with pytest.raises(HarnessError, match=r'^left_1 ended with code -2; see ') as raised:
-        ros.__exit__(None, None, None)
-    assert raised.value.__notes__ == ['stopped_0.log: \nleft_1.log: ']
 
 
 def test_error_of_the_test_is_raised_and_its_processes_end(tmp_path: Path) -> None:
@@ -151,27 +141,3 @@ def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> N
             assert environment['ROS_DOMAIN_ID'] == str(1000 + os.getpid())
             with pytest.raises(RuntimeError, match='taken'), isolated_domain():
                 pass
-
-
-def test_two_runs_write_to_two_folders(tmp_path: Path) -> None:
-    (tmp_path / 'link').symlink_to(tmp_path)
-    with (reserved_output(tmp_path / 'demo') as first,
-          reserved_output(tmp_path / 'link' / 'demo') as second):
-        assert (first, second) == (tmp_path / 'demo', tmp_path / 'link' / 'demo-2')
-    with reserved_output(tmp_path / 'demo') as again:
-        assert again == first
-
-
-@pytest.mark.parametrize(('given', 'reach'), [
-    ('', 'SYSTEM_DEFAULT'), ('rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
-    # whose default is the whole network, as it knows nothing of the profile
-    ('rmw_cyclonedds_cpp', 'LOCALHOST')])
-def test_environment_of_the_reservation_holds_here_with_the_middleware_that_is_named(
-        monkeypatch: pytest.MonkeyPatch, given: str, reach: str) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    monkeypatch.setenv('RMW_IMPLEMENTATION', given)
-    with isolated_domain() as environment:
-        assert environment.items() <= os.environ.items()
-        assert environment['RMW_IMPLEMENTATION'] == (given or 'rmw_fastrtps_cpp')
-        assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == reach
-    assert (os.environ['ROS_DOMAIN_ID'], os.environ['RMW_IMPLEMENTATION']) == ('7', given)

@@ -164,23 +164,3 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     ros.wait_for_status('controller_host: loops', lambda s: (
         value(s, 'running'), value(s, 'failed')) == ('1', '3'))
     assert process.stop() == 0
-
-
-def test_plants_and_controllers_of_a_site(ros: Harness) -> None:
-    loops = ('hall_1/a', 'hall_2/a')
-    commands = [ros.listen(Temperature, f'/{loop}/{reactor.COOLANT_SETPOINT}') for loop in loops]
-    start(ros, 'plant', loops, '-p', 'sample_period:=0.1')
-    start(ros, 'controller', loops)
-    ros.wait_until(lambda: all(len(own) > 3 for own in commands))
-    assert ros.trigger('/hall_2/a/plant/reset').success
-
-
-def test_process_of_which_no_loop_is_left_ends(ros: Harness, tmp_path: Path) -> None:
-    process = start(ros, 'controller', ('a', 'b'), '-p', 'model:=nowhere.safetensors')
-    process.told_to_end = True
-    assert ros.wait_for_end(process) == 1
-    assert process.output().count('cannot start: no model file at nowhere.safetensors') == 2
-    process = start(ros, 'controller', ('a', 'b'), '-r', '__ns:=/elsewhere')
-    assert ros.wait_for_end(process) == 1
-    assert 'controller: cannot start: -r __ns:=/elsewhere would apply to all loops' in (
-        process.output())

@@ -13,7 +13,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import parse, state_of
@@ -60,57 +60,6 @@ def stays_down(ros: Harness, node: str) -> None:
     # answered after its next report would have come
     for _ in range(3):
         assert state(ros, node) == 'unconfigured'
-
-
-def test_plant(ros: Harness) -> None:
-    measured = ros.listen(Temperature, reactor.TEMPERATURE)
-    process = started(ros, 'plant', speed=20.0)
-    # neither by name nor by number, which managers use
-    assert not change(ros, 'plant', 'activate')
-    assert not change(ros, 'plant', number=Transition.TRANSITION_ACTIVATE)
-    assert state(ros, 'plant') == 'unconfigured'
-
-    assert change(ros, 'plant', number=Transition.TRANSITION_CONFIGURE)
-    ros.wait_until(lambda: '/plant/reset' in parts(ros, 'plant'))
-    still = ros.wait_for_status('plant: simulation', lambda s: s.message == 'inactive')
-    # which moves nothing either
-    assert ros.set_parameters('plant', **{'constants.feed_temperature': 10.0})[0].successful
-    assert value(ros.wait_for_status('plant: simulation', lambda s: s is not still),
-                 'temperature [degC]') == value(still, 'temperature [degC]')
-    assert not measured
-
-    assert change(ros, 'plant', 'activate')
-    ros.wait_until(lambda: len(measured) > 20)
-    assert change(ros, 'plant', 'deactivate')
-    still = ros.wait_for_status('plant: simulation', lambda s: s.message == 'inactive')
-    count = len(measured)
-    ros.wait_for_status('plant: simulation', lambda s: s is not still)
-    assert len(measured) == count
-    # of which a busy machine skips some
-    passed = seconds(measured[-1]) - seconds(measured[0])
-    assert int(value(still, 'measurements')) == passed + 1
-
-    reset = ros.node.create_client(Trigger, 'plant/reset')
-    ros.wait_until(reset.service_is_ready)
-    coolant = ros.node.create_publisher(Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
-    ros.wait_until(coolant.get_subscription_count)
-    clean_up_under_way(ros, 'plant', lambda: coolant.publish(temperature(20.0, 0.0)),
-                       lambda: reset.call_async(Trigger.Request()))
-    stays_down(ros, 'plant')
-    assert not [s for s in ros.statuses if s.name.startswith('plant')]
-    # it begins afresh, with what was set meanwhile
-    assert all(result.successful for result in ros.set_parameters('plant', **{
-        'constants.feed_temperature': reactor.constant('feed_temperature'),
-        'temperature.bias': 3.0}))
-    assert change(ros, 'plant', 'configure')
-    assert change(ros, 'plant', 'activate')
-    ros.wait_until(lambda: len(measured) > count + 5)
-    again = measured[count:]
-    assert seconds(again[0]) == seconds(measured[0])
-    assert again[0].temperature == pytest.approx(measured[0].temperature + 3.0)
-    assert change(ros, 'plant', 'shutdown')
-    assert ros.wait_for_end(process) == 0
-    assert 'Traceback' not in process.output()
 
 
 def clean_up_under_way(ros: Harness, node: str, *sent: Callable[[], object]) -> None:

@@ -339,22 +339,3 @@ def test_a_slow_trial_serves_the_next_attempt_unless_the_file_has_changed(
     put(model_path('reactor_linear').read_bytes(), file)
     ros.wait_until(lambda: accepted(str(file)))
     ros.wait_until(lambda: f'model {file}: linear' in ros.printed())
-
-
-def test_dead_disk_does_not_pile_up_readers(
-        ros: Harness, tmp_path: Path) -> None:
-    # impatient, or this would last
-    bench, file = start_controller(ros, tmp_path, 'model_reload._LONG_WAIT = 0.02')
-    others = [file.with_name(f'{k}.safetensors') for k in range(8)]
-    for path in (file, *others):
-        os.mkfifo(disk(path))
-    assert bench.reload() == (
-        False, f'the current model is kept: {file} was not read within 0.02 s: check its disk')
-    assert bench.reload() == (
-        False, f'the current model is kept: {file} is still being read: check its disk, or try '
-        'again')
-    request = SetParameters.Request(parameters=[
-        Parameter('model', value=str(path)).to_parameter_msg() for path in others])
-    results = ros.call(SetParameters, 'controller/set_parameters', request).results
-    assert ['8 model files are still being read' in result.reason for result in results] == [
-        False] * 7 + [True]

@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 import shutil
 import signal
-import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -27,7 +26,6 @@ from koopman_ros.event_log.run import replayed_bag
 from koopman_ros.event_log.sources import read_records
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.controller import ReplayParameters
-from koopman_ros.records import BagReadError
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.controller_bench import STEADY
@@ -222,18 +220,6 @@ def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Pa
     assert sum(steps > 0.49) > 10  # K; the rate limit at one sample a second
 
 
-def test_bag_that_was_cut_off_is_reproduced_as_far_as_it_is_whole(
-        bag: Path, tmp_path: Path) -> None:
-    (file,) = bag.glob('*.mcap')
-    part = tmp_path / 'part.mcap'
-    part.write_bytes(file.read_bytes()[:int(0.7 * file.stat().st_size)])
-    with pytest.raises(BagReadError, match='not closed by its recorder'):
-        replayed(part)
-    found = replayed(part, recover=True)
-    assert found.check.identical == found.check.compared > 20
-    assert not found.complete
-
-
 def write_run(path: Path, change: Callable[[list[EventRecord]], Iterable[EventRecord]] = list,
               model: str = 'reactor_nz4', prefix: str = '') -> Path:
     """Write a bag of twenty measurements, with a snapshot in the middle of the records."""
@@ -303,16 +289,6 @@ def test_a_replay_reports_differences_of_a_new_model_and_a_new_tuning(
     assert (tmp_path / 'out' / 'replay.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
-    bag = write_run(tmp_path / 'run.mcap')
-    output = tmp_path / 'out'
-    assert run_here(replay, '--params-file', str(config_directory() / 'replay.yaml'),
-                    '-p', f'bags:=[{bag}, {bag}]', '-p', f'output:={output}') == 0
-    assert {path.name for path in output.iterdir()} == {
-        'report.md', 'summary.json', 'replay_1.png', 'replay_2.png'}
-    assert len(json.loads((output / 'summary.json').read_text())['bags']) == 2
-
-
 @pytest.mark.parametrize(('arguments', 'words'), [
     (('-p', 'bags:=[none.mcap]'), "bag 'none.mcap' does not exist"),
     (('-p', "bags:=['']"), "bags = [''] must contain"),
@@ -334,19 +310,3 @@ def test_a_bag_that_cannot_be_replayed_is_rejected_in_one_line(
     line = complaint(capfd)
     assert line.startswith('replay: ')
     assert words in line
-
-
-def test_controller_in_a_namespace_is_replayed_by_its_own_records(tmp_path: Path) -> None:
-    bag = write_run(tmp_path / 'run.mcap', model='reactor_nz3', prefix='/unit_1')
-    assert run_here(replay, '-r', '__ns:=/unit_1', bags=f'[{bag}]', output=tmp_path) == 0
-    (figures,) = json.loads((tmp_path / 'summary.json').read_text())['bags']
-    assert figures['recorded_model']['identical'] == figures['measurements'] == 20
-
-
-def test_missing_matplotlib_is_reported_in_one_line(
-        monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.delitem(sys.modules, 'koopman_ros.event_log.figure', raising=False)
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    assert run_here(replay, bags='[run.mcap]') == 1
-    assert complaint(capfd).startswith(
-        'replay: the plot needs matplotlib, which is not installed: pip install')
