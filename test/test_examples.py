@@ -18,7 +18,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
-from scipy.linalg import solve_continuous_are
 from sensor_msgs.msg import JointState
 
 from koopman_ros.core.units import NANOSECONDS
@@ -115,21 +114,6 @@ def test_classes_on_the_pendulum_differ_and_the_rule_is_as_stated(pendulum: Run)
         roots, abs=0.005)
 
 
-def test_weaker_motors_reach_less(pendulum: Run) -> None:
-    checks = pendulum.names['checks']
-    assert list(checks) == [4.0, 2.0]
-    for torque, check in checks.items():
-        # the model is as good as the truth that it is tried on
-        assert check.loops > 0
-        assert not check.failed.any()
-        angles = np.abs(check.setpoints[:, 0])
-        # derived by hand: m g l = 1 kg * 9.81 m/s^2 * 0.5 m
-        assert 0.5 < 4.905 * np.sin(angles.max()) <= torque * (1.0 + 1e-6)
-        assert _numbers(rf'^ *{torque:.0f} N m: .* holds (\S+) degrees', pendulum.text) == [
-            pytest.approx(np.degrees(np.arcsin(torque / 4.905)), abs=0.05)]
-    assert checks[2.0].hopeless > checks[4.0].hopeless > 0
-
-
 def test_pendulum_is_held_where_the_linear_model_is_off(pendulum: Run) -> None:
     runs, held = pendulum.names['runs'], pendulum.names['held']
     goal, truth = 0.7, -4.905 * np.sin(0.7)
@@ -162,26 +146,6 @@ def test_tanks_are_identified_from_their_file(tanks: Run) -> None:
     assert np.all(decision.rmse < 2.0 * names['NOISE'])
     assert np.all(decision.linear_rmse > 2.0 * decision.rmse)
     assert np.all(names['astray'] < 1.5e-3)
-
-
-def test_model_file_of_the_tanks_is_the_model(tanks: Run) -> None:
-    model, trained = tanks.names['model'], tanks.names['trained'].model
-    x = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 2))
-    np.testing.assert_array_equal(model.drift(x), trained.drift(x))
-    # the middle of the record is a steady state of the true tanks, too, but for the model's error
-    rate = TANKS.derivative(model.states.center, model.inputs.center)
-    assert np.all(np.abs(rate) < 0.1 * TANKS.B[0, 0])  # worth 0.1 V
-
-
-def test_unreachable_set_point_of_the_tanks_is_rejected_as_the_truth_has_it(tanks: Run) -> None:
-    # derived by hand: both outlets are alike, so that k u2 = a sqrt(2 g) (sqrt(h2) - sqrt(h1))
-    u1, u2 = 0.1781e-4 * np.sqrt(2.0 * 9.81) / 3.3e-6 * np.array(
-        [np.sqrt(0.15), np.sqrt(0.08) - np.sqrt(0.15)])
-    assert _numbers(r'in truth it takes (\S+) V and (\S+) V', tanks.text) == pytest.approx(
-        [u1, u2], abs=0.005)
-    assert _numbers(r'^level_2 set-point 0.08 m cannot be held, because pump_2 would have to be '
-                    r'(\S+) V, but its range is 0 V to 12 V', tanks.names['rejection']) == [
-        pytest.approx(u2, rel=0.2)]
 
 
 def test_leak_leaves_an_offset_that_the_observer_removes_and_measures(tanks: Run) -> None:
@@ -233,25 +197,6 @@ def test_equation_of_the_beam_is_read_off_its_polynomial(beam: Run) -> None:
     assert figures['polynomial'].rx < 1e-20 < figures['neural drift'].rx < 1e-4
     # nothing of this plant evolves linearly
     assert min(fit.rw for fit in figures.values()) > 0.05
-
-
-def test_rubbing_beam_is_no_polynomial(beam: Run) -> None:
-    rows = {one.name: one for one in beam.names['rough'].contenders}
-    assert beam.names['rough'].chosen.name == 'neural drift'
-    assert rows['neural drift'].rx < 0.1 * rows['polynomial'].rx
-    assert 'neural drift  rx' in beam.text
-    # the slope that is given for the friction is that of the friction
-    system, x = beam.names['rubbing'], np.array([3.0, 20.0])
-    steps = 1e-4 * np.eye(2)
-    slope = (system.drift(x + steps) - system.drift(x - steps)).T / 2e-4
-    np.testing.assert_allclose(system.drift_jacobian(x), slope, rtol=1e-5, atol=1e-6)
-
-
-def test_weights_in_units_give_the_gain_of_the_textbook(beam: Run) -> None:
-    A, B = np.array([[0.0, 1.0], [400.0, -8.0]]), np.array([[0.0], [1e4]])
-    Q, R = np.diag([1.0, 1.0 / 2500.0]), np.array([[400.0]])
-    K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))
-    np.testing.assert_allclose(beam.names['gain'], K, rtol=1e-6)
 
 
 def test_beam_is_held_on_the_slope(beam: Run) -> None:
@@ -314,13 +259,6 @@ def test_launch_file_gives_its_parameter_file_to_all_nodes() -> None:
         assert Path(node.ros_arguments[1]).is_file()
         assert node.parameters == {'autostart': False}
     assert _launched({'parameters': 'loop.yaml'})[0].ros_arguments[1] == 'loop.yaml'
-
-
-def test_no_node_starts_without_the_parameter_file_of_the_launch(ros: Harness) -> None:
-    plant, *_ = _launched({'system': 'two_tansk'})
-    process = ros.start(plant.executable, {}, tuple(plant.ros_arguments))
-    assert ros.wait_for_end(process) == 1
-    assert 'two_tansk.yaml' in process.output()
 
 
 @pytest.mark.parametrize('path', sorted(TUTORIALS.glob('*.py')), ids=lambda path: path.stem)
