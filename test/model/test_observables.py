@@ -25,7 +25,6 @@ LIFTS = NETWORKS | DICTIONARIES
 every_lift = pytest.mark.parametrize('lift', LIFTS.values(), ids=LIFTS)
 every_dictionary = pytest.mark.parametrize('lift', DICTIONARIES.values(), ids=DICTIONARIES)
 SEPARATIONS = [2.0, 1e-2, 1e-5, 1e-8, 1e-9, 1e-12, 0.0]
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 # Truncation error h^4 f'''''/30 and rounding eps/h are both near 1e-13 for functions of order 1.
 STEP = 1e-3
