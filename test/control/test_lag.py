@@ -8,14 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from koopman_ros.control import SetpointRequest, State
+from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
+from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.estimation import DisturbanceObserver, Estimate
 from koopman_ros.evaluation import at, exchange, perfect, simulate
-from koopman_ros.evaluation.optimal_cost import cost_along, Task
+from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.event_log.records import decoded, encoded
+from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.plants import Actuator, equilibrium_input, Process
+from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, Process
 from koopman_ros.plants.process import _with_input_lag
+from koopman_ros.tuning import Tuning
 from support.closed_loops import COOLANT, FOULED, REACTOR, SECOND, SETPOINT, shipped, START
 from support.lagged_reactor import lagged_model
 
@@ -114,3 +117,48 @@ def test_the_applied_input_is_measured_or_not(given, measured, estimator):
     late, follows = loop.estimation.applied(state, state.command - 5.0)
     assert follows
     np.testing.assert_array_equal(late.command, state.command)
+
+
+SLOW, VALVE_LAG = 60.0, 20.0  # s
+TANK = ControlAffineSystem(
+    'tank', ('level',), ('m',), ('valve',), ('percent',), 's', drift=lambda x: -x / SLOW,
+    B=np.array([[0.01 / SLOW]]), nominal_state=np.array([0.3]), nominal_input=np.array([30.0]))
+VALVE = Actuator(lower=0.0, upper=100.0, lag=VALVE_LAG, rangeability=30.0)
+
+
+def tank_model():
+    """Return a polynomial model of level and valve, which is not exact for the valve's curve."""
+    x = np.stack(np.meshgrid(np.linspace(0.02, 0.6, 15), np.linspace(5.0, 95.0, 31)),
+                 axis=-1).reshape(-1, 2)
+    u = x[::-1, 1:]
+    rates = np.hstack([TANK.derivative(x[:, :1], VALVE.effect(x[:, 1:])),
+                       (u - x[:, 1:]) / VALVE_LAG])
+    center = float(VALVE.position(np.array([30.0]))[0])
+    plant = PlantDescription(
+        'tank', ('level', 'applied_valve'), ('m', 'percent'), ('valve',), ('percent',), 's',
+        np.array([0.3, center]), np.array([center]), np.array([[0.0], [1.0 / VALVE_LAG]]))
+    return Edmd(5).learn(plant, DriftSamples(x, rates, u, np.arange(len(x)) % 5))
+
+
+@pytest.mark.parametrize(('start', 'step'), [(0.3, 0.001), (0.1, 0.005), (0.15, 0.3)])
+def test_behind_a_lag_and_a_valve_steps_of_any_size_are_nearly_optimal(start, step):
+    """Of a step far below the model's steady-state error, the observer takes that error away."""
+    model = tank_model()
+    loop = Controller(model, replace(
+        Tuning.for_model(model), observer_bandwidth=0.05, limits=InputLimits(
+            np.zeros(1), np.full(1, 100.0), np.full(1, np.inf))))
+    u0, u1 = (VALVE.position(np.array([100.0 * x])) for x in (start, start + step))
+    weights = loop.best.law.weights
+    task = Task(_with_input_lag(TANK, np.array([VALVE_LAG]), VALVE.effect),
+                np.array([start, u0[0]]), np.array([start + step, u1[0]]), u1,
+                np.diag(weights.Q) / model.states.scale ** 2,
+                np.diag(weights.R) / model.inputs.scale ** 2, 1.0, 300)
+    assert task.Q[1] == 0.0
+    run = simulate(loop, Process(TANK, 0, np.array([start]), u0, VALVE, u0), [
+        at(0.0, SetpointRequest(0, np.array([start]))),
+        at(BEGIN, SetpointRequest(0, np.array([start + step])))], duration=BEGIN + 299.0,
+        C=np.eye(1), state=loop.initialise(State(), u0))
+    assert set(run.levels) == {'sdre'}
+    begin = int(BEGIN)
+    cost = cost_along(task, np.hstack([run.states, run.inputs])[begin:], run.commands[begin:])
+    assert cost < 1.05 * optimum(task).cost

@@ -8,12 +8,14 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 import contextlib
 from dataclasses import replace
+import math
 from typing import Any
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from koopman_ros.core.characteristic import Characteristic
-from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.datasets import Array, Episode, PlantDescription
 from koopman_ros.identification_methods import WeakFormParameters
 from koopman_ros.learning.identification.chance import block_gains, clearly_positive
 from koopman_ros.learning.identification.drift import (
@@ -33,9 +35,13 @@ from koopman_ros.learning.identification.output_error import (
 from koopman_ros.learning.identification.weak_form import weak_form
 
 _POINTS, _FEW_POINTS = 21, 5  # of a characteristic, and of functions next to states
+# Coefficients of products of states and functions. The 880 of ten states and two inputs take 2 s a
+# step, and rarely does a record determine so many.
+_MOST_PRODUCTS = 300
 _SLIGHT = 0.02  # share of the range; a law does not feel a smaller deviation from a line
 _FEW_STEPS, _MOST_STEPS, _TOLERANCE = 10, 40, 1e-4  # of refinements
 _FALL = 0.1  # share of the range by which the effect of no characteristic falls
+_STIFFNESS = np.geomspace(1e-8, 1e3, 89)  # weights of squared changes of slope that are tried
 
 
 class NotMonotoneError(ValueError):
@@ -50,8 +56,9 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
     Functions of an input are added to the drift as further inputs, piecewise linear between the
     quantiles of the record. They are kept if they lower the errors at samples that are left out of
     the fit by more than two standard errors; the part that all states have in common is the
-    characteristic. At last products of such functions and states are tried in the same way. A
-    drift with them is not affine in the inputs, and competes as an alternative.
+    characteristic. At last products of such functions and states are tried in the same way, unless
+    there are too many. A drift with them is not affine in the inputs, and competes as an
+    alternative.
 
     :param plant: see :func:`identify`, like the options. Where it knows B nothing is tried.
     :param given: inputs whose characteristic the plant has already.
@@ -64,7 +71,15 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
         if name not in given and (one := characteristic_of(found, name)) is not None:
             plant = replace(plant, characteristics={**plant.characteristics, name: one})
             found = identify(plant, episodes, **options)
-    other = _not_affine(found)
+    functions = _hats(found, plant.input_names, _FEW_POINTS)
+    if functions is None:
+        return found
+    n_x = len(plant.state_names)
+    if (count := n_x * (1 + n_x) * len(functions.coordinates())) > _MOST_PRODUCTS:
+        return replace(found, steps=(
+            *found.steps, f'left out: {count} products of states and functions of the inputs, '
+            f'above the limit of {_MOST_PRODUCTS}'))
+    other = _not_affine(found, functions)
     return found if other is None else replace(
         found, alternatives=(other, *found.alternatives), warnings=(
             *found.warnings, f'a {other.form} explains the record better than static '
@@ -98,21 +113,44 @@ def characteristic_of(found: Identified, name: str) -> Characteristic | None:
             f'the effect of {name} rises and falls between {u[0]:.6g} and {u[-1]:.6g} '
             f'{inputs.units[inputs.names.index(name)]}, so that no control law can invert it: '
             'record a range in which it only rises or only falls')
-    one = Characteristic.of(u, np.maximum.accumulate(g))
+    one = Characteristic.of(u, smoothed(u, g))
     change = one.effects - inputs.characteristics.get(name, Characteristic.of(
         u[[0, -1]], u[[0, -1]])).effect(u)
     return one if np.max(np.abs(change)) > _SLIGHT * (u[-1] - u[0]) else None
 
 
-def _not_affine(found: Identified) -> NonAffineDrift | None:
+def smoothed(u: Array, g: Array) -> Array:
+    """
+    Return rising effects near estimates g (K,) of those of inputs u (K,), which rise.
+
+    Behind a lag their slope is one of the drift, and that of the estimates is mostly noise.
+    Squared changes of slope are weighted as generalised cross-validation finds best: P. Craven,
+    G. Wahba, Numerische Mathematik 31 (1979).
+    """
+    count = len(u)
+    lengths = np.diff(u) * (count - 1) / (u[-1] - u[0])
+    bend = np.diff(np.diff(np.eye(count), axis=0) / lengths[:, None], axis=0)
+    values, vectors = np.linalg.eigh(bend.T @ bend)
+    left = _STIFFNESS[:, None] * np.maximum(values, 0.0)
+    left /= 1.0 + left
+    errors = np.sum((left * (vectors.T @ g)) ** 2, axis=1) / np.sum(left, axis=1) ** 2
+    weight = math.sqrt(_STIFFNESS[np.argmin(errors)])
+    rises = np.tril(np.ones((count, count)))
+    found = lsq_linear(
+        np.vstack((rises, weight * bend @ rises)), np.append(g, np.zeros(count - 2)),
+        (np.append(-np.inf, np.zeros(count - 1)), np.inf)).x
+    # rounding may leave it a little below the bound
+    return np.asarray(np.maximum.accumulate(rises @ found))
+
+
+def _not_affine(found: Identified, functions: Hats) -> NonAffineDrift | None:
     """Return a drift with products of states and functions of the inputs, if it is better."""
     drift = found.drift
     assert isinstance(drift, DriftModel)
-    functions = _hats(found, drift.box.inputs.names, _FEW_POINTS)
     products = drift if drift.varying_input_matrix else replace(drift, B=np.hstack(
         [drift.B] + [0.0 * drift.B] * len(drift.box.states)))
-    better = functions and _better(found, functions, products)
-    return NonAffineDrift(drift.box, better, functions) if functions and better else None
+    better = _better(found, functions, products)
+    return NonAffineDrift(drift.box, better, functions) if better else None
 
 
 def _hats(found: Identified, names: Sequence[str], count: int) -> Hats | None:

@@ -303,20 +303,29 @@ class _Problem(Generic[_Model]):
         """Return J' r and J' J, whose rows of starts touch only their own segment."""
         M, n_x, p = *before.shape[1:], len(self.model.theta)
         q = p + (n_x if self.smooth else K.size)
-        gradient, matrix = np.zeros((M, q, 1)), np.zeros((M, q, q))
+        common = p if self.smooth else q
+        gradient, matrix = np.zeros(common), np.zeros((common, common))
+        own_gradient, own = np.zeros((M, q - common)), np.zeros((M, q - common, q))
         for rows, S in self._sensitivities(model, K, before, after, q):
-            J = self._weighed(S, rows).transpose(1, 3, 0, 2).reshape(M, q, -1)
-            gradient += J @ errors[rows].swapaxes(0, 1).reshape(M, -1, 1)
-            matrix += J @ J.swapaxes(1, 2)
+            J, weighed = self._weighed(S, rows), errors[rows]
+            # one product for all segments, of which the matrix is read and written once
+            shared = J.reshape(-1, q)[:, :common]
+            gradient += weighed.ravel() @ shared
+            matrix += shared.T @ shared
+            if self.smooth:
+                by_segment = J.swapaxes(0, 1).reshape(M, -1, q)
+                starts = by_segment[..., p:].swapaxes(1, 2)
+                own += starts @ by_segment
+                own_gradient += (starts @ weighed.swapaxes(0, 1).reshape(M, -1, 1))[..., 0]
         if not self.smooth:
-            return gradient[..., 0].sum(axis=0), matrix.sum(axis=0)
+            return gradient, matrix
         whole = np.zeros((p + M * n_x,) * 2)
-        whole[:p, :p] = matrix[:, :p, :p].sum(axis=0)
+        whole[:p, :p] = matrix
         for m in range(M):
-            own = slice(p + m * n_x, p + (m + 1) * n_x)
-            whole[own, own], whole[own, :p] = matrix[m, p:, p:], matrix[m, p:, :p]
-            whole[:p, own] = matrix[m, :p, p:]
-        return np.concatenate((gradient[:, :p, 0].sum(axis=0), gradient[:, p:].ravel())), whole
+            block = slice(p + m * n_x, p + (m + 1) * n_x)
+            whole[block, block], whole[block, :p] = own[m, :, p:], own[m, :, :p]
+            whole[:p, block] = own[m, :, :p].T
+        return np.concatenate((gradient, own_gradient.ravel())), whole
 
     def _sensitivities(self, model: _Model, K: Array, before: Array, after: Array, q: int
                        ) -> Iterator[tuple[slice, Array]]:

@@ -86,7 +86,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
         (own, held_out), (other, others) = map(free_run_errors, (varying, measured))
         better, words = compared(own, other)
         better &= bool(np.mean(held_out ** 2) < np.mean(others ** 2))
-        steps = measured.drift.form, f'{varying.drift.form}: {words}'
+        steps = *measured.steps, measured.drift.form, f'{varying.drift.form}: {words}'
         measured = replace(varying if better else measured, linear=measured.linear, steps=steps,
                            searched=('input_matrix_degree',))
     if _explains(measured, plant, episodes, _SLIGHT):

@@ -14,7 +14,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_with_characteristics
-from koopman_ros.learning.identification.characteristics import NotMonotoneError
+from koopman_ros.learning.identification.characteristics import NotMonotoneError, smoothed
 from koopman_ros.learning.identification.input_functions import NonAffineDrift
 from koopman_ros.learning.identification.structure_search import with_characteristics
 from koopman_ros.model import load
@@ -45,6 +45,27 @@ def record(rate, low, high, seed=0):
 def identified(episode, plant=PLANT, **options):
     return identify_with_characteristics(plant, [episode], degrees=(1,), methods=methods(20),
                                          **options)
+
+
+@pytest.mark.parametrize(('g', 'exact'), [
+    (lambda u: (30.0 ** u - 1.0) / 29.0, 1e-3),
+    (lambda u: np.maximum(u - 0.3, 0.0) / 0.7, 1e-2),
+    (lambda u: 0.5 + 0.5 * np.tanh(5.0 * (u - 0.5)) / np.tanh(2.5), 1e-3)],
+    ids=['equal percentage', 'dead zone', 'between two ends'])
+def test_a_smoothed_characteristic_rises_with_the_slope_of_the_true_one(g, exact):
+    u = np.linspace(0.0, 1.0, 21)
+    assert np.max(np.abs(smoothed(u, g(u)) - g(u))) < exact
+    errors, largest = [], []
+    for seed in range(10):
+        noisy = g(u) + 0.01 * np.random.default_rng(seed).standard_normal(len(u))
+        found = smoothed(u, noisy)
+        assert np.all(np.diff(found) >= 0.0)
+        rising = [np.maximum.accumulate(noisy), found]
+        errors.append([np.std(np.diff(one - g(u)) / np.diff(u)) for one in rising])
+        largest.append([np.max(np.abs(one - g(u))) for one in rising])
+    by_estimates, by_smoothed = np.mean(errors, axis=0)
+    assert by_smoothed < 0.75 * by_estimates
+    assert np.max(largest, axis=0)[1] < 1.1 * np.max(largest, axis=0)[0]
 
 
 @pytest.mark.parametrize(('g', 'low', 'high'), [
@@ -136,3 +157,18 @@ def test_a_drift_that_is_not_affine_in_the_input_competes():
     x, u = (np.random.default_rng(0).uniform(-0.4, 0.4, (2, 50, 1)))
     errors = [np.std(one.rate(x, u) - rate(x, u)) for one in (other, found.drift)]
     assert errors[0] < 0.5 * errors[1]
+
+
+def test_products_of_many_states_are_left_out_and_said():
+    """As their number rises with the square of the states, they would take minutes."""
+    rng = np.random.default_rng(0)
+    names = tuple(f'level_{k}' for k in range(6))
+    plant = PlantDescription('line', names, ('m',) * 6, ('valve', 'pump'), ('1', '1'), 's',
+                             np.full(6, np.nan), np.full(2, np.nan), None)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (125, 2)), 6, axis=0)
+    x = np.zeros((750, 6))
+    for k in range(749):
+        x[k + 1] = x[k] + PERIOD * (np.append(u[k, 0], x[k, :-1]) - x[k] + 0.5 * u[k, 1])
+    time = PERIOD * np.arange(750)
+    (said,) = identified(Episode(time, x, time, u), plant, given=plant.input_names).steps
+    assert said.startswith('left out: 336 products')

@@ -72,6 +72,19 @@ def test_inputs_that_moved_nearly_together_are_warned_of() -> None:
         assert warning.startswith('pump_1 and pump_2 moved together (correlation 0.9')
 
 
+@pytest.mark.parametrize('noise', [0.1, 0.5])
+def test_noise_of_inputs_that_count_as_held_does_not_hide_that_they_moved_together(noise) -> None:
+    """As in a table whose inputs were measured, and are not given as linear."""
+    for seed in SEEDS:
+        u = steps(seed, 12)
+        u[:, 1] = 0.35 * u[:, 0]
+        try:
+            (said,) = check_inputs(plant(3), record(u, seed, noise, measured=False))
+        except ValueError as error:
+            said = str(error)
+        assert said.startswith('pump_1 and pump_2 moved together (correlation 0.9')
+
+
 def test_three_inputs_of_which_no_two_moved_together() -> None:
     for seed in SEEDS:
         u = steps(seed, 12, 4)
