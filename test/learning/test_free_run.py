@@ -104,7 +104,8 @@ def test_a_model_is_rejected_whose_free_run_diverges_or_is_worse_than_that_of_th
     record = read(table(), 'position [m]', 'force [N]')
     own, linear = (dict.fromkeys(('record', 'test'), simulate(lifted(slope=one), record, init=2))
                    for one in (slope, A * [[1.0, 1.0], [1.1, 1.0]]))
-    reasons = list(_failed_runs(own, {LINEAR_MODEL: linear, DRIFT: own if diverged else linear}))
+    reasons = list(_failed_runs(own, dict.fromkeys((LINEAR_MODEL, DRIFT),
+                                                   own if diverged else linear)))
     assert words in ' '.join(reasons)
     assert len(reasons) == bool(words) + (slope[0, 0] > 0.0 and not diverged)
 
@@ -118,6 +119,9 @@ def test_a_free_run_may_diverge_where_that_of_the_drift_leaves_the_record():
     assert np.all(np.isfinite([drift.leaves, *drift.rmse]))
     runs = {'record': own}
     assert not list(_failed_runs(runs, {DRIFT: {'record': drift}, LINEAR_MODEL: runs}))
+    # a stable plant with a drift that explodes
+    stable = simulate(lifted(slope=A), record, init=2)
+    assert list(_failed_runs(runs, {DRIFT: runs, LINEAR_MODEL: {'record': stable}}))
 
 
 @pytest.mark.parametrize('usual', ['good', 'bad'])
