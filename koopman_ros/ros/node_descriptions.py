@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.model import load
-from koopman_ros.parameters import controller, panel, plant, trainer
+from koopman_ros.parameters import controller, panel, plant, player, trainer
 from koopman_ros.parameters.signal_topics import (
     bundled_plants,
     DEFAULT_SYSTEM,
@@ -65,7 +65,7 @@ def table_of(name: str, given: Mapping[str, Any]) -> ParameterTable[Any]:
     if name == 'plant':
         return plant.PlantTable(given)
     if name == 'player':
-        return trainer.player_table(given)
+        return player.player_table(given)
     if name == 'replay':
         return controller.REPLAY_TABLE
     model = given.get('model', '')

@@ -14,9 +14,9 @@ from rclpy.serialization import serialize_message
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import conversion, display_unit, NANOSECONDS
+from koopman_ros.parameters.player import PlayerParameters
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import PlayerParameters
 from koopman_ros.records import BagMessage, BagSummary
 from koopman_ros.records.tables import header_of, seconds_of, table_of
 from koopman_ros.ros.time_conversion import stamp_message

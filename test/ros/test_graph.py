@@ -23,12 +23,8 @@ from std_srvs.srv import SetBool
 from koopman_ros.core.paths import config_directory
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
-from koopman_ros.parameters.trainer import (
-    COMMAND,
-    MANUAL,
-    player_table,
-    SETPOINT,
-)
+from koopman_ros.parameters.player import player_table
+from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT
 from koopman_ros.records import BagWriter, message_definition
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
