@@ -300,7 +300,7 @@ def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, 
     """Say that a free run diverges, or is clearly worse on the test record than a linear one."""
     for name, own in runs.items():
         linear, test = others[LINEAR_MODEL][name], name == 'test'
-        # that of an unstable plant leaves the measured range by any model, if not for infinity
+        # that of an unstable plant leaves the measured range by any model, be it finite or not
         if own.diverged and (test or any(np.isnan(one[name].leaves) for one in others.values())):
             yield (f'its free run of the {"test " * test}record diverges: from {own.leaves:.4g} '
                    f'{own.plant.time_unit} on it errs by more than the measured range')

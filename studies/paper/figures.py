@@ -21,7 +21,6 @@ EXACT: dict[str, Any] = {'color': 'black', 'linewidth': 1.8}
 LEARNED: dict[str, Any] = {'color': 'tab:green', 'linestyle': '--', 'linewidth': 1.8}
 LINEAR: dict[str, Any] = {'color': 'tab:red', 'linewidth': 1.2}
 _LIFTED: dict[str, Any] = {'color': 'tab:red', 'linestyle': '--', 'linewidth': 1.8}
-FIGURE_SEED = 0
 FIGURE_NARROW_BOX = '[4,5.5]x[4,5.5]'
 
 

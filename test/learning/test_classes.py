@@ -20,7 +20,8 @@ from koopman_ros.learning import (
     Thresholds,
     TrainingTask,
 )
-from koopman_ros.learning.identification import identify
+from koopman_ros.learning.identification import identify, Stopped
+from koopman_ros.model import load
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.records import read
 from support.known_plants import KnownPlant, methods
@@ -69,9 +70,17 @@ def found():
 
 
 @pytest.fixture(scope='module')
-def best(found):
+def course():
+    """Return what is told of a comparison: of the starts, and of the closed loops."""
+    return [], []
+
+
+@pytest.fixture(scope='module')
+def best(found, course):
     """Compare the classes on the record of the bent plant, whose drift is of degree 2."""
-    return compared(found)
+    learning, judging = course
+    return compared(found, watch=lambda now: bool(learning.append(now)),
+                    judging=lambda *now: bool(judging.append(now)))
 
 
 def test_the_class_of_the_truth_is_chosen(found, best):
@@ -142,6 +151,20 @@ def test_a_rejection_advises_to_compare_the_classes_unless_they_were_compared(fo
         assert (f'set model_class to {BEST}' in reason) == advised
 
 
+def test_progress_counts_the_starts_of_all_classes(course, best):
+    learning, judging = course
+    assert list(dict.fromkeys(now.name for now in learning)) == list(CLASSES[2:])
+    shares = [now.finished for now in learning]
+    assert shares == sorted(shares)
+    assert shares[-1] == learning[-1].total == 3
+    assert list(dict.fromkeys(name for name, _ in judging)) == list(CLASSES)
+
+
+def test_comparison_that_is_stopped(found):
+    with pytest.raises(Stopped):
+        compared(found, judging=lambda name, share: name == 'polynomial' and share > 0.5)
+
+
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('bag') / 'linear.mcap', linear_run(200))
@@ -195,7 +218,23 @@ def test_of_a_linear_drift_the_linear_model_alone_is_learned(bag, tmp_path):
 
 
 @pytest.mark.usefixtures('quick')
-def test_a_task_with_an_unusable_executor_device_or_class_writes_nothing(bag, tmp_path):
+def test_a_report_of_one_class_has_no_comparison(bag, tmp_path):
+    retrained = retrain(task(bag, tmp_path, 'polynomial'))
+    assert class_lines(retrained.summary()) == {}
+    # exact, but no better than the linear model
+    assert 'best linear model' in retrained.reasons[0]
+
+
+@pytest.mark.usefixtures('quick')
+def test_the_plant_is_retrained_at_the_paths_of_the_task(bag, tmp_path):
+    """The same lift comes of it, and what fails writes nothing."""
+    models = []
+    for scheduler in ('', 'process'):
+        done = retrain(replace(task(bag, tmp_path, 'linear'), executor=scheduler))
+        models.append(load(done.model_file))
+        (tmp_path / 'new.safetensors').unlink()
+    assert models[0].A.tobytes() == models[1].A.tobytes()
+    assert models[0].verified_loops == models[1].verified_loops
     for change, text in (({'executor': 'joblib:0'}, "executor is 'joblib:0', must be"),
                          ({'device': 'abacus'}, "device is 'abacus', but torch"),
                          ({'model_class': 'lift'}, "model_class = 'lift' must be one of linear")):

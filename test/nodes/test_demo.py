@@ -17,32 +17,59 @@ import rclpy
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo import line_demo, retraining_demo, setpoint_demo
-from koopman_ros.records import summary
+from koopman_ros.event_log.records import parse
+from koopman_ros.event_log.run import replay_records
+from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess, reserved_output
 
 
-def test_demo_leaves_bag_picture_and_summary(tmp_path: Path) -> None:
-    exports = shutil.which('cc') is not None
+@pytest.mark.parametrize(('plant', 'signal', 'final', 'settling', 'cost', 'measurements'), [
+    # without observer: the linear law ends a kelvin off
+    pytest.param('reactor', 'temperature', 0.01, (60.0, 400.0), 1.5, 601, id='reactor'),
+    # from 60 degrees; angle and rate come in one message
+    pytest.param('pendulum', 'angle', 1e-3, (0.5, 3.0), 1.02, 301, id='pendulum')])
+def test_demo_leaves_bag_picture_and_summary(
+        tmp_path: Path, plant: str, signal: str, final: float, settling: tuple[float, float],
+        cost: float, measurements: int) -> None:
+    exports = plant == 'reactor' and shutil.which('cc') is not None
     done = subprocess.run(
-        [sys.executable, '-m', 'koopman_ros.demo', '--speed', '0', '--output', tmp_path,
-         *['--export'] * exports],
+        [sys.executable, '-m', 'koopman_ros.demo', '--plant', plant, '--speed', '0',
+         '--output', tmp_path, *['--export'] * exports],
         capture_output=True, text=True, timeout=240, check=False)
     assert (done.returncode, done.stderr) == (0, '')
     result = json.loads((tmp_path / 'summary.json').read_text())
-    assert result['final_error']['temperature'] < 0.01
-    # without observer: the linear law ends a kelvin off
-    assert result['linear_final_error']['temperature'] > 1.0
-    assert 60.0 < result['settling_time_seconds']['temperature'] < 400.0
-    assert 1.0 - 1e-6 < result['cost'] / result['optimal_cost'] < 1.5
+    assert result['final_error'][signal] < final
+    assert plant == 'pendulum' or result['linear_final_error'][signal] > 1.0
+    assert settling[0] < result['settling_time_seconds'][signal] < settling[1]
+    assert 1.0 - 1e-6 < result['cost'] / result['optimal_cost'] < cost
     assert result['cost'] < result['linear_cost']
-    assert result['measurements'] == result['commands'] == 601
+    assert result['measurements'] == result['commands'] == measurements
     if exports:
         assert result['exported_difference']['coolant_temperature'] < 1e-9
     assert summary(tmp_path / 'closed_loop.mcap').message_count == result['bag_messages']
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
-    assert 'temperature set-point [' in done.stdout
+    assert f'{signal} set-point [' in done.stdout
     assert len(re.findall(r'^ +[\d.]+ +', done.stdout, re.MULTILINE)) >= 20
+
+
+def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_less(
+        tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, '-m', 'koopman_ros.demo', 'disturbance', '--speed', '0', '--output',
+         tmp_path], capture_output=True, text=True, timeout=240, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+    result = json.loads((tmp_path / 'summary.json').read_text())
+    assert result['peak_unmeasured_kelvin'] == pytest.approx(0.91, abs=0.1)
+    assert result['peak_ratio'] < 1.0 / 3.0
+    assert result['peak_measured_kelvin'] < 0.25
+    assert (tmp_path / 'disturbance.png').read_bytes().startswith(b'\x89PNG')
+    # the records of the loop give its commands again
+    replayed = replay_records(
+        parse(entry.message.data) for entry in read_messages(
+            tmp_path / 'measured.mcap', [f'/{topics.EVENT_LOG}']))
+    assert len(replayed.samples) > 240
+    assert all(one.recorded == one.replayed for one in replayed.samples)
 
 
 def test_a_loop_with_dead_time_reaches_the_optimal_cost_and_beats_pi_control(
@@ -101,7 +128,9 @@ def test_demo_commands_nothing_in_a_domain_with_another_loop(
     assert "'mine'" in capsys.readouterr().err
 
 
-def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path) -> None:
+@pytest.mark.parametrize('which', [[], ['retrain']])
+def test_demo_interrupted_while_it_loads_ends_without_a_word(
+        tmp_path: Path, which: list[str]) -> None:
     program = (
         'import os, runpy, signal, sys\n'
         'class Interrupted:\n'
@@ -110,7 +139,7 @@ def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path) -> 
         '            os.kill(os.getpid(), signal.SIGINT)\n'
         'sys.meta_path.insert(0, Interrupted())\n'
         'runpy.run_module("koopman_ros.demo", run_name="__main__", alter_sys=True)\n')
-    done = subprocess.run([sys.executable, '-c', program, 'retrain', '--output', tmp_path],
+    done = subprocess.run([sys.executable, '-c', program, *which, '--output', tmp_path],
                           capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 

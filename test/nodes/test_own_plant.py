@@ -63,9 +63,9 @@ def start(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ..
 
 
 def train(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]],
-          *settings: str) -> Any:
+          setting: str) -> Any:
     """Train as the page has it; return the errors of the lift and of the linear model, in K."""
-    process = start(ros, overlay, command, '-p', *settings)
+    process = start(ros, overlay, command, '-p', setting)
     assert ros.wait_for_end(process) == 0, process.output()
     said = re.search(ACCEPTED, process.output())
     assert said, process.output()
@@ -89,8 +89,7 @@ def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempP
 def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
         overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
     assert summary(recorded).counts['/power_setpoint'] > 0
-    lift, linear = train(ros, overlay, TRAIN, 'restarts:=1', '-p',
-                         "identification_methods:=['weak_form']")
+    lift, linear = train(ros, overlay, TRAIN, 'restarts:=1')
     # the noise of the sensor is 0.2 K
     assert lift < 0.25 < 1.0 < linear
     model = load(folder / 'oven.safetensors')

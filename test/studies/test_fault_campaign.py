@@ -16,6 +16,7 @@ from koopman_ros.event_log.records import parse
 from studies.faults.__main__ import main
 from studies.faults.case import Command, FaultCase, LoopTrace, SeenStatus
 from studies.faults.cases import CASES, rejected_values
+from studies.faults.endurance import run_endurance
 from studies.faults.harness import FaultHarness, run
 from studies.faults.judge import judge
 from studies.faults.plants import FaultPlant, HEATED_LINE, QUADRUPLE_TANK, REACTOR, TWO_TANKS
@@ -108,6 +109,22 @@ def test_faults_of_messages_models_and_processes_are_survived(tmp_path: Path) ->
         nan, play=play, says=garbage.says, bump=killed.bump, plant=killed.plant,
         afterwards=60.0, recovery=60.0), tmp_path)
     assert result['reasons'] == []
+
+
+def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_path: Path) -> None:
+    case = replace(CASES['saddle-solver-missing'], play=CASES['saddle-lost'].play, between=True,
+                   settle=15.0, afterwards=30.0, recovery=0.0, largest_step=2.0)
+    result, found = run(case, tmp_path)
+    assert result['reasons'] == []
+    # with the solver the law would have planned
+    assert judge(found, replace(case, missing=()))['reasons'] != []
+
+
+def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
+    found = run_endurance(tmp_path / 'soak', lambda: None, hours=0.03)
+    assert found['reasons'] == []
+    assert found['answers']['measurements'] > 100
+    assert set(found['recorded'].values()) == {found['answers']['answered']}
 
 
 @pytest.mark.parametrize('on', [REACTOR, TWO_TANKS, QUADRUPLE_TANK, HEATED_LINE])

@@ -23,7 +23,8 @@ from koopman_ros.plants import (
     steady_state,
 )
 from studies import saddle
-from studies.paper.reactor import SYSTEM, training_samples
+from studies.paper import reactor
+from studies.paper.reactor import SETPOINT, SYSTEM, training_samples
 from studies.shipped_models import (
     FEED,
     library_system,
@@ -33,7 +34,9 @@ from studies.shipped_models import (
     line_with_feed,
     reactor_with_feed,
     SADDLE,
+    SEED,
     train_lift,
+    train_lifts,
 )
 from studies.unstable import SADDLE_TEMPERATURE, steady
 
@@ -145,6 +148,39 @@ def test_the_linear_model_is_the_linearisation_and_predicts_far_worse(episodes):
     assert roll_out_error(model, episodes) > 1.0
 
 
+@pytest.fixture(scope='module')
+def retrained():
+    # the best of three is shipped; one is to keep the promise, too, which is of the true plant
+    return train_lifts(starts=1, loops=0)
+
+
+# ten seconds of computing, several times as long beside other programs
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_a_retrained_lift_is_as_accurate_as_the_shipped_one(n_z, retrained, episodes):
+    """
+    Judge by the true plant alone: the bits of a training are those of its processor.
+
+    Another one rounds differently, in the simulated data already, and a thousand steps of the
+    minimisation carry that along directions that hardly change the model: with data that differ
+    by 1e-13 rw comes out several times as large or as small.
+    """
+    model, shipped_one = retrained[n_z], shipped(f'nz{n_z}')
+    assert model.is_hurwitz
+    assert_promise(model, episodes)
+    assert model.provenance.metrics['rollout_rmse'] <= PROMISED_KELVIN[n_z]
+    # of a step of 10 K, without an observer
+    assert reactor.feed_forward_offset(model) <= PROMISED_KELVIN[n_z]
+    loop = reactor.close_loop(model)
+    assert loop.failure == ''
+    assert abs(float(loop.states[-1, 0]) - SETPOINT) <= PROMISED_KELVIN[n_z]
+    # it is learned from what the shipped one was learned from
+    for mine, theirs in ((model.states, shipped_one.states), (model.inputs, shipped_one.inputs)):
+        for name in ('center', 'scale', 'lower', 'upper'):
+            np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), rtol=1e-9)
+    assert model.provenance.data_digest == drawn(SEED).digest()
+
+
 # The lifts of the other plants: a task each, for the learned law on the true plant.
 
 
@@ -185,29 +221,25 @@ PROMISES = {
 
 @cache
 def known(name):
-    """Return the task of a plant, the least cost of it and that of the linear law."""
+    """Return fresh data of a plant, its task, the least cost of it and that of the linear law."""
     promise, system = PROMISES[name], library_system(name)
     x_ref, u_ref = steady_state(system, promise.wanted)
     task = Task(system, system.nominal_state if promise.x0 is None else np.array(promise.x0),
                 x_ref, u_ref, np.array(promise.weights), np.ones(system.n_u),
                 promise.period / system.seconds_per_time_unit, promise.samples)
-    return task, optimum(task).cost, linear_law(task).cost
-
-
-def fits(name, model):
-    """Hold a lift to what is promised of it on fresh data."""
     lift = LIFTS[name]
-    fresh = box_episodes(library_system(name), lift.design, lift.episodes // 6, lift.duration,
-                         7001)
+    fresh = box_episodes(system, lift.design, lift.episodes // 6, lift.duration, 7001)
+    return fresh, task, optimum(task).cost, linear_law(task).cost
+
+
+def keeps(name, model):
+    """Hold a lift to what is promised of it, on fresh data and in closed loop."""
+    promise, (fresh, task, least, linear) = PROMISES[name], known(name)
+    system, x_ref = task.system, task.x_ref
     figures = fit(model, fresh.x, fresh.dxdt, fresh.u)
-    assert max(figures.rw, figures.rx) <= PROMISES[name].fit
+    assert max(figures.rw, figures.rx) <= promise.fit
     assert figures.cond < 10.0
 
-
-def controls(name, model):
-    """Hold a lift to what is promised of it in closed loop on the true plant."""
-    promise, (task, least, linear) = PROMISES[name], known(name)
-    system, x_ref = task.system, task.x_ref
     lower, upper = map(np.array, promise.limits)
     # the learned law alone, within the margin of its data that is the default
     settings = Tuning.for_model(
@@ -241,17 +273,14 @@ def test_shipped_lifts_of_the_library_keep_their_promise(name):
         width = np.subtract(getattr(lift.design, f'{other}_upper'),
                             getattr(lift.design, f'{other}_lower'))
         np.testing.assert_allclose((box.upper - box.lower) / width, 1.0, rtol=0.05)
-    fits(name, model)
-    if name in ('fed_reactor', 'two_tanks', 'pendulum'):
-        controls(name, model)
+    cost = keeps(name, model)
+    if name == 'two_state_example':
+        # of the exact lift's regulator in continuous time
+        assert cost < 1.001 * 990.1798
 
 
 def test_a_retrained_lift_of_the_library_is_as_accurate_as_the_shipped_one():
-    name = 'two_state_example'
-    model = train_lift(name, loops=0)
-    fits(name, model)
-    # of the exact lift's regulator in continuous time
-    assert controls(name, model) < 1.001 * 990.1798
+    keeps('two_state_example', train_lift('two_state_example', loops=0))
 
 
 def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone():

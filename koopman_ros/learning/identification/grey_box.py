@@ -23,7 +23,7 @@ from koopman_ros.learning.identification.identify import (
     INNOVATIONS_FORM,
     OUTPUT_ERROR,
     Score,
-    Stopped,
+    stage_monitor,
     Watch,
 )
 from koopman_ros.learning.identification.innovations_form import Predictor, spanned
@@ -94,11 +94,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
 
 def _stage(watch: Watch, number: int, text: str) -> Callable[..., bool]:
     """Begin one of three stages, and return its monitor."""
-    def monitor(*_: object) -> bool:
-        if watch(number, 3, text):
-            raise Stopped
-        return False
-
+    monitor = stage_monitor(watch, number, 3, text)
     monitor()
     return monitor
 
@@ -140,7 +136,7 @@ def _refined(record: SplitRecord, start: Predictor[Equations], monitor: Callable
     first = _fitted(record, start, none, record.fit, _GROWTHS[0], monitor)
     start = _filter(record, first.model, len(none.T))
     alone, filtered = (_fitted(record, start, gain, record.fit, _GROWTHS[1], monitor)
-                     for gain in (none, start.gain))
+                       for gain in (none, start.gain))
     best = filtered if filtered.cost < alone.cost else alone
     return Predictor(best.model, start.gain), best
 

@@ -64,6 +64,16 @@ class Stopped(Exception):  # noqa: N818
     """The `watch` callback asked to stop."""
 
 
+def stage_monitor(watch: Watch, number: int, total: int, text: str) -> Callable[..., bool]:
+    """Return a monitor that reports a stage, and raises Stopped when `watch` asks to stop."""
+    def monitor(*_: object) -> bool:
+        if watch(number, total, text):
+            raise Stopped
+        return False
+
+    return monitor
+
+
 @dataclass(frozen=True)
 class Score:
     """Prediction error of one estimate on the segments held out for the choice."""
@@ -205,9 +215,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     done, words = 0, {f'drift of degree {degree}': degree for degree in degrees}
 
     def progress(name: str, _: object) -> bool:
-        if watch(done, len(degrees) + 1, name or [*words, ''][done]):
-            raise Stopped
-        return False
+        return stage_monitor(watch, done, len(degrees) + 1, name or [*words, ''][done])()
 
     with contextlib.closing((backend or Serial()).run(
             _candidate, words, watch=progress, shared=_Given(

@@ -29,7 +29,7 @@ from koopman_ros.learning.identification.episode_offsets import (
 from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.identification.identify import (
     Identified,
-    Stopped,
+    stage_monitor,
     usual_degrees,
     Watch,
 )
@@ -110,12 +110,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     begun = itertools.count()
 
     def stage(text: str, limit: float = end) -> Callable[..., bool]:
-        number = min(next(begun), total - 1)
+        told = stage_monitor(watch, min(next(begun), total - 1), total, text)
 
         def monitor(*_: object) -> bool:
-            if watch(number, total, text):
-                raise Stopped
-            return time.process_time() > limit
+            return told() or time.process_time() > limit
 
         if monitor():
             choice.steps.append(f'stopped after {budget:.0f} s: {text}')

@@ -18,8 +18,10 @@ from koopman_ros.learning.identification import (
     identify_unmeasured,
     network_candidates,
 )
+from koopman_ros.learning.record import read_record
 from koopman_ros.model import Coordinates, linearised_model, Provenance
 from support.known_plants import CUBIC, methods, PAIR
+from support.long_records import bags_of, source
 from support.small_plants import BENT, bent_samples, bits, SMALL
 
 # test_backends holds the others to the same results
@@ -76,7 +78,7 @@ def estimated_with_a_hidden_state(backend):
                                dead_times=False, backend=backend)
 
 
-@pytest.mark.parametrize('estimate', [estimated])
+@pytest.mark.parametrize('estimate', [estimated, estimated_with_a_hidden_state])
 def test_drifts_are_estimated_side_by_side(places, estimate, monkeypatch):
     monkeypatch.setattr(network_candidates, 'UNITS', (2,))
     here, there = (estimate(places[kind]) for kind in ('', 'joblib:2'))
@@ -111,6 +113,27 @@ def test_loops_run_side_by_side(places):
     assert seen == sorted(seen)
 
 
+# Bags.
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    return bags_of(3, tmp_path_factory.mktemp('bags'))
+
+
+def test_both_readers_return_the_same(bags, places):
+    few, told = source(bags), []
+    one = read_record(few, 3000, 7)
+    other = read_record(few, 3000, 7, tick=told.append, backend=places['joblib:2'])
+    assert min(told) == 0
+    assert one.reduction == other.reduction
+    assert one.account == other.account
+    for a, b in zip(one.episodes, other.episodes, strict=True):
+        np.testing.assert_array_equal(a.x, b.x)
+    another = read_record(few, 3000, 8).episodes
+    assert [part.x[0, 0] for part in another] != [part.x[0, 0] for part in one.episodes]
+
+
 # Ends and interrupts: last, as a process that is ended at work is started anew.
 
 
@@ -128,5 +151,16 @@ def test_the_watch_follows_and_can_end_starts():
     assert {(2, 1), (2, 2), (2, 3), (3, 4)} <= set(finished) <= {
         (2, 0), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4)}
     assert any(now.iteration and np.isfinite(now.residual) for now in seen)
+    assert kept.status.startswith('interrupted')
+    assert (kept.model.n_z, kept.starts) == (3, 4)
+
+
+def test_an_interrupt_keeps_the_best_that_processes_have_found(places):
+    """The processes themselves ignore it."""
+    def watch(now):
+        if now.finished == 4:
+            raise KeyboardInterrupt
+
+    kept = trained(places['joblib:2'], watch)
     assert kept.status.startswith('interrupted')
     assert (kept.model.n_z, kept.starts) == (3, 4)
