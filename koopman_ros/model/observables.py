@@ -292,18 +292,24 @@ class Monomials:
         return Monomials(self.factors[..., None] * E, lowered)
 
     @cached_property
-    def _columns(self) -> tuple[int, list[NDArray[np.int64]]]:
-        return int(np.max(self.exponents, initial=1)), list(
-            np.ascontiguousarray(np.moveaxis(self.exponents, -1, 0)))
+    def _factors(self) -> tuple[int, list[NDArray[np.int64]]]:
+        """Return the highest power, and where the powers are that each row is a product of."""
+        E = self.exponents
+        degree = int(np.max(E, initial=1))
+        # states with an exponent first, in their order: x^0 of the others need not be multiplied
+        order = np.argsort(E == 0, axis=-1, kind='stable')
+        places = order * (degree + 1) + np.take_along_axis(E, order, axis=-1)
+        most = int(np.max(np.count_nonzero(E, axis=-1), initial=1))
+        return degree, list(np.ascontiguousarray(np.moveaxis(places[..., :most], -1, 0)))
 
     def at(self, x: Array) -> Array:
         """Evaluate them: (..., n_x) -> (..., *shape)."""
-        degree, columns = self._columns
+        degree, factors = self._factors
         # each power once: numpy's own power of many numbers takes twenty times as long
         powers = np.ones((*x.shape, degree + 1))
         for k in range(degree):
             np.multiply(powers[..., k], x, out=powers[..., k + 1])
-        found: Array = self.factors
-        for j, column in enumerate(columns):
-            found = found * powers[..., j, :].take(column, axis=-1)
+        powers, found = powers.reshape(*x.shape[:-1], -1), self.factors
+        for places in factors:
+            found = found * powers.take(places, axis=-1)
         return found
