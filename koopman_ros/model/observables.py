@@ -309,7 +309,7 @@ class Monomials:
         powers = np.ones((*x.shape, degree + 1))
         for k in range(degree):
             np.multiply(powers[..., k], x, out=powers[..., k + 1])
-        powers, found = powers.reshape(*x.shape[:-1], -1), self.factors
+        powers, found = powers.reshape(*x.shape[:-1], x.shape[-1] * (degree + 1)), self.factors
         for places in factors:
             found = found * powers.take(places, axis=-1)
         return found
