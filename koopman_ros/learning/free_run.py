@@ -185,7 +185,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     starts, disturbances = (np.array(some) for some in zip(*found, strict=True))
     disturbances = disturbances + known
     segments = Segments.of(indexed, step)
-    run = segments.path(lambda x, u: rate(x, u) + disturbances, starts)
+    run = segments.path(rate, starts, disturbances)
     paths = tuple(run[np.flatnonzero(segments.x[:, k, 0])[:len(one)], k][:, order]
                   for k, one in enumerate(episodes))
     errors, values = (np.concatenate(parts) for parts in (
@@ -273,9 +273,8 @@ def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Ep
 
     def errors(p: Array) -> Array:
         """Return the errors (S, m) from starts (S, n_x), side by side, in half-ranges."""
-        added = disturbance(p)
         path = segments.repeated(len(p)).path(
-            lambda x, u: rate(x, u) + added, states.to_physical(p[:, :n_x]))
+            rate, states.to_physical(p[:, :n_x]), disturbance(p))
         found = states.to_deviation(path[rows])[..., measured] - y[:, None]
         return np.hstack((np.clip(np.nan_to_num(
             np.swapaxes(found, 0, 1)[:, there], nan=_LOST), -_LOST, _LOST), p[:, n_x:]))

@@ -20,6 +20,7 @@ from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
 from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.learning.identification.simulation import simulated
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials
 
@@ -252,17 +253,20 @@ class Segments:
 
         return Segments(*map(tiled, (self.steps, self.u, self.x, self.measured)))
 
-    def path(self, rate: Rate, x0: Array) -> Array:
-        """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
-        path = np.empty((*self.x.shape[:2], x0.shape[-1]))
-        path[0] = x = x0
-        with np.errstate(all='ignore'):
-            for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
-                def held(x: Array, u: Array = u) -> Array:
-                    return rate(x, u)
+    def path(self, rate: Rate, x0: Array, added: Array | float = 0.0) -> Array:
+        """
+        Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence.
 
-                path[k + 1] = x = runge_kutta_step(held, x, h)
-        return path
+        :param added: (M, n_x) constant rates.
+        """
+        u, h, added = (one.reshape(self.steps.size, -1) for one in (
+            self.u, self.steps, np.broadcast_to(added, (len(self.u), *x0.shape))))
+
+        def step(rows: Any, x: Array) -> Array:
+            return runge_kutta_step(lambda x: rate(x, u[rows]) + added[rows], x, h[rows])
+
+        size = np.max(np.abs(x0), axis=0)
+        return simulated(step, x0, len(self.steps), np.where(size > 0.0, size, 1.0))
 
     def errors(self, rate: Rate, x0: Array) -> Array:
         """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""

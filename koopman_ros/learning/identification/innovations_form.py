@@ -21,6 +21,7 @@ from koopman_ros.learning.identification.drift import (
     gauss_newton_step,
     Segments,
 )
+from koopman_ros.learning.identification.simulation import simulated
 from koopman_ros.learning.identification.weak_form import regress
 from koopman_ros.model import Coordinates
 
@@ -54,23 +55,30 @@ class Predictor(Generic[_Drift]):
         return FilterRun(*(np.swapaxes(one, 0, 1)[segments.sampled.T] for one in (
             before, after, self._errors(segments, before))))
 
-    def states(self, data: Segments, x: Array) -> tuple[Array, Array]:
-        """Return the states (K + 1, M, n_x) before and after corrections, from starts (M, n_x)."""
+    def states(self, data: Segments, x: Array, guess: Array | None = None
+               ) -> tuple[Array, Array]:
+        """
+        Return the states (K + 1, M, n_x) before and after corrections, from starts (M, n_x).
+
+        :param guess: similar states before corrections.
+        """
         drift, n_y = self.drift, self.gain.shape[1]
-        v, target = drift.box.inputs.to_deviation(data.u), self.target(data)
-        before = np.empty((len(v) + 1, *x.shape))
-        # without a gain a predictor never corrects its state: its prediction is a simulation
-        after = np.empty(before.shape) if np.any(self.gain) else before
-        with np.errstate(all='ignore'):
-            for k in range(len(before)):
-                before[k] = x
-                if after is not before:
-                    error = np.where(data.measured[k], x[:, :n_y] - target[k], 0.0)
-                    after[k] = x = x - error @ self.gain.T
-                if k < len(v):
-                    x = runge_kutta_step(partial(drift.scaled_rate, v=v[k]), x,
-                                         data.steps[k][:, None])
-        return before, after
+        v, h, y = (one.reshape(len(one) * len(x), -1) for one in (
+            drift.box.inputs.to_deviation(data.u), data.steps, self.target(data)))
+        measured = data.measured.reshape(y.shape)
+
+        def corrected(rows: Any, x: Array) -> Array:
+            # without a gain a predictor never corrects its state: its prediction is a simulation
+            return x - np.where(measured[rows], x[:, :n_y] - y[rows], 0.0) @ self.gain.T if (
+                np.any(self.gain)) else x
+
+        def step(rows: Any, x: Array) -> Array:
+            return runge_kutta_step(partial(drift.scaled_rate, v=v[rows]), corrected(rows, x),
+                                    h[rows])
+
+        before = simulated(step, x, len(data.u), np.ones(x.shape[1]), guess)
+        after = corrected(slice(None), before.reshape(-1, x.shape[1])).reshape(before.shape)
+        return before, after if np.any(self.gain) else before
 
     def _errors(self, data: Segments, before: Array) -> Array:
         """Return the innovations (K + 1, M, n_y), 0 where nothing was measured."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Generic, Protocol, Self, TypeVar
 
@@ -217,6 +217,7 @@ class _Problem(Generic[_Model]):
     settling: int = 0
     smooth: bool = True
     penalty: Array | None = None
+    _last: list[Array] = field(default_factory=list)  # simulation, to begin the next one with
 
     def start(self) -> Tensor:
         """Return the parameters to begin with."""
@@ -254,7 +255,10 @@ class _Problem(Generic[_Model]):
         """Add the scaled prediction errors at given parameters."""
         model, K, starts = self.split(theta.numpy())
         with np.errstate(all='ignore'):
-            before, after = Predictor(model.drift, K).states(self.segments, starts)
+            before, after = Predictor(model.drift, K).states(
+                self.segments, starts, *self._last)
+            if np.all(np.isfinite(before)):
+                self._last[:] = [before]
             errors = self._weighed(before[..., :self._target.shape[2]] - self._target)
             cost = 0.5 * float(np.sum(errors ** 2)) / self.count
             if not np.isfinite(cost):
@@ -343,24 +347,22 @@ class _Problem(Generic[_Model]):
         block = max(1, _BLOCK // (M * n_x * (1 + p + n_x)))
         for first in range(0, steps, block):
             rows = slice(first, min(first + block, steps))
-            slopes = _step_slopes(model, after[rows][:steps - 1 - first], self._inputs[rows],
-                                  data.steps[rows])
-            found = np.empty((rows.stop - first, M, n_y, q))
-            for k, own in enumerate(found):
-                own[:] = S[:, :n_y]
-                if after is not before or not self.smooth:
-                    measured = data.measured[first + k]
-                    correction = K @ np.where(measured[..., None], own, 0.0)
-                    if not self.smooth:
-                        error = np.where(
-                            measured, before[first + k, :, :n_y] - self._target[first + k], 0.0)
-                        for i in range(n_x):
-                            correction[:, i, p + i * n_y:p + (i + 1) * n_y] += error
-                    S = S - correction
-                if k < len(slopes):
-                    S = slopes[k, ..., p:] @ S
-                    S[..., :p] += slopes[k, ..., :p]
-            yield rows, found
+            inner = slice(first, min(rows.stop, steps - 1))
+            slopes = _step_slopes(model, after[inner], self._inputs[inner], data.steps[inner])
+            more, A = np.zeros((*slopes.shape[:-1], q)), slopes[..., p:]
+            more[..., :p] = slopes[..., :p]
+            measured = data.measured[inner, :, None]
+            if not self.smooth:
+                error = (before[..., :n_y] - self._target)[inner, :, None] * measured
+                for i in range(n_x):
+                    more[..., p + i * n_y:p + (i + 1) * n_y] -= A[..., i, None] * error
+            A = A - np.pad(A @ K * measured, ((0, 0),) * 3 + ((0, n_x - n_y),))
+            found = np.empty((1 + len(A), M, n_x, q))
+            found[0] = S
+            for k, own in enumerate(A):
+                np.add(own @ found[k], more[k], out=found[k + 1])
+            S = found[-1]
+            yield rows, found[:rows.stop - first, :, :n_y]
 
 
 def _step_slopes(model: Refinable, x: Array, v: Array, steps: Array) -> Array:

@@ -91,7 +91,9 @@ def test_normal_equations_against_differences(learn, smooth, corrected):
     # central differences: 1e-10 of the third derivative, 1e-16 / 1e-5 of rounding
     assert found.gradient.numpy() == pytest.approx(J.T @ base, abs=1e-7)
     assert found.matrix.numpy() == pytest.approx(J.T @ J, abs=1e-6)
-    assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == found.cost
+    # the simulation begins with that before, and rounds differently
+    assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == (
+        pytest.approx(found.cost, rel=1e-14))
     theta = theta + 1e8
     for derivatives in (True, False):
         diverging = normal_equations(problem.add_residuals, theta, derivatives=derivatives)
