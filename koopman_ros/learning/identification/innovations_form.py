@@ -77,7 +77,8 @@ class Predictor(Generic[_Drift]):
                                     h[rows])
 
         before = simulated(step, x, len(data.u), np.ones(x.shape[1]), guess)
-        after = corrected(slice(None), before.reshape(-1, x.shape[1])).reshape(before.shape)
+        with np.errstate(all='ignore'):
+            after = corrected(slice(None), before.reshape(-1, x.shape[1])).reshape(before.shape)
         return before, after if np.any(self.gain) else before
 
     def _errors(self, data: Segments, before: Array) -> Array:
