@@ -20,7 +20,7 @@ from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.learning.identification.simulation import simulated
+from koopman_ros.learning.identification.simulation import fitted, simulated
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials
 
@@ -33,8 +33,6 @@ _Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]
 # Of the search of a steady state: the range is that of noisy measurements, and a search that is so
 # far outside does not come back.
 _SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
-# Difference of two starts that tells the slope, in units of the states' scale.
-_STEP = 1e-4
 
 
 def box_of(plant: PlantDescription, episodes: Sequence[Episode]) -> Box:
@@ -289,50 +287,15 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     :return: the starts (M, n_x), and the mean squared errors from there (M, n_x), in state units
         squared, infinite on divergence.
     """
-    x0 = segments.x[0]
-    n_x = x0.shape[1]
+    def errors(starts: Array) -> Array:
+        """Evaluate the errors (S, K + 1, M, n_x), as states of different units weigh alike."""
+        found = segments.repeated(len(starts)).errors(
+            rate, (scale * starts).reshape(-1, len(scale))) / scale
+        return np.moveaxis(found.reshape(len(found), *starts.shape), 1, 0)
+
+    starts, squares = fitted(errors, (segments.x[0] / scale)[None])
     count = np.maximum(np.sum(segments.measured, axis=0), 1)
-    best, least = x0, np.full_like(x0, np.inf)
-    # with each segment the same from starts that differ in one state
-    shifted = segments.repeated(1 + n_x)
-    shifts = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
-    for last in (False, False, True):
-        tried = x0 + scale * (shifts[:1] if last else shifts)[:, None]
-        # errors in units of the scale: states of different units weigh alike
-        found = (segments if last else shifted).errors(rate, tried.reshape(-1, n_x)) / scale
-        found = found.reshape(len(found), *tried.shape)
-        errors = found[:, 0]
-        # a model may diverge from any of the starts
-        with np.errstate(all='ignore'):
-            squares = np.sum(errors ** 2, axis=0) / count
-            better = np.sum(squares, axis=1) < np.sum(least, axis=1)
-            best, least = (np.where(better[:, None], x0, best),
-                           np.where(better[:, None], squares, least))
-            if last or not np.all(np.isfinite(errors)):
-                break
-            # (K + 1, M, n_x, n_x): change of every state with each start
-            slopes = np.moveaxis(found[:, 1:] - found[:, :1], 1, -1) / _STEP
-            step = gauss_newton_step(slopes, errors)
-            if step is None:
-                break
-            x0 = x0 + scale * step
-    return best, least * scale ** 2
-
-
-def gauss_newton_step(slopes: Array, errors: Array) -> Array | None:
-    """
-    Return the steps (M, p) that reduce the squared errors of M segments, None if not finite.
-
-    :param slopes: (K, M, n, p) derivatives of the errors.
-    :param errors: (K, M, n) errors of n signals at K samples.
-    """
-    normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
-    right = np.einsum('kmij,kmi->mj', slopes, errors)
-    if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
-        return None
-    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-    step: Array = -(inverse @ right[..., None])[..., 0]
-    return step
+    return scale * starts, scale ** 2 * squares / count
 
 
 def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:

@@ -15,19 +15,13 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.solvers import runge_kutta_step
-from koopman_ros.learning.identification.drift import (
-    Drift,
-    DriftModel,
-    gauss_newton_step,
-    Segments,
-)
-from koopman_ros.learning.identification.simulation import simulated
+from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
+from koopman_ros.learning.identification.simulation import fitted, simulated
 from koopman_ros.learning.identification.weak_form import regress
 from koopman_ros.model import Coordinates
 
 SETTLING = 40  # samples after which a filter has found the state
-# Of the search for the start of an episode: how far hidden states are tried, steps, differences.
-_APART, _SEARCHES, _STEP = 0.5, 3, 1e-4
+_APART = 0.5  # how far hidden states are tried at the start of an episode
 
 
 _Drift = TypeVar('_Drift', bound=Drift, covariant=True)
@@ -111,28 +105,9 @@ class Predictor(Generic[_Drift]):
             found = self._errors(tiled, self.states(tiled, starts.reshape(-1, n_x))[0])
             return np.moveaxis(found.reshape(len(found), *starts.shape[:2], n_y), 1, 0)
 
-        def best_of(starts: Array) -> tuple[Array, Array]:
-            """Return the best of starts (S, M, n_x) for each segment, and its size."""
-            with np.errstate(over='ignore'):
-                squares = np.sum(errors(starts) ** 2, axis=(1, 3))
-            squares = np.where(np.isfinite(squares), squares, np.inf)
-            chosen = np.argmin(squares, axis=0)[None]
-            return (np.take_along_axis(starts, chosen[..., None], axis=0)[0],
-                    np.take_along_axis(squares, chosen, axis=0)[0])
-
         shifts = np.concatenate((np.zeros((1, n_x)), hidden, -hidden))
         tried = home + shifts[:, None]
-        best, least = best_of(tried if guess is None else np.concatenate((guess[None], tried)))
-        steps = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
-        for _ in range(_SEARCHES):
-            here, *shifted = errors(best + steps[:, None])
-            slopes = np.stack([other - here for other in shifted], axis=-1) / _STEP
-            change = gauss_newton_step(slopes, here)
-            if change is None:
-                break
-            offer, own = best_of((best + change)[None])
-            best, least = (np.where((own < least)[:, None], offer, best), np.minimum(own, least))
-        return best
+        return fitted(errors, tried if guess is None else np.concatenate((guess[None], tried)))[0]
 
 
 @dataclass(frozen=True)

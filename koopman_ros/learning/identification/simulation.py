@@ -20,6 +20,8 @@ _BLOCK = 500  # steps that are taken at once
 _FEW = 64  # most states of all segments for which that is faster
 _MOST, _SLOW = 10, 0.1  # Newton steps; share of a change, above which slopes are evaluated again
 _DIFFERENCE, _CONVERGED, _LOST = 1e-6, 1e-10, 1e6  # of states, in units of their size
+# Of starts: Gauss-Newton steps, differences, and the share of the squares that ends them.
+_SEARCHES, _SHIFT, _GAIN = 3, 1e-4, 1e-6
 
 
 def simulated(step: Step, x0: Array, count: int, scale: Array, guess: Array | None = None
@@ -45,6 +47,44 @@ def simulated(step: Step, x0: Array, count: int, scale: Array, guess: Array | No
                 for k in range(first, last):
                     path[k + 1] = step(slice(M * k, M * (k + 1)), path[k])
     return path
+
+
+def fitted(errors: Callable[[Array], Array], tried: Array) -> tuple[Array, Array]:
+    """
+    Return the starts (M, n_x) from which simulations err least, by Gauss-Newton steps.
+
+    :param errors: errors(starts) (S, K, M, n) of simulations from starts (S, M, n_x).
+    :param tried: (S, M, n_x) starts, of which the best one of each segment is refined.
+    :return: with the sums of their squared errors (M, n), infinite on divergence.
+    """
+    def best_of(starts: Array) -> tuple[Array, Array, Array]:
+        """Return the best of starts for each segment, its squares and its errors (K, M, n)."""
+        found = errors(starts)
+        squares = np.sum(found ** 2, axis=1)
+        squares = np.where(np.isfinite(squares), squares, np.inf)
+        chosen = np.argmin(np.sum(squares, axis=-1), axis=0)[None, :, None]
+        return (*(np.take_along_axis(one, chosen, axis=0)[0] for one in (starts, squares)),
+                np.take_along_axis(found, chosen[:, None], axis=0)[0])
+
+    with np.errstate(all='ignore'):
+        best, least, here = best_of(tried)
+        shifts = _SHIFT * np.eye(best.shape[1])[:, None]
+        for _ in range(_SEARCHES):
+            slopes = np.moveaxis(errors(best + shifts) - here, 0, -1) / _SHIFT
+            normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
+            right = np.einsum('kmij,kmi->mj', slopes, here)
+            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+                break
+            inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+            offer, own, there = best_of((best - (inverse @ right[..., None])[..., 0])[None])
+            before = np.sum(least, axis=-1)
+            better = np.sum(own, axis=-1) < before
+            best, least = (np.where(better[:, None], *both) for both in (
+                (offer, best), (own, least)))
+            here = np.where(better[:, None], there, here)
+            if np.all(np.sum(least, axis=-1) >= (1.0 - _GAIN) * before):
+                break
+    return best, least
 
 
 def _solved(step: Step, first: int, path: Array, scale: Array) -> bool:
