@@ -26,7 +26,7 @@ from koopman_ros.learning.lift.levenberg_marquardt import (
     NormalEquations,
 )
 
-_MAX_ITERATIONS = 40
+MAX_ITERATIONS = 40
 _BLOCK = 200_000  # numbers of derivatives that are evaluated at once
 
 
@@ -106,7 +106,7 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
     """
     return fitted_by_simulation(
         PolynomialCoefficients(model, learn_input_matrix), segments, tolerance=1e-6,
-        iterations=_MAX_ITERATIONS, monitor=monitor).model.drift
+        iterations=MAX_ITERATIONS, monitor=monitor).model.drift
 
 
 def fitted_by_simulation(model: _Model, segments: Segments, starts: Array | None = None, *,
@@ -174,7 +174,7 @@ class Refined(Generic[_Model]):
 def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Array,
                      deviation: Array, *, settling: int = 0, smooth: bool = False,
                      tolerance: float = 1e-4, penalty: Array | None = None,
-                     iterations: int = _MAX_ITERATIONS,
+                     iterations: int = MAX_ITERATIONS,
                      monitor: Callable[[int, float], bool] | None = None) -> Refined[_Model]:
     """
     Refine a drift model and a filter's gain for the best prediction of the next measurement.
@@ -197,12 +197,10 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
     :param iterations: limit on steps tried.
     """
     problem = _Problem(model, segments, gain, starts, deviation, settling, smooth, penalty)
-    theta: Array = minimise(
-        problem.add_residuals, problem.start(), max_iterations=iterations,
-        tolerance=tolerance, patience=3, monitor=monitor).theta.numpy()
-    refined, K, starts = problem.split(theta)
-    cost = normal_equations(problem.add_residuals, torch.from_numpy(theta), derivatives=False).cost
-    return Refined(refined, K, starts, cost, problem, theta)
+    found = minimise(problem.add_residuals, problem.start(), max_iterations=iterations,
+                     tolerance=tolerance, patience=3, monitor=monitor)
+    theta: Array = found.theta.numpy()
+    return Refined(*problem.split(theta), found.cost, problem, theta)
 
 
 @dataclass(frozen=True)

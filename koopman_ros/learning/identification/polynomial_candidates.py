@@ -20,6 +20,7 @@ from koopman_ros.learning.identification.innovations_form import (
 from koopman_ros.learning.identification.output_error import (
     fitted_by_simulation,
     innovations_form,
+    MAX_ITERATIONS,
     PolynomialCoefficients,
 )
 from koopman_ros.learning.identification.realisation import realised
@@ -37,6 +38,7 @@ UNIT = '1'  # of a state that is not measured: any other scale would do as well
 # of the interval between samples (alpha, beta and gamma of tracking filters).
 _GAINS = ((0.5, 0.1, 0.01), (0.2, 0.02, 0.001), (0.8, 0.4, 0.1))
 _SAMPLES = 20  # between samples, in which rates are counted at first
+_FEW_STEPS = 15  # of each gain, of which the best goes on
 
 _Polynomial = Predictor[DriftModel]
 
@@ -98,22 +100,22 @@ class PolynomialSearch:
     def simulated(self, start: _Polynomial, monitor: Callable[..., bool]
                   ) -> StructureCandidate | None:
         """Return the candidate whose simulations err least; None where they diverge."""
+        pieces = 0
         # a realisation or a filter may forget faster than the plant
-        for _ in range(1 if self.samples else 2):
-            samples = self.samples or self.record.memory(start.drift)
+        for samples in [self.samples] if self.samples else [self.record.memory(start.drift), 0]:
             try:
-                data, starts = self.record.simulated(start, samples)
+                data, starts = self.record.simulated(start, samples or self.samples)
             except ValueError:
                 return None
+            if len(starts) == pieces:
+                break
             refined = fitted_by_simulation(
                 PolynomialCoefficients(start.drift, self.learn_B), data, starts,
                 monitor=monitor)
             if not np.isfinite(refined.cost):
                 return None
-            if not self.samples:
-                self.samples = self.record.memory(refined.model.drift)
-                if self.samples == samples:
-                    break
+            pieces = len(starts)
+            self.samples = self.samples or self.record.memory(refined.model.drift)
         return candidate_of(refined, start, data, self.record)
 
     def extended(self, linear: StructureCandidate) -> _Polynomial:
@@ -155,19 +157,20 @@ class PolynomialSearch:
     def from_filters(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
         """Return the best filter of a linear drift; it is stable where the plant is not."""
         try:
-            tried = [self._refined(self._start(hidden, gains), monitor) for gains in _GAINS]
+            tried = [self._refined(self._start(hidden, gains), monitor, _FEW_STEPS)
+                     for gains in _GAINS]
         except ValueError:
             return None
         return self.filtered(min(tried, key=lambda pair: pair[1])[0], monitor)
 
-    def _refined(self, start: _Polynomial, monitor: Callable[..., bool]
-                 ) -> tuple[_Polynomial, float]:
+    def _refined(self, start: _Polynomial, monitor: Callable[..., bool],
+                 steps: int = MAX_ITERATIONS) -> tuple[_Polynomial, float]:
         record, parts = self.record, self.record.fit
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
             PolynomialCoefficients(start.drift, self.learn_B), start.gain,
             *record.simulated(start, parts=parts), self.deviation,
-            settling=min(SETTLING, shortest // 3), monitor=monitor)
+            settling=min(SETTLING, shortest // 3), iterations=steps, monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost
 
     def _shape(self, hidden: int) -> DriftModel:
