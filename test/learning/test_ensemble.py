@@ -3,11 +3,11 @@
 
 """Drifts of halves of a record: of a plant that changes, of noise that is coloured, of neither."""
 
+from itertools import accumulate
 import re
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.solvers import runge_kutta_step
@@ -27,10 +27,10 @@ def record(count, *, change=0.0, colour=0.0, size=0.02):
         path.append(x)
         acting = (1.0 - change * k / count) * held
         x = runge_kutta_step(lambda x, acting=acting: CUBIC.rate(x, acting), x, PERIOD)
-    noise = lfilter([size * np.sqrt(1.0 - colour ** 2)], [1.0, -colour],
-                    rng.standard_normal((count, 1)), axis=0)
+    white = size * np.sqrt(1.0 - colour ** 2) * rng.standard_normal((count, 1))
+    noise = list(accumulate(white, lambda last, new: colour * last + new))
     time = PERIOD * np.arange(count)
-    return Episode(time, path + noise, time, u)
+    return Episode(time, np.array(path) + noise, time, u)
 
 
 @pytest.mark.parametrize(('count', 'properties', 'words'), [

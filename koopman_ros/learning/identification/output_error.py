@@ -168,7 +168,23 @@ class Refined(Generic[_Model]):
 
         :param samples: of a segment.
         """
-        return self._problem.left_out(self._theta, samples)
+        problem, p, n_x = self._problem, len(self.model.theta), self.starts.shape[1]
+        before, after, errors = problem.simulated(self._theta)
+        J = np.concatenate([problem.weighed(S, rows) for rows, S in problem.sensitivities(
+            self.model, self.gain, before, after, p + n_x)])
+        C = np.linalg.pinv(self.information(), hermitian=True)[:p, :p]
+        # a start is always fitted, within the range: nothing but the first samples tells it
+        prior = np.mean(errors[problem.counted] ** 2) * np.eye(n_x)
+        found = []
+        for m in range(len(self.starts)):
+            rows = np.flatnonzero(problem.counted[:, m].any(axis=1))
+            for part in np.array_split(rows, max(1, len(rows) // samples)):
+                S, start = np.split(J[part, m].reshape(-1, p + n_x), [p], axis=1)
+                S = S - start @ np.linalg.solve(start.T @ start + prior, start.T @ S)
+                rest = np.eye(len(S)) - S @ C @ S.T
+                found.append(np.linalg.solve(rest, errors[part, m].ravel()).reshape(
+                    -1, errors.shape[2]))
+        return np.concatenate(found)
 
 
 def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Array,
@@ -233,7 +249,7 @@ class _Problem(Generic[_Model]):
     @cached_property
     def count(self) -> float:
         """Samples whose errors count, on average of the outputs."""
-        return float(np.sum(self._counted)) / self._target.shape[2]
+        return float(np.sum(self.counted)) / self._target.shape[2]
 
     @cached_property
     def _inputs(self) -> Array:
@@ -244,20 +260,24 @@ class _Problem(Generic[_Model]):
         return Predictor(self.model.drift, self.gain).target(self.segments)
 
     @cached_property
-    def _counted(self) -> NDArray[np.bool_]:
+    def counted(self) -> NDArray[np.bool_]:
         """(K + 1, M, n_y) where an error counts."""
         settled = np.cumsum(self.segments.sampled, axis=0) > self.settling
         return self.segments.measured & settled[..., None]
 
+    def simulated(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Return the states before and after corrections, and weighed errors (K + 1, M, n_y)."""
+        model, K, starts = self.split(theta)
+        before, after = Predictor(model.drift, K).states(self.segments, starts, *self._last)
+        if np.all(np.isfinite(before)):
+            self._last[:] = [before]
+        return before, after, self.weighed(before[..., :K.shape[1]] - self._target)
+
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
         """Add the scaled prediction errors at given parameters."""
-        model, K, starts = self.split(theta.numpy())
+        model, K, _ = self.split(theta.numpy())
         with np.errstate(all='ignore'):
-            before, after = Predictor(model.drift, K).states(
-                self.segments, starts, *self._last)
-            if np.all(np.isfinite(before)):
-                self._last[:] = [before]
-            errors = self._weighed(before[..., :self._target.shape[2]] - self._target)
+            before, after, errors = self.simulated(theta.numpy())
             cost = 0.5 * float(np.sum(errors ** 2)) / self.count
             if not np.isfinite(cost):
                 equations.add_sums(np.inf)
@@ -271,32 +291,10 @@ class _Problem(Generic[_Model]):
             equations.add_sums(0.5 * float(slope @ theta.numpy()), *(
                 map(torch.from_numpy, (slope, np.diag(weights))) if found else ()))
 
-    def left_out(self, theta: Array, samples: int) -> Array:
-        """Return the errors as :meth:`Refined.left_out` has them."""
-        model, K, starts = self.split(theta)
-        p, (M, n_x), n_y = len(self.model.theta), starts.shape, self._target.shape[2]
-        before, after = Predictor(model.drift, K).states(self.segments, starts)
-        errors = self._weighed(before[..., :n_y] - self._target)
-        J = np.concatenate([self._weighed(S, rows) for rows, S in self._sensitivities(
-            model, K, before, after, p + n_x)])
-        matrix = normal_equations(self.add_residuals, torch.from_numpy(theta)).matrix.numpy()
-        C = (np.linalg.pinv(matrix, hermitian=True) / self.count)[:p, :p]
-        # a start is always fitted, within the range: nothing but the first samples tells it
-        prior = np.mean(errors[self._counted] ** 2) * np.eye(n_x)
-        found = []
-        for m in range(M):
-            rows = np.flatnonzero(self._counted[:, m].any(axis=1))
-            for part in np.array_split(rows, max(1, len(rows) // samples)):
-                S, start = np.split(J[part, m].reshape(-1, p + n_x), [p], axis=1)
-                S = S - start @ np.linalg.solve(start.T @ start + prior, start.T @ S)
-                rest = np.eye(len(S)) - S @ C @ S.T
-                found.append(np.linalg.solve(rest, errors[part, m].ravel()).reshape(-1, n_y))
-        return np.concatenate(found)
-
-    def _weighed(self, values: Array, rows: slice = slice(None)) -> Array:
+    def weighed(self, values: Array, rows: slice = slice(None)) -> Array:
         """Return values (k, M, n_y, ...) of the outputs at some steps as the cost weighs them."""
         more = (1,) * (values.ndim - 3)
-        counted, deviation = self._counted[rows], self.deviation
+        counted, deviation = self.counted[rows], self.deviation
         return np.where(counted.reshape(*counted.shape, *more),
                         values / deviation.reshape(*deviation.shape, *more), 0.0)
 
@@ -308,8 +306,8 @@ class _Problem(Generic[_Model]):
         common = p if self.smooth else q
         gradient, matrix = np.zeros(common), np.zeros((common, common))
         own_gradient, own = np.zeros((M, q - common)), np.zeros((M, q - common, q))
-        for rows, S in self._sensitivities(model, K, before, after, q):
-            J, weighed = self._weighed(S, rows), errors[rows]
+        for rows, S in self.sensitivities(model, K, before, after, q):
+            J, weighed = self.weighed(S, rows), errors[rows]
             # one product for all segments, of which the matrix is read and written once
             shared = J.reshape(-1, q)[:, :common]
             gradient += weighed.ravel() @ shared
@@ -329,7 +327,7 @@ class _Problem(Generic[_Model]):
             whole[:p, block] = own[m, :, :p].T
         return np.concatenate((gradient, own_gradient.ravel())), whole
 
-    def _sensitivities(self, model: _Model, K: Array, before: Array, after: Array, q: int
+    def sensitivities(self, model: _Model, K: Array, before: Array, after: Array, q: int
                        ) -> Iterator[tuple[slice, Array]]:
         """
         Yield blocks of derivatives (k, M, n_y, q) of the outputs by the parameters.

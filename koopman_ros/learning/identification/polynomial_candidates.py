@@ -83,19 +83,21 @@ class PolynomialSearch:
             # an unstable plant in a closed loop has no realisation of its own
             if found is not None and (begin == self.from_filters
                                       or found.model.drift.growth_rate < 0.0):
-                return self._standardised(found) if hidden else found
+                assert isinstance(found.model, PolynomialCoefficients)
+                moved = self._standardised(Predictor(found.model.drift, found.gain))
+                return found if moved is None or not hidden else replace(
+                    found, model=replace(found.model, drift=moved.drift), start=moved)
             self.samples = samples
         return None
 
-    def _standardised(self, found: StructureCandidate) -> StructureCandidate:
-        """Return a linear model whose hidden states are between -1 and 1 in the record."""
-        assert isinstance(found.model, PolynomialCoefficients)
+    def _standardised(self, start: _Polynomial) -> _Polynomial | None:
+        """Return the same with hidden states between -1 and 1 in the record, None if constant."""
+        if len(start.gain) == len(self.deviation):
+            return start
         try:
-            start = Predictor(found.model.drift, found.gain)
-            start = standardised(start, self.record.estimates(start))
+            return standardised(start, self.record.estimates(start))
         except (ValueError, np.linalg.LinAlgError):
-            return found
-        return replace(found, model=replace(found.model, drift=start.drift), start=start)
+            return None
 
     def simulated(self, start: _Polynomial, monitor: Callable[..., bool]
                   ) -> StructureCandidate | None:
@@ -147,12 +149,8 @@ class PolynomialSearch:
         if found is None:
             return None
         A, B, c = found
-        start = Predictor(replace(shape, coefficients=np.vstack((c, A.T)), B=B),
-                          np.zeros((n_y + hidden, n_y)))
-        try:
-            return standardised(start, self.record.estimates(start)) if hidden else start
-        except (ValueError, np.linalg.LinAlgError):
-            return None
+        return self._standardised(Predictor(replace(shape, coefficients=np.vstack((c, A.T)), B=B),
+                                            np.zeros((n_y + hidden, n_y))))
 
     def from_filters(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
         """Return the best filter of a linear drift; it is stable where the plant is not."""
