@@ -26,7 +26,7 @@ from koopman_ros.learning.lift.levenberg_marquardt import (
     NormalEquations,
 )
 
-MAX_ITERATIONS = 40
+_MAX_ITERATIONS = 40
 _BLOCK = 200_000  # numbers of derivatives that are evaluated at once
 
 
@@ -106,7 +106,7 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
     """
     return fitted_by_simulation(
         PolynomialCoefficients(model, learn_input_matrix), segments, tolerance=1e-6,
-        iterations=MAX_ITERATIONS, monitor=monitor).model.drift
+        iterations=_MAX_ITERATIONS, monitor=monitor).model.drift
 
 
 def fitted_by_simulation(model: _Model, segments: Segments, starts: Array | None = None, *,
@@ -190,7 +190,7 @@ class Refined(Generic[_Model]):
 def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Array,
                      deviation: Array, *, settling: int = 0, smooth: bool = False,
                      tolerance: float = 1e-4, penalty: Array | None = None,
-                     iterations: int = MAX_ITERATIONS,
+                     iterations: int = _MAX_ITERATIONS,
                      monitor: Callable[[int, float], bool] | None = None) -> Refined[_Model]:
     """
     Refine a drift model and a filter's gain for the best prediction of the next measurement.

@@ -20,7 +20,6 @@ from koopman_ros.learning.identification.innovations_form import (
 from koopman_ros.learning.identification.output_error import (
     fitted_by_simulation,
     innovations_form,
-    MAX_ITERATIONS,
     PolynomialCoefficients,
 )
 from koopman_ros.learning.identification.realisation import realised
@@ -38,7 +37,6 @@ UNIT = '1'  # of a state that is not measured: any other scale would do as well
 # of the interval between samples (alpha, beta and gamma of tracking filters).
 _GAINS = ((0.5, 0.1, 0.01), (0.2, 0.02, 0.001), (0.8, 0.4, 0.1))
 _SAMPLES = 20  # between samples, in which rates are counted at first
-_FEW_STEPS = 15  # of each gain, of which the best goes on
 
 _Polynomial = Predictor[DriftModel]
 
@@ -155,20 +153,19 @@ class PolynomialSearch:
     def from_filters(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial | None:
         """Return the best filter of a linear drift; it is stable where the plant is not."""
         try:
-            tried = [self._refined(self._start(hidden, gains), monitor, _FEW_STEPS)
-                     for gains in _GAINS]
+            tried = [self._refined(self._start(hidden, gains), monitor) for gains in _GAINS]
         except ValueError:
             return None
         return self.filtered(min(tried, key=lambda pair: pair[1])[0], monitor)
 
-    def _refined(self, start: _Polynomial, monitor: Callable[..., bool],
-                 steps: int = MAX_ITERATIONS) -> tuple[_Polynomial, float]:
+    def _refined(self, start: _Polynomial, monitor: Callable[..., bool]
+                 ) -> tuple[_Polynomial, float]:
         record, parts = self.record, self.record.fit
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
             PolynomialCoefficients(start.drift, self.learn_B), start.gain,
             *record.simulated(start, parts=parts), self.deviation,
-            settling=min(SETTLING, shortest // 3), iterations=steps, monitor=monitor)
+            settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost
 
     def _shape(self, hidden: int) -> DriftModel:
