@@ -202,8 +202,8 @@ class TrainerParameters(SignalParameters):
         0.1, 'A new model is accepted if its held-out error is smaller than that of the current '
              'model and of the best linear model by at least this fraction.', '', 0.0, 0.99)
     max_condition_number: float = parameter(
-        1e4, 'Largest accepted condition number of learned coordinates.', '', 1.0, 1e12,
-        open_minimum=True)
+        1e4, 'Largest accepted condition number of learned coordinates, over that of the states '
+             'among them.', '', 1.0, 1e12, open_minimum=True)
 
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
     measured_min: Array = value_column(
