@@ -15,7 +15,6 @@ from pathlib import Path
 import sys
 from typing import Any
 
-import casadi
 import numpy as np
 
 from koopman_ros import __version__
@@ -39,6 +38,7 @@ from koopman_ros.plants import (
 from koopman_ros.records import read, Record, RecordedInput, RecordedState
 from studies import report
 from studies.campaign import Metrics, over, read_options
+from studies.equations import EQUATIONS
 from studies.least import least_course
 from studies.robustness.disturbances import CHANGED, LEAD, SETPOINT
 from studies.robustness.loop import (
@@ -110,20 +110,12 @@ def _task(x: Array, samples: int) -> Task:
 
 def least_cost() -> float:
     """Return the least cost in K^2 min of the step without dead time, from a sample before it."""
-    p = ReactorParameters()
-
-    def rates(x: casadi.SX, u: casadi.SX) -> casadi.SX:
-        reaction = p.concentration * p.pre_exponential_factor * casadi.exp(
-            -p.activation_temperature / x)
-        return (p.flow_rate / p.volume * (p.feed_temperature - x)
-                + p.heating_per_conversion * reaction + p.cooling_rate * (u - x))
-
     goal = _task(np.array([START]), round(OPTIMAL / PERIOD))
     share = np.linspace(0.0, 1.0, goal.samples + 1)[:, None]
     guess = OptimalTrajectory(
         START + (SETPOINT - START) * share, np.maximum(
             goal.u_ref, COOLANT - RATE * PERIOD * np.arange(goal.samples)[:, None]), math.inf)
-    return least_course(goal, rates, *(np.array([end]) for end in COOLANT_RANGE),
+    return least_course(goal, EQUATIONS['reactor'], *(np.array([end]) for end in COOLANT_RANGE),
                         step=np.array([RATE * PERIOD]), guess=guess).cost
 
 
@@ -194,7 +186,7 @@ def table_of(summary: Mapping[str, Any]) -> str:
 def main(args: list[str] | None = None) -> int:
     """Run the study."""
     output: Path = read_options(
-        args, 'late_reactor', 'Compute steps of a reactor behind a dead time.',
+        args, 'studies.late_reactor', 'Compute steps of a reactor behind a dead time.',
         'out/studies-late').output
     output.mkdir(parents=True, exist_ok=True)
     retrained = retrain(task(output), record=record())

@@ -40,7 +40,8 @@ from koopman_ros.parameters.trainer import SETPOINT
 from koopman_ros.plants import ControlAffineSystem, Process, sensor_noise, steady_state
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.ros.topics import CONTROLLER_INTERNALS, LOOP_QOS
-from studies.saddle import becomes, controller, FOULING, NOISE, reactor, UA, WANDER, WIDE
+from studies.robustness.loop import on_plant
+from studies.saddle import controller, FOULING, NOISE, reactor, UA, WANDER, WIDE
 from studies.saddle import truth as true_model
 from studies.unstable import MARGIN, SADDLE_TEMPERATURE
 
@@ -281,7 +282,7 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
         n_y = len(one.measured.names)
         return simulate(
             one, plant, [
-                at(0.0, Initialisation(u0)), at(fouled, becomes(reactor(FOULING))),
+                at(0.0, Initialisation(u0)), at(fouled, on_plant(system=reactor(FOULING))),
                 *(at(sent, SetpointRequest(after_a_second(round(when * NANOSECONDS)),
                                            np.array([value])))
                   for sent, when, value in _requests())],

@@ -14,7 +14,7 @@ from typing import Any
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from studies.faults import interceptor, late, operators, processes, silence
+from studies.faults import interceptor, operators, processes, silence
 from studies.faults.case import FaultCase
 from studies.faults.interceptor import delayed, frozen, lost, noise, Packet, stamped, twice, value
 from studies.faults.operators import altered, changed_for_good, Maker, REQUESTS, scaled
@@ -352,7 +352,8 @@ def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
                    partial(operators.storm_of_setpoints, asked=tuple(asked)), code=code)
     # the outflow below cannot be less than the inflow from above
     yield case('not-held', 'a set-point that no flow can hold together with the other',
-               operators.not_held, code=StatusCode.SETPOINT_NOT_HELD)
+               partial(operators.setpoint_rejected, asked=on.never, says='cannot be held'),
+               code=StatusCode.SETPOINT_NOT_HELD)
     yield case('mode-once', 'manual mode for 20 samples, and back, without a bump', partial(
         operators.mode_once, seconds=20.0 * on.period), bump=_TANK_BUMP)
     yield case('mode-storm', f'{REQUESTS} changes between automatic and manual mode',
@@ -431,7 +432,8 @@ _SADDLE = (
           ('feed-warm', 'T_f +5 K', {'constants.feed_temperature': _FEED + 5.0}),
           ('feed-cold', 'T_f -5 K', {'constants.feed_temperature': _FEED - 5.0}))),
     _on(SADDLE, 'operators', 'setpoint-out-of-reach', 'a set-point of 120 degC',
-        operators.out_of_reach, code=StatusCode.SETPOINT_OUTSIDE),
+        partial(operators.setpoint_rejected, asked={reactor.TEMPERATURE: 120.0},
+                says='request rejected'), code=StatusCode.SETPOINT_OUTSIDE),
     _on(SADDLE, 'operators', 'temperature-limited', 'the temperature may not exceed '
         f'{operators.LIMIT:g} degC, 1 K below the set-point, 240 s', operators.limited),
     _on(SADDLE, 'processes', 'controller-killed', 'the controller is killed and started again',
@@ -524,8 +526,8 @@ _HEATED_LINE = (
     _line('sensor', 'nan', 'temperature: NaN', _shows(math.nan), 50.0,
           code=StatusCode.NOT_FINITE),
     _on(HEATED_LINE, 'sensor', 'quality-bad', 'temperature: of bad quality, 50 s',
-        partial(late.bad_quality, seconds=50.0), code=StatusCode.BAD_QUALITY,
-        controller={'temperature.quality_topic': late.QUALITY}),
+        partial(operators.bad_quality, seconds=50.0), code=StatusCode.BAD_QUALITY,
+        controller={'temperature.quality_topic': operators.QUALITY}),
     _line('sensor', 'feed-nan', 'feed temperature: NaN', _shows(math.nan), 600.0, 'disturbances',
           says=('^controller: .*feed_temperature is nan',)),
     _line('sensor', 'feed-lost', 'feed temperature: no measurement', lost, 600.0, 'disturbances',
@@ -551,16 +553,16 @@ _HEATED_LINE = (
                   partial(processes.plant_again, number=signal.SIGKILL)),
     *(_line_process(f'reloaded-{seconds:g}', f'the model is reloaded with a dead time of '
                     f'{seconds:g} s, while the set-point steps',
-                    partial(late.reloaded, seconds=seconds)) for seconds in (32.0, 58.0)),
+                    partial(processes.reload_later, seconds=seconds)) for seconds in (32.0, 58.0)),
     _line_operator('modes', 'between manual and automatic mode every 15 s, while the set-point '
-                   'steps', late.modes_in_a_step),
+                   'steps', operators.modes_in_a_step),
     _line_operator('mode-storm', f'{REQUESTS} changes between automatic and manual mode',
                    operators.storm_of_modes),
     _line_operator('bad-values-storm', f'{REQUESTS} parameters that cannot be',
                    partial(operators.storm_of_parameters,
                            make=lambda: _cycled(rejected_values(HEATED_LINE)), rejected=True)),
     _line_operator('latched', 'NaN until the safe input is latched, which is cleared then',
-                   partial(late.latched, alteration=_shows(math.nan)(), seconds=200.0),
+                   partial(operators.latched, alteration=_shows(math.nan)(), seconds=200.0),
                    between=True, controller={'safe_latch': True}),
     *(_on(HEATED_LINE, 'disturbances', name, f'{does}, for good, and the set-point steps',
           partial(changed_for_good, parameters=parameters, setpoint=HEATED_LINE.other), **details)

@@ -236,10 +236,10 @@ class FaultHarness:
             node.destroy_subscription(subscription)
         self.trace.setpoints.append((self.now, values))
 
-    def set_parameters(self, node: str, **values: Any) -> list[str]:
-        """Set parameters one by one; return why they were rejected, if any was."""
-        return [result.reason for result in self.ros.set_parameters(node, **values)
-                if not result.successful]
+    def set_parameters(self, node: str, **values: Any) -> None:
+        """Set parameters, none of which may be rejected."""
+        reasons = self.ros.rejected_parameters(node, **values)
+        self.expect(not reasons, f'{node}: rejected: {reasons}')
 
     @property
     def now(self) -> float:

@@ -13,8 +13,8 @@ from studies.general.study import EXPERIMENTS
 def main(args: list[str] | None = None) -> int:
     """Run the study and write the report."""
     options = read_options(
-        args, 'general', 'Apply the law on models of several classes to plants that it was not '
-        'made for.', 'out/studies-general', 10, 'joblib', EXPERIMENTS)
+        args, 'studies.general', 'Apply the law on models of several classes to plants that it '
+        'was not made for.', 'out/studies-general', 10, 'joblib', EXPERIMENTS)
     names = options.plants or list(EXPERIMENTS)
     return conclude(
         options.seeds, options.output, lambda: run_campaign(

@@ -18,8 +18,8 @@ from studies.robustness.study import study
 def main(args: list[str] | None = None) -> int:
     """Run the study and write the report."""
     options = read_options(
-        args, 'robustness', 'Compute margins, region of attraction, disturbances, noise and the '
-        'fallback of narrow data.', 'out/studies-robustness', scheduler='')
+        args, 'studies.robustness', 'Compute margins, region of attraction, disturbances, noise '
+        'and the fallback of narrow data.', 'out/studies-robustness', scheduler='')
     output: Path = options.output
     start = time.monotonic()
     with backend_of(options.scheduler) as backend:

@@ -52,7 +52,6 @@ class Margins:
     gain: float  #: factor of the gain
     phase: float  #: in degrees
     delay: float  #: additional dead time, in s
-    distance: float  #: smallest distance of the Nyquist curve from -1
 
 
 def linearised_reactor(temperature: float) -> control.StateSpace:
@@ -119,7 +118,7 @@ def margins_at(controller: Controller, temperature: float) -> Margins:
               for phase, frequency in zip(phases, crossings, strict=True)]
     return Margins(
         min(rising, default=math.inf), min(map(abs, phases), default=math.inf),
-        min(delays, default=math.inf), float(np.min(np.abs(1.0 + response))))
+        min(delays, default=math.inf))
 
 
 class End(Enum):

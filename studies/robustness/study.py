@@ -79,8 +79,7 @@ def study(backend: Backend | None = None) -> Found:
     figures = {
         'margins': {
             f'coolant_weight={weight:g}/bandwidth={bandwidth:g}/{kelvin:g}K': {
-                'gain': m.gain, 'phase_degrees': m.phase,
-                'delay_seconds': m.delay, 'distance': m.distance}
+                'gain': m.gain, 'phase_degrees': m.phase, 'delay_seconds': m.delay}
             for (weight, bandwidth, kelvin), m in margins.items()},
         'disturbances': disturbed,
         'wrong_dead_time': {
