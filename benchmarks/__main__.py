@@ -15,8 +15,8 @@ from studies.campaign import read_options
 
 PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')
 MEANING = {
-    'plan': 'by plant: figures in microseconds of each side with 30 intervals, targets given, and '
-            'the agreement of their commands',
+    'plan': 'by plant: processor times in microseconds of each side with 30 intervals, targets '
+            'given, and the agreement of their commands',
     'pending_us': f'median processor time of the control step of {pending.PLANT} with 0 and with '
                   f'{pending.PENDING} commands on their way, in turns, by law',
 }

@@ -23,13 +23,11 @@ from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import table, write_figures
 from koopman_ros.core.units import SECONDS_PER_MINUTE
-from koopman_ros.evaluation import at, Simulation
+from koopman_ros.evaluation import at
 from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory, Task
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.plants import (
-    Actuator,
-    ControlAffineSystem,
     equilibrium_input,
     random_steps,
     RandomStepDesign,
@@ -47,10 +45,10 @@ from studies.robustness.loop import (
     COOLANT_RANGE,
     errors,
     on_plant,
+    overshoot,
     PERIOD,
     REACTOR,
-    reactor_controller,
-    run_loop,
+    run_late,
     START,
 )
 from studies.shipped_models import FEED, reactor_with_feed
@@ -94,15 +92,6 @@ def task(folder: Path) -> TrainingTask:
         disturbances=INPUTS[1:], model_class='polynomial')
 
 
-def _run(model: LiftedModel, dead_time: float, system: ControlAffineSystem, seconds: float,
-         *events: Any, **others: Any) -> Simulation:
-    """Run the loop by the default parameters, from rest."""
-    return run_loop(
-        reactor_controller(model=model, bandwidth=None), system, np.array([START]),
-        float(equilibrium_input(system, [START])[0]), seconds, events,
-        actuator=Actuator(dead_time=dead_time), **others)
-
-
 def _task(x: Array, samples: int) -> Task:
     return Task(REACTOR, x, np.array([SETPOINT]), equilibrium_input(REACTOR, [SETPOINT]),
                 np.ones(1), np.ones(1), PERIOD / SECONDS_PER_MINUTE, samples)
@@ -122,14 +111,14 @@ def least_cost() -> float:
 def late_step(model: LiftedModel, dead_time: float) -> dict[str, float]:
     """Step the set-point by -10 K: overshoot, and cost before and after the first effect."""
     step = at(LEAD, at_setpoint(SETPOINT))
-    course = _run(model, dead_time, REACTOR, LEAD + SETTLED + 3.0 * dead_time, step)
+    course = run_late(model, dead_time, REACTOR, LEAD + SETTLED + 3.0 * dead_time, step)
     late = round(dead_time / PERIOD)
     acting = np.vstack((np.tile(course.commands[:1], (late, 1)), course.commands))
     # the last sample before an effect of the step is at rest
     first = round(LEAD / PERIOD) - 1 + late
     moving = _task(course.states[first], len(course.states) - first)
     rest = cost_along(moving, course.states[:1], course.commands[:1])
-    return {'overshoot_kelvin': max(0.0, float(np.max(-errors(course, SETPOINT, LEAD)))),
+    return {'overshoot_kelvin': overshoot(course, SETPOINT, LEAD),
             'cost': cost_along(moving, course.states[first:],
                                acting[first:len(course.states)]),
             'cost_at_rest': late * rest}
@@ -137,21 +126,20 @@ def late_step(model: LiftedModel, dead_time: float) -> dict[str, float]:
 
 def fouled(model: LiftedModel, dead_time: float) -> dict[str, float]:
     """Step the set-point while UA is a fifth smaller: the largest overshoot, and the end."""
-    course = _run(model, dead_time, CHANGED['UA −20 %'], 300.0 + 25.0 * dead_time,
-                  at(LEAD, at_setpoint(SETPOINT)), period=FOULED_PERIOD)
-    away = errors(course, SETPOINT, LEAD)
-    return {'fouled_overshoot_kelvin': max(0.0, float(np.max(-away))),
+    course = run_late(model, dead_time, CHANGED['UA −20 %'], 300.0 + 25.0 * dead_time,
+                      at(LEAD, at_setpoint(SETPOINT)), period=FOULED_PERIOD)
+    return {'fouled_overshoot_kelvin': overshoot(course, SETPOINT, LEAD),
             'fouled_final_kelvin': math.inf if course.failure else float(
-                np.max(np.abs(away[-30:])))}
+                np.max(np.abs(errors(course, SETPOINT)[-30:])))}
 
 
 def warmer_feed(model: LiftedModel, dead_time: float, *, measured: bool) -> float:
     """Return the largest deviation in K after a step of the feed."""
-    plant = REACTOR, CHANGED['T_i +5 K']
     feed = ReactorParameters().feed_temperature
-    course = _run(model, dead_time, plant[0], LEAD + 100.0 + 2.0 * dead_time,
-                  at(LEAD, on_plant(system=plant[1])), disturbances=lambda seconds: (
-                      np.array([feed + FEED_STEP * (seconds >= LEAD)]) if measured else None))
+    course = run_late(
+        model, dead_time, REACTOR, LEAD + 100.0 + 2.0 * dead_time,
+        at(LEAD, on_plant(system=CHANGED['T_i +5 K'])), disturbances=lambda seconds: (
+            np.array([feed + FEED_STEP * (seconds >= LEAD)]) if measured else None))
     return float(np.max(np.abs(errors(course, START))))
 
 

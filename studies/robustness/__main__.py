@@ -23,11 +23,11 @@ def main(args: list[str] | None = None) -> int:
     output: Path = options.output
     start = time.monotonic()
     with backend_of(options.scheduler) as backend:
-        found = study(backend)
+        figures, courses = study(backend)
     seconds = round(time.monotonic() - start, 1)
     write_figures(output / 'summary.json', {
-        'package_version': __version__, 'wall_seconds': seconds, **found.figures})
-    write_report(found, output)
+        'package_version': __version__, 'wall_seconds': seconds, **figures})
+    write_report(figures, courses, output)
     print(f'wrote {output}/report.md, summary.json and figures in {seconds:.0f} s')
     return 0
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.evaluation import at, perfect, ScheduledChange, Sensor, Simulation
-from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input
+from koopman_ros.plants import Actuator, ControlAffineSystem
 from studies.campaign import Metrics
 from studies.robustness import loop
 from studies.robustness.loop import at_setpoint, changed_reactor, on_plant, REACTOR, START
@@ -51,11 +51,9 @@ class Disturbed:
 
     def run(self, bandwidth: float = loop.BANDWIDTH) -> Simulation:
         """Simulate it with the default controller, from rest."""
-        coolant = float(equilibrium_input(self.system, self.x0)[0])
         return loop.run_loop(
-            loop.reactor_controller(bandwidth=bandwidth), self.system, np.array(self.x0), coolant,
-            self.seconds, self.changes, actuator=self.actuator, tells=self.tells,
-            sensor=self.sensor)
+            loop.reactor_controller(bandwidth=bandwidth), self.system, self.seconds, self.changes,
+            x0=self.x0, actuator=self.actuator, tells=self.tells, sensor=self.sensor)
 
 
 def _step(words: str, *changes: ScheduledChange, **details: Any) -> Disturbed:
@@ -100,14 +98,10 @@ def judge(case: Disturbed) -> Metrics:
 def late(known: float, share: float, system: ControlAffineSystem) -> Metrics:
     """Step by -10 K with a coolant that is `share` times as late as is known, in s."""
     model = replace(loop.shipped_model(), dead_time=np.array([known]))
-    course = loop.run_loop(
-        loop.reactor_controller(model=model, bandwidth=None), system, np.array([START]),
-        float(equilibrium_input(system, [START])[0]), SECONDS, [at(LEAD, at_setpoint(SETPOINT))],
-        actuator=Actuator(dead_time=share * known))
-    away = loop.errors(course, SETPOINT, LEAD)
-    return {'largest_kelvin': max(0.0, float(np.max(-away))),
+    course = loop.run_late(model, share * known, system, SECONDS, at(LEAD, at_setpoint(SETPOINT)))
+    return {'largest_kelvin': loop.overshoot(course, SETPOINT, LEAD),
             'seconds_to_0.2_kelvin': loop.settling(course, SETPOINT, 0.2, LEAD),
-            'final_kelvin': float(np.max(np.abs(away[-60:])))}
+            'final_kelvin': float(np.max(np.abs(loop.errors(course, SETPOINT)[-60:])))}
 
 
 def noise_against_speed(bandwidth: float) -> Metrics:
@@ -118,8 +112,8 @@ def noise_against_speed(bandwidth: float) -> Metrics:
         second to the next; times after UA -20 % (`fouled`), None for never.
     """
     noisy = loop.run_loop(
-        loop.reactor_controller(bandwidth=bandwidth), REACTOR, np.array([START]), loop.COOLANT,
-        2400.0, [at(0.0, at_setpoint(START))], noise=NOISE)
+        loop.reactor_controller(bandwidth=bandwidth), REACTOR, 2400.0,
+        [at(0.0, at_setpoint(START))], noise=NOISE)
     settled = noisy.times >= 600.0
     coolant = noisy.commands[settled, 0]
     metrics: Metrics = {

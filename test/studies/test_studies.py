@@ -287,8 +287,8 @@ def grows(controller: Controller, temperature: float, delay: float) -> bool:
     """Simulate for 450 s whether a deviation grows when the coolant is late by some s."""
     held = float(equilibrium_input(REACTOR, [temperature])[0])
     course = loop.run_loop(
-        controller, REACTOR, np.array([temperature + 1e-4]), held, 450.0,
-        [at(0.0, loop.at_setpoint(temperature))], actuator=Actuator(delay=delay))
+        controller, REACTOR, 450.0, [at(0.0, loop.at_setpoint(temperature))],
+        x0=[temperature + 1e-4], coolant=held, actuator=Actuator(delay=delay))
     # the swing at the end
     late = loop.errors(course, temperature)[-len(course.times) // 3:]
     return bool(np.ptp(late) > 2e-4)
@@ -296,7 +296,7 @@ def grows(controller: Controller, temperature: float, delay: float) -> bool:
 
 def test_the_simulated_loop_oscillates_beyond_its_delay_margin() -> None:
     controller = loop.reactor_controller(bandwidth=10.0, coolant_weight=0.1)
-    margin = stability.margins_at(controller, 316.0).delay
+    margin = stability.margins_at(controller, 316.0).delay_seconds
     assert margin == pytest.approx(8.92, abs=0.05)
     assert not grows(controller, 316.0, 0.95 * margin)
     assert grows(controller, 316.0, 1.05 * margin)
