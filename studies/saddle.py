@@ -91,6 +91,12 @@ def reactor(constants: dict[str, float]) -> ControlAffineSystem:
     return two_state_reactor(ReactorParameters(**constants), nominal_state=SADDLE)
 
 
+def cost(T: Array, u: Array, value: float, system: ControlAffineSystem, period: float) -> float:
+    """Return the integral of (T - T_ref)^2 + (T_c - T_c,ref)^2 in K^2 min, sampled by s."""
+    u_ref = steady_state(system, {'temperature': value})[1][0]
+    return float(np.sum((T - value) ** 2 + (u - u_ref) ** 2)) * period / 60.0
+
+
 def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
     """Take the temperature along its course, and let the jacket foul."""
     x0, u0 = steady(COURSE[0.0])
@@ -104,9 +110,7 @@ def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
     for begin, end in itertools.pairwise([*COURSE, FOULED, END]):
         part, after = (t >= begin) & (t < end), begin == FOULED
         value = COURSE.get(begin, COURSE[max(COURSE)])
-        u_ref = steady_state(fouled if after else SYSTEM, {'temperature': value})[1][0]
-        costs[after] += float(np.sum((T[part] - value) ** 2 + (u[part] - u_ref) ** 2)) * (
-            period / 60.0)
+        costs[after] += cost(T[part], u[part], value, fouled if after else SYSTEM, period)
         if begin:
             # what is left after two thirds of the time
             late = part & (t >= end - (end - begin) / 3.0)
