@@ -28,7 +28,7 @@ class Learned:
 
 
 def learned(learn: Learner, plant: PlantDescription, samples: DriftSamples, seed: int) -> Learned:
-    """Learn a model; one that is rejected is learned again, to see what the rejection is worth."""
+    """Learn a model; one that is rejected is learned again, to judge the rejection."""
     begin, rejected = time.process_time(), ''
     try:
         model = learn(plant, samples, seed, True)
