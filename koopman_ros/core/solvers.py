@@ -82,8 +82,6 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     :param max_gain: largest spectral norm of K taken as solved.
     """
     try:
-        if not Q.any():
-            raise np.linalg.LinAlgError('no state is weighted')
         # values so large that something overflows end in a residual or a gain that is rejected
         with np.errstate(all='ignore'):
             P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
@@ -106,8 +104,9 @@ def _continuous(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array, f
     """Return P, K and the residual, by A. J. Laub, IEEE Trans. Automat. Contr. 24 (1979)."""
     R_inverse_Bt = _solved(R, B.T)
     G = B @ R_inverse_Bt
-    scale = _scale(Q, G)
-    P = scale * _stable_graph(_hamiltonian(A, scale * G, Q / scale))
+    H = np.block([[A, -G], [-Q, -A.T]])
+    scale = _balanced(H)
+    P = scale * _stable_graph(H)
     PA, PGP = P @ A, P @ G @ P
     # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
     size = _size(Q) + 2.0 * _size(PA) + _size(PGP)
@@ -125,12 +124,12 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n = len(A)
     D, W = over_interval(A, B, Q, R, interval)
-    # input and weight without the cross term
-    both = np.concatenate((D[:n, n:], W[:n, n:])).T
-    by_R = both.T.dot(_solved(W[n:, n:], both))
-    rest, G, Q_rest = D[:n, :n] - by_R[:n, n:], by_R[:n, :n], W[:n, :n] - by_R[n:, n:]
-    scale = _scale(Q_rest, G)
-    less = _hamiltonian(rest, scale * G, Q_rest / scale)
+    less = np.zeros((2 * n, 2 * n))
+    less[:n, :n], less[n:, :n], less[n:, n:] = D[:n, :n], -W[:n, :n], -D[:n, :n].T
+    # without the cross term of input and state
+    less -= np.concatenate((D[:n, n:], -W[:n, n:])).dot(
+        _solved(W[n:, n:], np.concatenate((W[:n, n:], D[:n, n:])).T))
+    scale = _balanced(less)
     more = less.copy()
     more[:, n:] *= -1.0
     more.flat[::2 * n + 1] += 2.0
@@ -218,17 +217,15 @@ def _solved(M: Array, right: Array) -> Array:
     return np.asarray(found, dtype=np.float64)
 
 
-def _scale(Q: Array, G: Array) -> float:
-    """Return by how much to divide P for order one, so that no block dominates the Hamiltonian."""
-    size_Q, size_G = _size(Q), _size(G)
-    return math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
-
-
-def _hamiltonian(A: Array, G: Array, Q: Array) -> Array:
-    n = len(A)
-    H = np.empty((2 * n, 2 * n))
-    H[:n, :n], H[:n, n:], H[n:, :n], H[n:, n:] = A, -G, -Q, -A.T
-    return H
+def _balanced(H: Array) -> float:
+    """Divide P for order one in place, so that no block of a Hamiltonian dominates; return by it."""
+    n = len(H) // 2
+    G, Q = H[:n, n:], H[n:, :n]
+    size_G, size_Q = _size(G), _size(Q)
+    scale = math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
+    G *= scale
+    Q /= scale
+    return scale
 
 
 def _stable_graph(H: Array, least: float = 0.0) -> Array:
