@@ -218,7 +218,7 @@ def _solved(M: Array, right: Array) -> Array:
 
 
 def _balanced(H: Array) -> float:
-    """Divide P for order one in place, so that no block of a Hamiltonian dominates; return by it."""
+    """Divide P for order one, in place, so that no block dominates; return the divisor."""
     n = len(H) // 2
     G, Q = H[:n, n:], H[n:, :n]
     size_G, size_Q = _size(G), _size(Q)

@@ -6,6 +6,7 @@
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
+import math
 from typing import Any, ClassVar, TypedDict, Unpack
 
 import numpy as np
@@ -227,12 +228,13 @@ def _result(model: LiftedModel, found: Feedback, interval: float, u: Array | Non
             growth: float | None = None) -> LawResult:
     """Return the input of a feedback, or (n_u,) of its gain, unless it must not be used."""
     riccati = found.riccati
-    info = SolutionInfo(found.form.value, riccati.residual, riccati.gain)
     if not found.solved:
-        return LawResult(None, reason(StatusCode(riccati.status.value)), info)
-    if growth is None:
+        growth = math.nan
+    elif growth is None:
         growth = found.growth(interval / model.seconds_per_time_unit)
     info = SolutionInfo(found.form.value, riccati.residual, riccati.gain, growth)
+    if not found.solved:
+        return LawResult(None, reason(StatusCode(riccati.status.value)), info)
     if not growth < 1.0:
         return LawResult(None, reason(StatusCode.PREDICTED_UNSTABLE, interval=interval), info)
     return LawResult(model.inputs.to_physical(found.u if u is None else u), info=info)
