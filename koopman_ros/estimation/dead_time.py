@@ -9,6 +9,7 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,8 +68,7 @@ class AppliedInputs:
                 for begin, end in itertools.pairwise(sorted(edges))]
 
 
-@dataclass(frozen=True, slots=True)
-class PendingInputs:
+class PendingInputs(NamedTuple):
     """The inputs that were applied before a time, of which some act after it."""
 
     applied: AppliedInputs

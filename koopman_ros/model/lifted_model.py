@@ -531,12 +531,8 @@ class LiftedModel:
         if self._weights is not None:
             return self.observables.features.lift(x) @ self._weights.T
         z, J = self.observables.lift_and_jacobian(x)
-        f = (self.onto_states(J) @ z.dot(self._A_t)[..., None])[..., 0]
+        f = (self.onto_states(J) @ z.dot(self.A.T)[..., None])[..., 0]
         return f if self.pre_feedback is None else f - self.pre_feedback_rate(x)
-
-    @cached_property
-    def _A_t(self) -> Array:
-        return np.ascontiguousarray(self.A.T)
 
     @cached_property
     def pre_feedback_slope(self) -> Array:

@@ -140,34 +140,28 @@ class NetworkObservables(Observables):
 
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
         """Evaluate the secants, by divided differences of tanh and of its slope."""
-        a, a_ref = arguments = np.array((x, x_ref)).dot(self._W_t) + self.b
+        a, a_ref = arguments = np.array((x, x_ref)).dot(self.W.T) + self.b
         h, h_ref = np.tanh(arguments)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
-        apart = a - a_ref + np.copysign(1e-300, a - a_ref)
+        apart = a - a_ref
+        apart += np.copysign(1e-300, apart)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
-        J, M, H = self._bent(np.array((
+        found = self._bent(np.array((
             1.0 - h * h, secant, -(h + h_ref) * secant * self.W.dot(w))))
-        return J + self._of_states, M + self._of_states, H
+        found[:2] += self._of_states
+        J, M, H = found
+        return J, M, H
 
     def _hidden(self, x: Array) -> Array:
-        return np.tanh(x.dot(self._W_t) + self.b)
+        return np.tanh(x.dot(self.W.T) + self.b)
 
     def _lifted(self, x: Array, h: Array) -> Array:
-        free: Array = (h - self.value_at_zero).dot(self._V_t)
+        free: Array = (h - self.value_at_zero).dot(self.V.T)
         return np.concatenate((x, free), axis=-1) if self.identity else free
 
     def _bent(self, slope: Array) -> Array:
         """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""
         return slope.dot(self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
-
-    @cached_property
-    def _W_t(self) -> Array:
-        # contiguous, and dot in place of @: half the time of a product so small
-        return np.ascontiguousarray(self.W.T)
-
-    @cached_property
-    def _V_t(self) -> Array:
-        return np.ascontiguousarray(self.V.T)
 
     @cached_property
     def _of_states(self) -> Array:
