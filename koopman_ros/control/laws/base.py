@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +40,8 @@ class Target:
             (until - seconds, target) for until, target in self.later if until > seconds))
 
 
-def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None,
+                        drift: Array | None = None) -> Target:
     """
     Solve f(x_ref) + B(x_ref) u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
@@ -49,8 +50,10 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
     :param x_ref: (n_x,) scaled deviation.
     :param w: (n_x,) disturbance of the state's rate, none by default.
+    :param drift: f(x_ref) (n_x,), where it is known.
     """
-    w, drift = np.zeros(model.n_x) if w is None else w, model.drift(x_ref)
+    w = np.zeros(model.n_x) if w is None else w
+    drift = model.drift(x_ref) if drift is None else drift
     u = -model.input_inverse(x_ref).dot(drift + w)
     forcing = model.forcing(x_ref, u) + w
     return Target(x_ref, u, forcing, math.hypot(*(drift + forcing).tolist()))
@@ -114,8 +117,7 @@ class Weights:
         return cls(Q, R)
 
 
-@dataclass(frozen=True, slots=True)
-class SolutionInfo:
+class SolutionInfo(NamedTuple):
     """Figures of a law's solution; NaN and '' for those that it does not have."""
 
     form: str = ''  #: which form of the law was used, for the operator
