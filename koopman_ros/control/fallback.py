@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 import itertools
 import math
 from types import NoneType
@@ -96,11 +96,6 @@ class FallbackLevel:
         """Return the part (n_c,) of a state (n_x,) that has a set-point."""
         return x[self._indices]
 
-    @cached_property
-    def _drift_at(self) -> Callable[[tuple[float, ...]], Array]:
-        # a set-point, and those that a law looks ahead to, stay for many samples
-        return lru_cache(maxsize=32)(lambda goal: self.model.drift(np.array(goal)))
-
     def target(self, setpoint: Array, w: Array, start: Array | None) -> Target | None:
         """
         Find the steady state of a set-point (n_c,), in state units, under a disturbance (n_x,).
@@ -116,7 +111,7 @@ class FallbackLevel:
             x[self._indices] = goal
             return Target(x, np.zeros(model.n_u), np.zeros(n), 0.0)
         if self.controls_all:
-            return steady_state_target(model, goal, w, self._drift_at(tuple(goal.tolist())))
+            return steady_state_target(model, goal, w)
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(
             (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
         return partial_target(
