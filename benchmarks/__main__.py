@@ -3,21 +3,20 @@
 
 """Computing time of the law `mpc`, of do-mpc and of casadi's SQP: ``python -m benchmarks``."""
 
-import argparse
 from collections.abc import Iterator
 import os
-from pathlib import Path
 import shutil
 import sys
 from typing import Any
 
 from benchmarks import pending, planning
 from koopman_ros.core.plots import machine, table, write_figures
+from studies.campaign import read_options
 
 PACKAGES = ('numpy', 'scipy', 'daqp', 'casadi', 'do-mpc')
 MEANING = {
-    'plan': 'by plant: figures in microseconds of each side with 30 intervals, targets given, and '
-            'the agreement of their commands',
+    'plan': 'by plant: processor times in microseconds of each side with 30 intervals, targets '
+            'given, and the agreement of their commands',
     'pending_us': f'median processor time of the control step of {pending.PLANT} with 0 and with '
                   f'{pending.PENDING} commands on their way, in turns, by law',
 }
@@ -28,14 +27,9 @@ SAMPLES, QUICK_SAMPLES = 800, 80  # timed plans with each lift
 
 def main(args: list[str] | None = None) -> int:
     """Measure plans and steps, print tables and write ``summary.json``."""
-    parser = argparse.ArgumentParser(
-        prog='python -m benchmarks',
-        description='Compare the time of a plan with other programs.')
-    parser.add_argument('--quick', action='store_true',
-                        help='fewer plans, and no compiled SQP: a minute')
-    parser.add_argument('--output', type=Path, default=Path('out/bench'),
-                        help='folder of summary.json (default: %(default)s)')
-    given = parser.parse_args(args)
+    given = read_options(
+        args, 'benchmarks', 'Compare the time of a plan with other programs.', 'out/bench',
+        flags={'quick': 'fewer plans, and no compiled SQP: a minute'})
     path = given.output / 'summary.json'
     figures: dict[str, Any] = {'machine': machine(*PACKAGES), 'meaning': MEANING}
     try:

@@ -6,7 +6,7 @@
 from collections.abc import Callable
 from pathlib import Path
 import tempfile
-from time import perf_counter_ns, thread_time_ns
+from time import thread_time_ns
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -49,8 +49,8 @@ def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
     Time all sides on one course, block by block in turns, once they are seen to agree.
 
     :param compiler: command of a C compiler for the others, or None.
-    :return: by side its figures in microseconds; `agreement`, the largest distance of its commands
-        from the law's as a share of the input's range.
+    :return: by side its processor times in microseconds; `agreement`, the largest distance of its
+        commands from the law's as a share of the input's range.
     :raises ValueError: where the sides do not solve one problem.
     """
     case = CASES[plant]
@@ -71,29 +71,24 @@ def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
                              f'{apart[side]:.2g} of the range, at most {most:g} is explained: '
                              'the sides do not solve one problem')
     state = State()
-    taken: dict[str, list[tuple[int, int]]] = {side: [] for side in ('step', *again)}
+    taken: dict[str, list[int]] = {side: [] for side in ('step', *again)}
     for block in range(0, samples, _BLOCK):
-        numbers = range(block, min(block + _BLOCK, samples))
-        for k in numbers:
-            if k in requested:
-                state, _ = controller.request_setpoint(state, requested[k])
-            used, start = thread_time_ns(), perf_counter_ns()
-            state, _, _ = controller.step(
-                state, calls[k][0], after_a_second(round(k * case.period * NANOSECONDS)))
-            taken['step'].append((perf_counter_ns() - start, thread_time_ns() - used))
-        for side, answer in again.items():
-            for k in numbers:
-                used, start = thread_time_ns(), perf_counter_ns()
-                answer(*calls[k])
-                taken[side].append((perf_counter_ns() - start, thread_time_ns() - used))
-    found: dict[str, Any] = {'steps': samples, 'states': case.system.n_x,
-                             'compiled': compiler is not None, 'agreement': apart}
-    for side, pairs in taken.items():
-        wall, cpu = 1e-3 * np.array(pairs[_UNTIMED:]).T
-        for clock, values in (('', wall), ('cpu_', cpu)):
-            for label, percent in (('median', 50), ('p99', 99)):
-                found[f'{side}_{clock}{label}_us'] = float(np.percentile(values, percent))
-    return found
+        for side, times in taken.items():
+            for k in range(block, min(block + _BLOCK, samples)):
+                if side == 'step' and k in requested:
+                    state, _ = controller.request_setpoint(state, requested[k])
+                start = thread_time_ns()
+                if side == 'step':
+                    state, _, _ = controller.step(
+                        state, calls[k][0], after_a_second(round(k * case.period * NANOSECONDS)))
+                else:
+                    again[side](*calls[k])
+                times.append(thread_time_ns() - start)
+    return {'steps': samples, 'states': case.system.n_x, 'compiled': compiler is not None,
+            'agreement': apart, **{
+                f'{side}_cpu_{label}_us': 1e-3 * float(np.percentile(times[_UNTIMED:], percent))
+                for side, times in taken.items()
+                for label, percent in (('median', 50), ('p99', 99))}}
 
 
 def _controller(case: PartialCase) -> Controller:

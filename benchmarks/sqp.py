@@ -15,7 +15,7 @@ import casadi
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from studies.equations import Rates
+from studies.equations import Rates, with_cost
 
 # Its own solver of quadratic programs can be generated as C together with the rest.
 _OPTIONS: dict[str, Any] = {
@@ -97,21 +97,12 @@ def _program(problem: SqpProblem) -> dict[str, Any]:
     n, n_u = len(unit), len(unit_u)
     given = casadi.SX.sym('given', 2 * n + n_u)
     x_now, x_ref, u_ref = given[:n], given[n:2 * n], given[2 * n:]
-
-    def rate(y: Any, u: Any) -> Any:
-        e, v = y[:n] - x_ref, u - u_ref
-        return casadi.vertcat(problem.rates(y[:n], u), casadi.dot(problem.Q * e, e)
-                              + casadi.dot(problem.R * v, v))
-
+    step = with_cost(problem.rates, problem.Q, problem.R, (x_ref, u_ref))
     nodes = casadi.SX.sym('x', n, len(problem.lengths) + 1)
     inputs = casadi.SX.sym('u', n_u, len(problem.lengths))
     cost, rest, variables = 0.0, [(unit * nodes[:, 0] - x_now) / unit], []
     for k, h in enumerate(problem.lengths.tolist()):
-        u, y = unit_u * inputs[:, k], casadi.vertcat(unit * nodes[:, k], 0.0)
-        k1 = rate(y, u)
-        k2 = rate(y + 0.5 * h * k1, u)
-        k3 = rate(y + 0.5 * h * k2, u)
-        y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(y + h * k3, u))
+        y = step(casadi.vertcat(unit * nodes[:, k], 0.0), unit_u * inputs[:, k], h)
         cost += y[n]
         rest.append(y[:n] / unit - nodes[:, k + 1])
         variables += [nodes[:, k], inputs[:, k]]

@@ -34,7 +34,7 @@ def read_options(args: list[str] | None, module: str, description: str, output: 
                  flags: Mapping[str, str] | None = None, records: str = ''
                  ) -> argparse.Namespace:
     """
-    Read the options of a study.
+    Read the options of a study or benchmark.
 
     :param output: default folder of the report; '' for no such option.
     :param seeds: default number of seeds, 0 for no such option.
@@ -43,7 +43,7 @@ def read_options(args: list[str] | None, module: str, description: str, output: 
     :param flags: further switches, with their help.
     :param records: default folder of measured records; '' for no such option.
     """
-    parser = argparse.ArgumentParser(prog=f'python -m studies.{module}', description=description)
+    parser = argparse.ArgumentParser(prog=f'python -m {module}', description=description)
     if plants:
         parser.add_argument('plants', nargs='*', metavar='plant',
                             help=f'which: {", ".join(plants)} (default: all)')
@@ -52,7 +52,7 @@ def read_options(args: list[str] | None, module: str, description: str, output: 
                             help='number of seeds, at least 1 (default: %(default)s)')
     if output:
         parser.add_argument('--output', type=Path, default=Path(output),
-                            help='folder for figures and report (default: %(default)s)')
+                            help='folder for the results (default: %(default)s)')
     if scheduler is not None:
         parser.add_argument(
             '--scheduler', default=scheduler, metavar='PLACE', help='place of the runs: joblib '

@@ -8,6 +8,8 @@ from typing import Any, TypeAlias
 
 import casadi
 
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.plants.library.pendulum import Pendulum
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from koopman_ros.plants.library.reactor import FedReactor, ReactorParameters, TwoStateReactor
@@ -51,6 +53,30 @@ def two_state(x: Any, u: Any) -> Any:
     return _reactor(p, x, p.flow_rate, u[0])
 
 
+def reactor(x: Any, u: Any) -> Any:
+    """Return the rate of the temperature of the one-state reactor, per minute."""
+    p = ReactorParameters()
+    return _reactor(p, casadi.vertcat(p.concentration, x), p.flow_rate, u[0])[1]
+
+
+def with_cost(rates: Rates, Q: Array, R: Array, goal: tuple[Any, Any]
+              ) -> Callable[[Any, Any, float], Any]:
+    """
+    Return a Runge-Kutta step of a state and its cost so far (n_x + 1,), by input and length.
+
+    :param Q: (n_x,) weights of squared distances from the state of the goal.
+    :param R: (n_u,) the same of its input.
+    """
+    def step(y: Any, u: Any, length: float) -> Any:
+        def rate(y: Any) -> Any:
+            e, v = y[:-1] - goal[0], u - goal[1]
+            return casadi.vertcat(rates(y[:-1], u), casadi.dot(Q * e, e) + casadi.dot(R * v, v))
+
+        return runge_kutta_step(rate, y, length)
+
+    return step
+
+
 def _reactor(p: ReactorParameters, x: Any, flow: Any, coolant: Any) -> Any:
     reaction = p.pre_exponential_factor * casadi.exp(-p.activation_temperature / x[1]) * x[0]
     fed = flow / p.volume
@@ -62,4 +88,4 @@ def _reactor(p: ReactorParameters, x: Any, flow: Any, coolant: Any) -> Any:
 
 EQUATIONS: dict[str, Rates] = {
     'fed_reactor': fed_reactor, 'pendulum': pendulum, 'quadruple_tank': quadruple_tank,
-    'two_state': two_state}
+    'reactor': reactor, 'two_state': two_state}

@@ -210,6 +210,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.output.mkdir(parents=True, exist_ok=True)
         (options.output / 'exported_loops.json').write_text(json.dumps(summary, indent=1) + '\n')
     return int(any(one['differs'] for one in summary['loops'].values()))
+
+
 def random_loop(seed: int) -> Controller:
     """Return the loop of a number, with a time constant of about 20 s."""
     rng = np.random.default_rng(seed)

@@ -15,7 +15,6 @@ from pathlib import Path
 import sys
 from typing import Any
 
-import casadi
 import numpy as np
 
 from koopman_ros import __version__
@@ -24,13 +23,11 @@ from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import table, write_figures
 from koopman_ros.core.units import SECONDS_PER_MINUTE
-from koopman_ros.evaluation import at, Simulation
+from koopman_ros.evaluation import at
 from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory, Task
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.plants import (
-    Actuator,
-    ControlAffineSystem,
     equilibrium_input,
     random_steps,
     RandomStepDesign,
@@ -39,6 +36,7 @@ from koopman_ros.plants import (
 from koopman_ros.records import read, Record, RecordedInput, RecordedState
 from studies import report
 from studies.campaign import Metrics, over, read_options
+from studies.equations import EQUATIONS
 from studies.least import least_course
 from studies.robustness.disturbances import CHANGED, LEAD, SETPOINT
 from studies.robustness.loop import (
@@ -47,10 +45,10 @@ from studies.robustness.loop import (
     COOLANT_RANGE,
     errors,
     on_plant,
+    overshoot,
     PERIOD,
     REACTOR,
-    reactor_controller,
-    run_loop,
+    run_late,
     START,
 )
 from studies.shipped_models import FEED, reactor_with_feed
@@ -94,15 +92,6 @@ def task(folder: Path) -> TrainingTask:
         disturbances=INPUTS[1:], model_class='polynomial')
 
 
-def _run(model: LiftedModel, dead_time: float, system: ControlAffineSystem, seconds: float,
-         *events: Any, **others: Any) -> Simulation:
-    """Run the loop by the default parameters, from rest."""
-    return run_loop(
-        reactor_controller(model=model, bandwidth=None), system, np.array([START]),
-        float(equilibrium_input(system, [START])[0]), seconds, events,
-        actuator=Actuator(dead_time=dead_time), **others)
-
-
 def _task(x: Array, samples: int) -> Task:
     return Task(REACTOR, x, np.array([SETPOINT]), equilibrium_input(REACTOR, [SETPOINT]),
                 np.ones(1), np.ones(1), PERIOD / SECONDS_PER_MINUTE, samples)
@@ -110,34 +99,26 @@ def _task(x: Array, samples: int) -> Task:
 
 def least_cost() -> float:
     """Return the least cost in K^2 min of the step without dead time, from a sample before it."""
-    p = ReactorParameters()
-
-    def rates(x: casadi.SX, u: casadi.SX) -> casadi.SX:
-        reaction = p.concentration * p.pre_exponential_factor * casadi.exp(
-            -p.activation_temperature / x)
-        return (p.flow_rate / p.volume * (p.feed_temperature - x)
-                + p.heating_per_conversion * reaction + p.cooling_rate * (u - x))
-
     goal = _task(np.array([START]), round(OPTIMAL / PERIOD))
     share = np.linspace(0.0, 1.0, goal.samples + 1)[:, None]
     guess = OptimalTrajectory(
         START + (SETPOINT - START) * share, np.maximum(
             goal.u_ref, COOLANT - RATE * PERIOD * np.arange(goal.samples)[:, None]), math.inf)
-    return least_course(goal, rates, *(np.array([end]) for end in COOLANT_RANGE),
+    return least_course(goal, EQUATIONS['reactor'], *(np.array([end]) for end in COOLANT_RANGE),
                         step=np.array([RATE * PERIOD]), guess=guess).cost
 
 
 def late_step(model: LiftedModel, dead_time: float) -> dict[str, float]:
     """Step the set-point by -10 K: overshoot, and cost before and after the first effect."""
     step = at(LEAD, at_setpoint(SETPOINT))
-    course = _run(model, dead_time, REACTOR, LEAD + SETTLED + 3.0 * dead_time, step)
+    course = run_late(model, dead_time, REACTOR, LEAD + SETTLED + 3.0 * dead_time, step)
     late = round(dead_time / PERIOD)
     acting = np.vstack((np.tile(course.commands[:1], (late, 1)), course.commands))
     # the last sample before an effect of the step is at rest
     first = round(LEAD / PERIOD) - 1 + late
     moving = _task(course.states[first], len(course.states) - first)
     rest = cost_along(moving, course.states[:1], course.commands[:1])
-    return {'overshoot_kelvin': max(0.0, float(np.max(-errors(course, SETPOINT, LEAD)))),
+    return {'overshoot_kelvin': overshoot(course, SETPOINT, LEAD),
             'cost': cost_along(moving, course.states[first:],
                                acting[first:len(course.states)]),
             'cost_at_rest': late * rest}
@@ -145,21 +126,20 @@ def late_step(model: LiftedModel, dead_time: float) -> dict[str, float]:
 
 def fouled(model: LiftedModel, dead_time: float) -> dict[str, float]:
     """Step the set-point while UA is a fifth smaller: the largest overshoot, and the end."""
-    course = _run(model, dead_time, CHANGED['UA −20 %'], 300.0 + 25.0 * dead_time,
-                  at(LEAD, at_setpoint(SETPOINT)), period=FOULED_PERIOD)
-    away = errors(course, SETPOINT, LEAD)
-    return {'fouled_overshoot_kelvin': max(0.0, float(np.max(-away))),
+    course = run_late(model, dead_time, CHANGED['UA −20 %'], 300.0 + 25.0 * dead_time,
+                      at(LEAD, at_setpoint(SETPOINT)), period=FOULED_PERIOD)
+    return {'fouled_overshoot_kelvin': overshoot(course, SETPOINT, LEAD),
             'fouled_final_kelvin': math.inf if course.failure else float(
-                np.max(np.abs(away[-30:])))}
+                np.max(np.abs(errors(course, SETPOINT)[-30:])))}
 
 
 def warmer_feed(model: LiftedModel, dead_time: float, *, measured: bool) -> float:
     """Return the largest deviation in K after a step of the feed."""
-    plant = REACTOR, CHANGED['T_i +5 K']
     feed = ReactorParameters().feed_temperature
-    course = _run(model, dead_time, plant[0], LEAD + 100.0 + 2.0 * dead_time,
-                  at(LEAD, on_plant(system=plant[1])), disturbances=lambda seconds: (
-                      np.array([feed + FEED_STEP * (seconds >= LEAD)]) if measured else None))
+    course = run_late(
+        model, dead_time, REACTOR, LEAD + 100.0 + 2.0 * dead_time,
+        at(LEAD, on_plant(system=CHANGED['T_i +5 K'])), disturbances=lambda seconds: (
+            np.array([feed + FEED_STEP * (seconds >= LEAD)]) if measured else None))
     return float(np.max(np.abs(errors(course, START))))
 
 
@@ -194,7 +174,7 @@ def table_of(summary: Mapping[str, Any]) -> str:
 def main(args: list[str] | None = None) -> int:
     """Run the study."""
     output: Path = read_options(
-        args, 'late_reactor', 'Compute steps of a reactor behind a dead time.',
+        args, 'studies.late_reactor', 'Compute steps of a reactor behind a dead time.',
         'out/studies-late').output
     output.mkdir(parents=True, exist_ok=True)
     retrained = retrain(task(output), record=record())

@@ -8,7 +8,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.evaluation.optimal_cost import OptimalTrajectory, Task
-from studies.equations import Rates
+from studies.equations import Rates, with_cost
 
 
 def least_course(task: Task, rates: Rates, lower: Array, upper: Array, *,
@@ -59,16 +59,7 @@ def least_course(task: Task, rates: Rates, lower: Array, upper: Array, *,
 def _sample(task: Task, rates: Rates) -> casadi.Function:
     """Return state and cost (n_x + 1,) after a sample, by Runge-Kutta steps."""
     x0, u = casadi.SX.sym('x', task.system.n_x), casadi.SX.sym('u', task.system.n_u)
-
-    def rate(y: casadi.SX) -> casadi.SX:
-        e, v = y[:-1] - task.x_ref, u - task.u_ref
-        return casadi.vertcat(rates(y[:-1], u),
-                              casadi.dot(task.Q * e, e) + casadi.dot(task.R * v, v))
-
-    y, h = casadi.vertcat(x0, 0.0), task.period / task.substeps
+    step, y = with_cost(rates, task.Q, task.R, (task.x_ref, task.u_ref)), casadi.vertcat(x0, 0.0)
     for _ in range(task.substeps):
-        k1 = rate(y)
-        k2 = rate(y + 0.5 * h * k1)
-        k3 = rate(y + 0.5 * h * k2)
-        y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(y + h * k3))
+        y = step(y, u, task.period / task.substeps)
     return casadi.Function('sample', [x0, u], [y])

@@ -8,7 +8,7 @@ Run it as ``python -m studies.saddle`` (needs the `train` and `mpc` requirements
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import itertools
 import sys
 import time
@@ -16,27 +16,21 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest, Tuning
+from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest
+from koopman_ros.core.arrays import Array
 from koopman_ros.core.plots import table
 from koopman_ros.core.signals import Outputs
-from koopman_ros.evaluation import at, Loop, simulate
-from koopman_ros.evaluation.simulate import Change, Simulation
+from koopman_ros.evaluation import at, simulate
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
+from studies import unstable
 from studies.campaign import over, read_options
 from studies.general.systems import SADDLE
+from studies.robustness.loop import on_plant
 from studies.true_model import TrueModel
-from studies.unstable import (
-    LIMITS,
-    MARGIN,
-    random_starts,
-    REACHED,
-    SADDLE_TEMPERATURE,
-    steady,
-    SYSTEM,
-)
+from studies.unstable import LIMITS, lost, REACHED, steady, SYSTEM
 
 TEMPERATURE = Outputs(('temperature',), ('K',), np.array([[0.0, 1.0]]))
 NOISE = 0.1  # K
@@ -50,7 +44,7 @@ PERIODS = (1.0, 5.0, 15.0, 30.0)  # s
 COURSE, FOULED, END = {0.0: 350.0, 60.0: 355.0, 500.0: 345.0}, 1000.0, 1600.0
 UA = ReactorParameters().heat_transfer_coefficient
 FOULING = {'heat_transfer_coefficient': 0.85 * UA}
-STARTS, ARRIVAL = 40, 600.0  # s
+ARRIVAL = 600  # s
 
 
 @dataclass(frozen=True)
@@ -84,24 +78,12 @@ def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = 
     :param informed: whether it measures the concentration, too.
     :param plugins: parameters of the laws by name, where not the default ones.
     """
-    n_y = 2 if informed else 1
-    return Controller(model, Tuning.for_model(
-        model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
-        controlled=('temperature',), bumpless_transfer_time=0.0,
-        estimator='extended_kalman_filter', measurement_noise=np.array([1e-4, NOISE])[-n_y:],
+    return unstable.controller(
+        model, laws, limits, measured=None if informed else TEMPERATURE,
+        estimator='extended_kalman_filter',
+        measurement_noise=np.array([1e-4, NOISE])[0 if informed else 1:],
         disturbance_noise=np.full(1, WANDER * np.sqrt(60.0)), initial_error=FIRST_GUESS,
-        fallback_order=laws, learned_model_margin=MARGIN, linear_model_margin=MARGIN,
-        plugins=plugins or {}),
-        None if informed else TEMPERATURE)
-
-
-def becomes(system: ControlAffineSystem) -> Change:
-    """Let the plant go on as another one."""
-    def change(loop: Loop) -> Loop:
-        plant = loop.plant
-        return replace(loop, plant=Process(system, plant.time_ns, plant.x, plant.u))
-
-    return change
+        plugins=plugins or {})
 
 
 def reactor(constants: dict[str, float]) -> ControlAffineSystem:
@@ -109,23 +91,26 @@ def reactor(constants: dict[str, float]) -> ControlAffineSystem:
     return two_state_reactor(ReactorParameters(**constants), nominal_state=SADDLE)
 
 
+def cost(T: Array, u: Array, value: float, system: ControlAffineSystem, period: float) -> float:
+    """Return the integral of (T - T_ref)^2 + (T_c - T_c,ref)^2 in K^2 min, sampled by s."""
+    u_ref = steady_state(system, {'temperature': value})[1][0]
+    return float(np.sum((T - value) ** 2 + (u - u_ref) ** 2)) * period / 60.0
+
+
 def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
     """Take the temperature along its course, and let the jacket foul."""
     x0, u0 = steady(COURSE[0.0])
-    fouled, informed = reactor(FOULING), one.measured.all_states
+    fouled = reactor(FOULING)
     loop = simulate(one, Process(SYSTEM, 0, x0, u0), [
-        at(0.0, Initialisation(u0)), at(FOULED, becomes(fouled)),
+        at(0.0, Initialisation(u0)), at(FOULED, on_plant(system=fouled)),
         *(at(when, SetpointRequest(0, np.array([value]))) for when, value in COURSE.items())],
-        duration=END, period=period, noise=np.array([0.0, NOISE])[0 if informed else 1:],
-        seed=seed)
+        duration=END, period=period, noise=_noise(one.measured.all_states), seed=seed)
     T, t, u = loop.states[:, 1], loop.times, loop.commands[:, 0]
     costs, offsets = [0.0, 0.0], [0.0, 0.0]
     for begin, end in itertools.pairwise([*COURSE, FOULED, END]):
         part, after = (t >= begin) & (t < end), begin == FOULED
         value = COURSE.get(begin, COURSE[max(COURSE)])
-        u_ref = steady_state(fouled if after else SYSTEM, {'temperature': value})[1][0]
-        costs[after] += float(np.sum((T[part] - value) ** 2 + (u[part] - u_ref) ** 2)) * (
-            period / 60.0)
+        costs[after] += cost(T[part], u[part], value, fouled if after else SYSTEM, period)
         if begin:
             # what is left after two thirds of the time
             late = part & (t >= end - (end - begin) / 3.0)
@@ -138,22 +123,8 @@ def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
                       float(np.sqrt(np.mean(error ** 2))))
 
 
-def _gave_up(loop: Simulation) -> bool:
-    return bool(loop.failure) or bool({'hold', 'safe'} & set(loop.levels))
-
-
-def lost(one: Controller, seed: int) -> set[int]:
-    """Return which of the starts about the steady states do not come to 350 K."""
-    found, informed = set(), one.measured.all_states
-    for start, x0 in enumerate(random_starts(STARTS, seed)):
-        begin = float(x0[1])
-        loop = simulate(one, Process(SYSTEM, 0, x0, steady(begin)[1]), [
-            at(0.0, Initialisation(steady(begin)[1])),
-            at(0.0, SetpointRequest(0, np.array([SADDLE_TEMPERATURE])))],
-            duration=ARRIVAL, noise=np.array([0.0, NOISE])[0 if informed else 1:], seed=start)
-        if _gave_up(loop) or not abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED:
-            found.add(start)
-    return found
+def _noise(informed: bool) -> Array:
+    return np.array([0.0, NOISE])[0 if informed else 1:]
 
 
 def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS,
@@ -191,19 +162,16 @@ def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS,
 def main(args: list[str] | None = None) -> int:
     """Learn from several seeds and print the tables."""
     options = read_options(
-        args, 'saddle', 'Hold the two-state reactor at its saddle from its temperature alone.',
-        seeds=10, scheduler='')
+        args, 'studies.saddle', 'Hold the two-state reactor at its saddle from its temperature '
+        'alone.', seeds=10, scheduler='')
     with backend_of(options.scheduler) as backend:
         _report(options.seeds, backend)
     return 0
 
 
 def _report(seeds: int, backend: Backend) -> None:
-    # torch is needed to learn alone
-    from studies.unstable import learn
-
     begin = time.monotonic()
-    models = list(over(backend, learn, range(seeds)).values())
+    models = list(over(backend, unstable.learn, range(seeds)).values())
     print(f'learned {seeds} lifts, {time.monotonic() - begin:.0f} s', file=sys.stderr, flush=True)
     head = ['law', 'sample [s]', 'cost / true model', 'worst', 'cost / full information', 'worst',
             'offset [K]', 'error of C_A [mol/L]', 'lost', 'fouling: cost / true model', 'lost',
@@ -211,11 +179,12 @@ def _report(seeds: int, backend: Backend) -> None:
     print(f'{seeds} lifts, 0.1 K of noise, 350 -> 355 -> 345 K, then UA -15 %; coolant '
           f'from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at 1 K/s\n')
     print(table(head, course_rows(models, backend=backend), range(1, len(head))))
-    print(f'\nOf {STARTS} starts from 335 to 370 K, C_A up to 0.2 mol/L from steady, do not come '
-          'to 350 K (coolant from 253 to 373 K):\n')
+    print(f'\nOf {unstable.LIMITED_STARTS} starts from 335 to 370 K, C_A up to 0.2 mol/L from '
+          'steady, do not come to 350 K (coolant from 253 to 373 K):\n')
 
     def losses(law: str) -> list[int]:
-        return [len(lost(controller(model, LAWS[law], WIDE, informed=informed), 0))
+        return [len(lost(controller(model, LAWS[law], WIDE, informed=informed), ARRIVAL,
+                         _noise(informed)))
                 for model, informed in ((models[0], False), (truth(), True))]
 
     rows = [[name, *found] for name, found in over(backend, losses, LAWS).items()]

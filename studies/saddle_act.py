@@ -37,10 +37,11 @@ from koopman_ros.evaluation.simulate import after_a_second, Simulation
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
-from koopman_ros.plants import ControlAffineSystem, Process, sensor_noise, steady_state
+from koopman_ros.plants import ControlAffineSystem, Process, sensor_noise
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.ros.topics import CONTROLLER_INTERNALS, LOOP_QOS
-from studies.saddle import becomes, controller, FOULING, NOISE, reactor, UA, WANDER, WIDE
+from studies.robustness.loop import on_plant
+from studies.saddle import controller, cost, FOULING, NOISE, reactor, UA, WANDER, WIDE
 from studies.saddle import truth as true_model
 from studies.unstable import MARGIN, SADDLE_TEMPERATURE
 
@@ -281,7 +282,7 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
         n_y = len(one.measured.names)
         return simulate(
             one, plant, [
-                at(0.0, Initialisation(u0)), at(fouled, becomes(reactor(FOULING))),
+                at(0.0, Initialisation(u0)), at(fouled, on_plant(system=reactor(FOULING))),
                 *(at(sent, SetpointRequest(after_a_second(round(when * NANOSECONDS)),
                                            np.array([value])))
                   for sent, when, value in _requests())],
@@ -321,14 +322,11 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
 
 
 def _cost(T: Array, u: Array, fouled: float) -> float:
-    """Return the integral of (T - T_ref)^2 + (T_c - T_c,ref)^2 in K^2 min, until it fouls."""
-    edges, total = [*COURSE, fouled], 0.0
-    for k, value in enumerate(COURSE.values()):
-        part = slice(int(edges[k]), int(edges[k + 1]))
-        u_ref = steady_state(_usual(), {'temperature': value})[1][0]
-        if k:
-            total += float(np.sum((T[part] - value) ** 2 + (u[part] - u_ref) ** 2))
-    return total / SECONDS_PER_MINUTE
+    """Return the cost of the set-points after the first, until it fouls."""
+    edges = [*map(int, COURSE), int(fouled)]
+    parts = list(zip(edges, edges[1:], COURSE.values(), strict=False))
+    return sum(cost(T[begin:end], u[begin:end], value, _usual(), 1.0)
+               for begin, end, value in parts[1:])
 
 
 def draw(path: Path, run: _Run, phases: list[tuple[str, float]], model: LiftedModel, seed: int

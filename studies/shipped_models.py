@@ -8,10 +8,8 @@ Run it as ``python -m studies.shipped_models`` (needs the `train` requirements);
 fixed, so that the same machine writes the same files bit for bit.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 import sys
 
 import numpy as np
@@ -32,6 +30,7 @@ from koopman_ros.plants import (
     ReactorParameters,
 )
 from koopman_ros.plants.library.heated_line import HeatedLine
+from studies.campaign import read_options
 from studies.paper.reactor import SYSTEM, TRAINING, training_samples
 
 SEED = 2026
@@ -206,17 +205,11 @@ def saddle_model() -> LiftedModel:
 
 def main(args: list[str] | None = None) -> int:
     """Train shipped models and write them."""
-    parser = argparse.ArgumentParser(description='Train the models that the package ships.')
-    parser.add_argument('plants', nargs='*', metavar='plant', default=NAMES,
-                        help=f'whose models: {", ".join(NAMES)} (default: all)')
-    parser.add_argument('--output', type=Path, default=Path('config/models'),
-                        help='folder for the model files (default: %(default)s)')
-    options = parser.parse_args(args)
-    if unknown := set(options.plants) - set(NAMES):
-        parser.error(f'there is no lift of {", ".join(sorted(unknown))}: choose of '
-                     f'{", ".join(NAMES)}')
+    options = read_options(
+        args, 'studies.shipped_models', 'Train the models that the package ships.',
+        'config/models', plants=NAMES)
     options.output.mkdir(parents=True, exist_ok=True)
-    for plant in options.plants:
+    for plant in options.plants or NAMES:
         own = {SADDLE: saddle_model, FEED: feed_model, LINE: line_model}.get(
             plant, partial(train_lift, plant))
         models = reactor_models() if plant == 'reactor' else {plant: own()}

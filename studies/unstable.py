@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 import sys
 import time
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from koopman_ros.control import Controller, Initialisation, InputLimits, Setpoin
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.core.plots import table
+from koopman_ros.core.signals import Outputs
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory, optimum, Task
 from koopman_ros.evaluation.simulate import Simulation
@@ -79,75 +81,88 @@ def cost_ratio(model: LiftedModel, begin: float, end: float) -> float:
 
     :return: the integral of (T - T_ref)^2 + (T_c - T_c,ref)^2 over the least a held input can.
     """
-    x0, (x_ref, u_ref) = steady(begin)[0], steady(end)
-    weights, one = np.array([0.0, 1.0]), np.ones(1)
-    task = Task(SYSTEM, x0, x_ref, u_ref, weights, one, PERIOD / SYSTEM.seconds_per_time_unit,
-                SAMPLES)
-    loop = run(model, ('sdre',), UNLIMITED, 0.1, begin, end, x0, SAMPLES)
+    task = _task(begin, end, SAMPLES)
+    loop = run(controller(model, ('sdre',), UNLIMITED, 0.1), begin, end, SAMPLES)
     if set(loop.levels) != {'sdre'}:
         return float('inf')
     return cost_along(task, loop.states, loop.commands[:-1]) / optimum(task).cost
 
 
-def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: float,
-        begin: float, end: float, x0: Array, samples: int) -> Simulation:
+def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = LIMITS,
+               margin: float = MARGIN, measured: Outputs | None = None, **others: Any
+               ) -> Controller:
     """
-    Run laws on the true reactor, sampled each second, from a state to a temperature.
+    Return a controller of the temperature.
 
     :param laws: best first.
     :param margin: half-ranges of the training box by which they may leave that.
-    :param begin: in K; its coolant is on before.
-    :param x0: (2,) in mol/L and K.
+    :param measured: the outputs; all states when None.
+    :param others: of the tuning.
     """
-    settings = Tuning.for_model(
+    return Controller(model, Tuning.for_model(
         model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
-        controlled=('temperature',), bumpless_transfer_time=0.0,
-        fallback_order=laws, learned_model_margin=margin, linear_model_margin=margin)
-    before = steady(begin)[1]
+        controlled=('temperature',), bumpless_transfer_time=0.0, fallback_order=laws,
+        learned_model_margin=margin, linear_model_margin=margin, **others), measured)
+
+
+def run(one: Controller, begin: float, end: float, samples: int, x0: Array | None = None,
+        **others: Any) -> Simulation:
+    """
+    Run a controller on the true reactor, sampled each second, to a temperature.
+
+    :param begin: in K; its coolant is on before.
+    :param x0: (2,) in mol/L and K; the steady state at `begin` when None.
+    :param others: of the simulation.
+    """
+    rest, before = steady(begin)
     return simulate(
-        Controller(model, settings), Process(SYSTEM, 0, x0, before),
+        one, Process(SYSTEM, 0, rest if x0 is None else x0, before),
         [at(0.0, Initialisation(before)), at(0.0, SetpointRequest(0, steady(end)[0][1:]))],
-        period=PERIOD, duration=PERIOD * samples)
+        period=PERIOD, duration=PERIOD * samples, **others)
+
+
+def lost(one: Controller, samples: int, noise: Array | None = None) -> list[int]:
+    """Return which of the starts about the steady states do not come to the saddle."""
+    found = []
+    for start, x0 in enumerate(random_starts(LIMITED_STARTS, 0)):
+        loop = run(one, float(x0[1]), SADDLE_TEMPERATURE, samples, x0, noise=noise, seed=start)
+        if loop.failure or {'hold', 'safe'} & set(loop.levels) or not (
+                abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED):
+            found.append(start)
+    return found
 
 
 def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
     """
     Return the cost of laws in each step under limits, and the number of starts that they lose.
 
-    The cost is in K^2 min, infinite where the set-point is not reached. A start is
-    lost if it leaves their margin, so that the safe input acts, or does not reach the set-point.
+    The cost is in K^2 min, infinite where the set-point is not reached.
     """
-    costs = []
+    costs, one = [], controller(model, laws)
     for begin, end in STEPS:
-        task = _limited_task(begin, end)
-        x0 = task.x0
-        loop = run(model, laws, LIMITS, MARGIN, begin, end, x0, LIMITED_SAMPLES)
-        costs.append(cost_along(task, loop.states, loop.commands[:-1])
-                     if abs(loop.states[-1, 1] - end) < REACHED else float('inf'))
-    lost = 0
-    for x0 in random_starts(LIMITED_STARTS, 0):
-        loop = run(model, laws, LIMITS, MARGIN, float(x0[1]), SADDLE_TEMPERATURE, x0,
-                   LIMITED_SAMPLES)
-        lost += 'safe' in loop.levels or not (
-            abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED)
-    return [laws[0], *(f'{cost:.2f}' for cost in costs), f'{lost} of {LIMITED_STARTS}']
+        loop = run(one, begin, end, LIMITED_SAMPLES)
+        costs.append(cost_along(_task(begin, end, LIMITED_SAMPLES), loop.states,
+                                loop.commands[:-1]) if abs(loop.states[-1, 1] - end) < REACHED
+                     else float('inf'))
+    return [laws[0], *(f'{cost:.2f}' for cost in costs),
+            f'{len(lost(one, LIMITED_SAMPLES))} of {LIMITED_STARTS}']
 
 
 def least_costs(model: LiftedModel) -> list[str]:
     """Return the least cost of each step under limits, found from the course of the law `mpc`."""
     costs = []
     for begin, end in STEPS:
-        task = _limited_task(begin, end)
-        loop = run(model, ('mpc', 'sdre'), LIMITS, MARGIN, begin, end, task.x0, LIMITED_SAMPLES)
+        loop = run(controller(model, ('mpc', 'sdre')), begin, end, LIMITED_SAMPLES)
         costs.append(least_course(
-            task, EQUATIONS['two_state'], LIMITS.lower, LIMITS.upper, step=PERIOD * LIMITS.rate,
+            _task(begin, end, LIMITED_SAMPLES), EQUATIONS['two_state'], LIMITS.lower,
+            LIMITS.upper, step=PERIOD * LIMITS.rate,
             guess=OptimalTrajectory(loop.states, loop.commands[:LIMITED_SAMPLES], 0.0)).cost)
     return ['the least', *(f'{cost:.2f}' for cost in costs), '']
 
 
-def _limited_task(begin: float, end: float) -> Task:
+def _task(begin: float, end: float, samples: int) -> Task:
     return Task(SYSTEM, steady(begin)[0], *steady(end), np.array([0.0, 1.0]), np.ones(1),
-                PERIOD / SYSTEM.seconds_per_time_unit, LIMITED_SAMPLES)
+                PERIOD / SYSTEM.seconds_per_time_unit, samples)
 
 
 def random_starts(count: int, seed: int) -> Iterator[Array]:
@@ -166,8 +181,8 @@ def steady(temperature: float) -> tuple[Array, Array]:
 def main(args: list[str] | None = None) -> int:
     """Learn from several seeds and print a row for each, judged on fresh samples."""
     options = read_options(
-        args, 'unstable', 'Learn the two-state reactor about its saddle under a pre-feedback.',
-        seeds=10, scheduler='')
+        args, 'studies.unstable', 'Learn the two-state reactor about its saddle under a '
+        'pre-feedback.', seeds=10, scheduler='')
     with backend_of(options.scheduler) as backend:
         return _report(options.seeds, backend)
 

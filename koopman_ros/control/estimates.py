@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,8 +38,7 @@ from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(NamedTuple):
     """A measurement as it was taken into account."""
 
     verdict: Verdict  #: whether it is accepted

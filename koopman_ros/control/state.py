@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,8 +101,7 @@ class Arrival(Enum):
     MISSING = 'missing'
 
 
-@dataclass(frozen=True, slots=True)
-class MeasurementReport:
+class MeasurementReport(NamedTuple):
     """The measurement that was answered."""
 
     arrival: Arrival = Arrival.MISSING  #: its outcome
@@ -119,8 +118,7 @@ class MeasurementReport:
 NOTHING_MEASURED = MeasurementReport()
 
 
-@dataclass(frozen=True, slots=True)
-class EstimateReport:
+class EstimateReport(NamedTuple):
     """The estimate in the units of the signals."""
 
     state: Array  #: (n_x,) in state units
@@ -137,7 +135,9 @@ class EstimateReport:
         states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
         try:
             disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
-            at_bound = bool(estimator.at_bound(estimate.w))
+            # but for rounding
+            at_bound = any(abs(one) >= (1.0 - 1e-9) * most for one, most in zip(
+                disturbance.tolist(), estimator.tuning.max_disturbance.tolist(), strict=True))
         except BaseException as error:
             contained(error)
             disturbance, at_bound = np.full(len(inputs), np.nan), False
@@ -152,8 +152,7 @@ class EstimateReport:
         return None if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 
-@dataclass(frozen=True, slots=True)
-class TargetReport:
+class TargetReport(NamedTuple):
     """The target of the law, in the units of the signals."""
 
     setpoint: Array  #: (n_c,) that is tracked, in state units
@@ -164,8 +163,7 @@ class TargetReport:
     input: Array | None = None  #: (n_u,) that holds it, in input units; None without a law
 
 
-@dataclass(frozen=True, slots=True)
-class CommandReport:
+class CommandReport(NamedTuple):
     """How the command came about."""
 
     law: SolutionInfo = NO_SOLUTION  #: about the solution of the law

@@ -203,8 +203,8 @@ class ControlStep(Configuration):
                     self.model.states.to_physical(target.x),
                     self.model.inputs.to_physical(target.u))))
         u, at_range, at_rate = limit(self.tuning.limits, wanted, state.command, time.counted)
-        done = replace(done, at_range=done.at_range or at_range, at_rate=at_rate,
-                       outside=self.model.inputs.violation(u))
+        done = done._replace(at_range=done.at_range or at_range, at_rate=at_rate,
+                             outside=self.model.inputs.violation(u))
         applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)
         state = replace(state, **changes, command=u, commanded_ns=time.command_ns,
                         applied=applied, interval=time.interval)
@@ -271,11 +271,11 @@ class ControlStep(Configuration):
         level, held = supervisor.level, self._last_command(state)
         if result is None or result.u is None:
             done = NO_COMMAND if result is None else CommandReport(
-                replace(result.info, form=''), at_range=result.clipped, plan=result.plan)
+                result.info._replace(form=''), at_range=result.clipped, plan=result.plan)
             if level == SAFE:
                 share = 0.0 if recovery is None else recovery.share
                 wanted = self.safe_input + share * (self.nominal_input - self.safe_input)
-                return dict(WITHOUT_LAW), wanted, replace(done, recovery=share)
+                return dict(WITHOUT_LAW), wanted, done._replace(recovery=share)
             passing = supervisor.resumes is not None
             return {} if passing else {**WITHOUT_LAW, 'transfer': state.transfer}, held, done
         if state.law != level and state.command is not None and self.tuning.bumpless_transfer_time:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
@@ -62,8 +63,7 @@ class FallbackOrder:
         return _HYSTERESIS * self.margins[-1]
 
 
-@dataclass(frozen=True, slots=True)
-class LevelRequest:
+class LevelRequest(NamedTuple):
     """The best level that is possible now."""
 
     level: str  #: which

@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
+from typing import NamedTuple
 
 from koopman_ros.control.state import State
 from koopman_ros.control.supervisor import HOLD
@@ -18,8 +19,7 @@ from koopman_ros.estimation import History
 _LONGEST_WATCH = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class StepTime:
+class StepTime(NamedTuple):
     """The times of a step."""
 
     now_ns: int  #: stamp of the measurement, or up to which there was none

@@ -42,7 +42,8 @@ def _brief(value: object) -> str:
         few = value.ndim == 1 and len(value) <= _FEW
         return f'[{", ".join(f"{number:.6g}" for number in value)}]' if few else (
             f'<array {value.shape}>')
-    if is_dataclass(value) and not isinstance(value, type):
+    named = isinstance(value, tuple) and type(value) is not tuple
+    if named or (is_dataclass(value) and not isinstance(value, type)):
         return f'{type(value).__name__}(...)'
     if isinstance(value, tuple | list | Mapping):
         plain = len(value) <= _FEW and all(isinstance(item, str | int | float) for item in value)

@@ -43,7 +43,7 @@ class NoParameters:
 
 @dataclass(frozen=True)
 class Column:
-    """The metadata of a field declared by :func:`column` holds."""
+    """The metadata of a field declared by :func:`column`."""
 
     signals: str  #: of which signals
     name: str  #: in YAML; empty for that of the field

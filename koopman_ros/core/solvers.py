@@ -4,17 +4,17 @@
 """Riccati equations of the continuous and the sampled regulator, Runge-Kutta steps, Jacobians."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dgees, dgeev, dgesv
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.status import StatusCode
 
-__all__ = ['RiccatiSolution', 'RiccatiStatus', 'differences', 'over_interval',
-           'runge_kutta_step', 'solve_riccati', 'spectral_radius', 'transition']
+__all__ = ['RiccatiSolution', 'differences', 'over_interval', 'runge_kutta_step', 'solve_riccati',
+           'spectral_radius', 'transition']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis look undamped.
@@ -25,26 +25,12 @@ _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 # Step of a central difference, as a share of the magnitude: rounding and curvature both leave
 # about ten digits.
 _DIFFERENCE = 1e-5
-# The power series of exp(M) - I, for |M| < 1, by M to M^4 in rows that are multiplied by powers of
-# M^4 (M. S. Paterson, L. J. Stockmeyer, SIAM J. Comput. 2 (1973)).
-_SERIES = np.array([[1.0 / math.factorial(4 * i + j) for j in range(1, 5)] for i in range(5)])
+# The power series of exp(M) - I, for |M| < 2/3, by M to M^4 in rows that are multiplied by powers
+# of M^4 (M. S. Paterson, L. J. Stockmeyer, SIAM J. Comput. 2 (1973)).
+_SERIES = np.array([[1.0 / math.factorial(4 * i + j) for j in range(1, 5)] for i in range(4)])
 
 
-class RiccatiStatus(Enum):
-    """Whether a solution may be used."""
-
-    SOLVED = 'solved'
-    # there is no stable subspace of full size: (A, B) is not stabilisable, or a mode on the
-    # imaginary axis is not weighted
-    NOT_STABILISABLE = 'riccati_not_stabilisable'
-    # the residual is too large to trust the gain: (A, B) is nearly not stabilisable
-    INACCURATE = 'riccati_inaccurate'
-    # likewise, seen by the gain
-    GAIN_TOO_LARGE = 'riccati_gain_too_large'
-
-
-@dataclass(frozen=True)
-class RiccatiSolution:
+class RiccatiSolution(NamedTuple):
     """
     Solution of a Riccati equation with its gain.
 
@@ -56,7 +42,12 @@ class RiccatiSolution:
     K: Array  #: (m, n); zeros without a solution
     residual: float  #: Frobenius norm of the equation's left side over the sum of its terms' norms
     gain: float  #: spectral norm of K
-    status: RiccatiStatus  #: whether K may be used
+    failure: StatusCode | None  #: why K must not be used, None where it may
+
+    @property
+    def solved(self) -> bool:
+        """Whether K may be used."""
+        return self.failure is None
 
 
 def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0.0,
@@ -70,9 +61,9 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     N_d'), with the plant and the weights over an interval (C. F. Van Loan, IEEE Trans. Automat.
     Contr. 23 (1978)). Its gain tends to the continuous one as the interval goes to 0.
 
-    A returned status other than SOLVED means that K must not be used: near the border of
-    stabilisability the Schur method yields a P with enormous gains and eigenvalues that look
-    fine, which only the residual and the size of the gain reveal.
+    K must not be used where there is a failure: near the border of stabilisability the Schur
+    method yields a P with enormous gains and eigenvalues that look fine, which only the residual
+    and the size of the gain reveal.
 
     :param A: (n, n), and B (n, m).
     :param Q: (n, n) symmetric, positive semidefinite, not zero.
@@ -82,8 +73,6 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     :param max_gain: largest spectral norm of K taken as solved.
     """
     try:
-        if not Q.any():
-            raise np.linalg.LinAlgError('no state is weighted')
         # values so large that something overflows end in a residual or a gain that is rejected
         with np.errstate(all='ignore'):
             P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
@@ -92,22 +81,19 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     except (ArithmeticError, ValueError):
         # a singular matrix, no stable subspace, or numbers that are not finite
         return RiccatiSolution(np.zeros_like(A), np.zeros_like(B.T), math.inf, math.inf,
-                               RiccatiStatus.NOT_STABILISABLE)
-    if not residual <= max_residual:
-        status = RiccatiStatus.INACCURATE
-    elif not gain <= max_gain:
-        status = RiccatiStatus.GAIN_TOO_LARGE
-    else:
-        status = RiccatiStatus.SOLVED
-    return RiccatiSolution(P, K, residual, gain, status)
+                               StatusCode.NOT_STABILISABLE)
+    return RiccatiSolution(P, K, residual, gain, (
+        StatusCode.RICCATI_INACCURATE if not residual <= max_residual else
+        StatusCode.GAIN_TOO_LARGE if not gain <= max_gain else None))
 
 
 def _continuous(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array, float]:
     """Return P, K and the residual, by A. J. Laub, IEEE Trans. Automat. Contr. 24 (1979)."""
     R_inverse_Bt = _solved(R, B.T)
     G = B @ R_inverse_Bt
-    scale = _scale(Q, G)
-    P = scale * _stable_graph(_hamiltonian(A, scale * G, Q / scale))
+    H = np.block([[A, -G], [-Q, -A.T]])
+    scale = _balanced(H)
+    P = scale * _stable_graph(H)
     PA, PGP = P @ A, P @ G @ P
     # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
     size = _size(Q) + 2.0 * _size(PA) + _size(PGP)
@@ -125,12 +111,12 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n = len(A)
     D, W = over_interval(A, B, Q, R, interval)
-    # input and weight without the cross term
-    both = np.concatenate((D[:n, n:], W[:n, n:])).T
-    by_R = both.T.dot(_solved(W[n:, n:], both))
-    rest, G, Q_rest = D[:n, :n] - by_R[:n, n:], by_R[:n, :n], W[:n, :n] - by_R[n:, n:]
-    scale = _scale(Q_rest, G)
-    less = _hamiltonian(rest, scale * G, Q_rest / scale)
+    less = np.zeros((2 * n, 2 * n))
+    less[:n, :n], less[n:, :n], less[n:, n:] = D[:n, :n], -W[:n, :n], -D[:n, :n].T
+    # without the cross term of input and state
+    less -= np.concatenate((D[:n, n:], -W[:n, n:])).dot(
+        _solved(W[n:, n:], np.concatenate((W[:n, n:], D[:n, n:])).T))
+    scale = _balanced(less)
     more = less.copy()
     more[:, n:] *= -1.0
     more.flat[::2 * n + 1] += 2.0
@@ -190,7 +176,7 @@ def transition(A: Array, interval: float) -> Array:
 
 def _part(M: Array, interval: float, size: float) -> tuple[Array, int]:
     """Return exp(M h) - I for a part h of an interval, and how often h doubles to all of it."""
-    doublings = max(0, math.frexp(size)[1])
+    doublings = max(0, math.frexp(1.5 * size)[1])
     M = M * math.ldexp(interval, -doublings)
     M2 = M.dot(M)
     M4 = M2.dot(M2)
@@ -218,17 +204,15 @@ def _solved(M: Array, right: Array) -> Array:
     return np.asarray(found, dtype=np.float64)
 
 
-def _scale(Q: Array, G: Array) -> float:
-    """Return by how much to divide P for order one, so that no block dominates the Hamiltonian."""
-    size_Q, size_G = _size(Q), _size(G)
-    return math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
-
-
-def _hamiltonian(A: Array, G: Array, Q: Array) -> Array:
-    n = len(A)
-    H = np.empty((2 * n, 2 * n))
-    H[:n, :n], H[:n, n:], H[n:, :n], H[n:, n:] = A, -G, -Q, -A.T
-    return H
+def _balanced(H: Array) -> float:
+    """Divide P for order one, in place, so that no block dominates; return the divisor."""
+    n = len(H) // 2
+    G, Q = H[:n, n:], H[n:, :n]
+    size_G, size_Q = _size(G), _size(Q)
+    scale = math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
+    G *= scale
+    Q /= scale
+    return scale
 
 
 def _stable_graph(H: Array, least: float = 0.0) -> Array:
@@ -243,7 +227,7 @@ def _stable_graph(H: Array, least: float = 0.0) -> Array:
         raise np.linalg.LinAlgError('the Hamiltonian is not finite')
     # as scipy.linalg.schur, which takes three times as long for so few numbers
     _, stable, real, _, vectors, _, info = dgees(lambda real, _: real < 0.0, H, sort_t=1)
-    if info != 0 or stable != n or not (real[:n] < -max(least, _AXIS_MARGIN * size)).all():
+    if info != 0 or stable != n or not max(real[:n].tolist()) < -max(least, _AXIS_MARGIN * size):
         raise np.linalg.LinAlgError('no stable subspace of full dimension exists')
     P = _solved(vectors[:n, :n].T, vectors[n:, :n].T)
     return 0.5 * (P + P.T)

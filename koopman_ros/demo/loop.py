@@ -159,14 +159,8 @@ class Operator:
 
     def set(self, node: str, **values: object) -> None:
         """Set parameters of a node."""
-        for name, value in values.items():
-            # a busy machine may not read a model in the time that the loop can wait
-            while 'still being read' in (reason := ''.join(
-                    result.reason for result in self.harness.set_parameters(
-                        node, **{name: value}) if not result.successful)):
-                pass
-            if reason:
-                raise HarnessError(f'{node}: {reason}')
+        if reasons := self.harness.rejected_parameters(node, **values):
+            raise HarnessError(f'{node}: {"; ".join(reasons)}')
 
     def record_again(self, bag: Path) -> None:
         """End the recording, and begin another one."""

@@ -9,6 +9,7 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,15 +61,14 @@ class AppliedInputs:
     def pieces(self, start_ns: int, end_ns: int, dead_ns: tuple[int, ...]
                ) -> list[tuple[float, Array]]:
         """Return the durations in s and the inputs (n_u,) that act from one time to another."""
-        edges = {start_ns, end_ns} | {
-            time + dead for time in self.times_ns[1:] for dead in set(dead_ns)
-            if start_ns < time + dead < end_ns}
+        edges = sorted({start_ns, end_ns, *(
+            at for time in self.times_ns[1:] for dead in set(dead_ns)
+            if start_ns < (at := time + dead) < end_ns)})
         return [((end - begin) / NANOSECONDS, self.acting(begin, dead_ns))
-                for begin, end in itertools.pairwise(sorted(edges))]
+                for begin, end in itertools.pairwise(edges)]
 
 
-@dataclass(frozen=True, slots=True)
-class PendingInputs:
+class PendingInputs(NamedTuple):
     """The inputs that were applied before a time, of which some act after it."""
 
     applied: AppliedInputs

@@ -31,8 +31,9 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
     # far out the model's drift grows without bound, and corrections could not bring x back
-    lost = not (np.abs(x) <= LOST * model.states.half_widths).all()
-    return None if lost else Estimate(x, estimate.w)
+    within = all(abs(one) <= LOST * half for one, half in zip(
+        x.tolist(), model.states.half_widths.tolist(), strict=True))
+    return Estimate(x, estimate.w) if within else None
 
 
 class DisturbanceObserver(Estimator):

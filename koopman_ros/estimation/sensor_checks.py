@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,7 @@ class Accepted:
     jumped: bool = False  #: whether a later one was rejected as a jump
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     """The outcome of the check of a measurement."""
 
     accepted: Accepted | None  #: to be remembered; None as long as none was accepted
@@ -77,9 +77,9 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
             seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
     # back after a jump, and further than noise brings it
     moved = last.jumped and bool(np.any(change > limits.at_rest))
-    still = change == 0.0
-    if not still.any():
+    if 0.0 not in change.tolist():
         return Verdict(changed, moved=moved)
+    still = change == 0.0
     before = last.standstill
     stuck = Standstill(
         tuple(since if same else time_ns

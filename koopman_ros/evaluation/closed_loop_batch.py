@@ -23,7 +23,6 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import (
     differences,
-    RiccatiStatus,
     runge_kutta_step,
     solve_riccati,
 )
@@ -260,7 +259,7 @@ def _informed(given: LoopBatch, setpoints: Array, inputs: Array) -> _Feedback:
             found = solve_riccati(A[i], B[i], weights.Q, weights.R,
                                   interval=given.interval, max_gain=tuning.max_gain,
                                   max_residual=tuning.max_riccati_residual)
-            if found.status is RiccatiStatus.SOLVED:
+            if found.solved:
                 u = plant.model.inputs.to_physical(inputs[k] - found.K @ e[i])
                 v[k] = plant.model.inputs.to_deviation(tuning.limits.within(u))
         return v

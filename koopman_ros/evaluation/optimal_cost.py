@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.core.solvers import runge_kutta_step, solve_riccati
 from koopman_ros.plants.system import ControlAffineSystem
 
 _MAX_ITERATIONS = 200
@@ -84,7 +84,7 @@ def optimum(task: Task) -> OptimalTrajectory:
     system = task.system
     riccati = solve_riccati(system.slope(task.x_ref, task.u_ref), system.input_matrix(task.x_ref),
                             np.diag(task.Q), np.diag(task.R))
-    K = riccati.K if riccati.status is RiccatiStatus.SOLVED else np.zeros_like(riccati.K)
+    K = riccati.K if riccati.solved else np.zeros_like(riccati.K)
     course = _constant_law(task, task.u_ref, K, task.x_ref)
     if not math.isfinite(course.cost):
         raise ValueError(f'{system.name}: the linear law does not stabilise the plant from '

@@ -18,7 +18,7 @@ from koopman_ros.control.state import State, StepReport
 from koopman_ros.control.steady_state import nearest_steady_state, partial_target
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.signals import per_signal
-from koopman_ros.core.status import reason, StatusCode, StatusFormatter
+from koopman_ros.core.status import reason, StatusFormatter
 from koopman_ros.core.units import Displays, NANOSECONDS
 from koopman_ros.model import LiftedModel
 
@@ -321,9 +321,9 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
     def act(x: Array) -> tuple[Array, Array]:
         xi = model.states.to_deviation(x)
         found = law(model, xi, target, weights)
-        if not found.solved:
+        if found.riccati.failure is not None:
             words = StatusFormatter(Displays({}))
-            raise _Failed(words(reason(StatusCode(found.riccati.status.value))))
+            raise _Failed(words(reason(found.riccati.failure)))
         return xi, found.u
 
     def flow(_: float, y: Array) -> Array:

@@ -71,7 +71,8 @@ class Thresholds:
     #: by this share its held-out error must be smaller than those of the current model, where
     #: there is one, and of the best linear model
     margin: float = 0.1
-    condition: float = 1e4  #: largest condition number of E[z z']
+    #: largest condition number of E[z z'], over that of the states among the coordinates
+    condition: float = 1e4
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.margin < 1.0:
@@ -188,7 +189,7 @@ class HeldOut:
         """
         reasons = [unusable(model)] + ([] if linear else [self.exceeded(
             model, 'the best linear model', rmse, self.linear_rmse, 'set model_class to linear')])
-        cond, most = figures.fit.cond, self._thresholds.condition
+        cond, most = figures.fit.cond, self._thresholds.condition * figures.fit.cond_of_states
         # monomials depend on each other on most data, and only learned coordinates collapse
         if not (cond <= most or isinstance(model.observables, PolynomialObservables)):
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '

@@ -150,19 +150,22 @@ class Coordinates:
         :return: largest excess over a side of the box in half its width; 0 inside, infinity for a
             value that is not finite.
         """
-        excess = np.maximum(self.lower - value, value - self.upper)
-        largest = float((excess / self._half_ranges).max(initial=0.0))
-        return math.inf if math.isnan(largest) else largest
+        largest = 0.0
+        for one, low, high in zip(value.tolist(), *self._sides, strict=True):
+            # NaN is not inside
+            if not low <= one <= high:
+                excess = 2.0 * max(low - one, one - high) / (high - low)
+                largest = math.inf if math.isnan(excess) else max(largest, excess)
+        return largest
 
     @cached_property
-    def _half_ranges(self) -> Array:
-        """Half the width (n,) of the training box, in units."""
-        return 0.5 * (self.upper - self.lower)
+    def _sides(self) -> tuple[list[float], list[float]]:
+        return self.lower.tolist(), self.upper.tolist()
 
     @cached_property
     def half_widths(self) -> Array:
         """Half the width (n,) of the training box, in scaled deviations."""
-        return frozen(self._half_ranges / self.scale, 'half-ranges', (len(self),))
+        return frozen(0.5 * (self.upper - self.lower) / self.scale, 'half-ranges', (len(self),))
 
     @cached_property
     def corners(self) -> Array:

@@ -439,6 +439,8 @@ class LiftedModel:
 
     def forcing(self, x: Array, u: Array) -> Array:
         """Evaluate B(x) u, the rate due to inputs: (..., n_x), (..., n_u) -> (..., n_x)."""
+        if self.input_terms is None:
+            return u @ self.B.T
         return (self.input_matrix(x) @ u[..., None])[..., 0]
 
     def forcing_jacobian(self, x: Array, u: Array) -> Array:
@@ -477,8 +479,9 @@ class LiftedModel:
 
     def distance(self, x: Array) -> float:
         """Return the distance of a state (n_x,), in state units, as :meth:`distances`."""
-        x = self.states.to_deviation(self.states.array('state', x))
-        return float(self.distances(x[None])[0])
+        outside = self.states.violation(self.states.array('state', x))
+        return outside if self.training_states is None else max(outside, float(
+            self.training_states.distance(self.states.to_deviation(x), self.states.half_widths)))
 
     def distances(self, x: Array) -> Array:
         """
@@ -511,8 +514,8 @@ class LiftedModel:
         """Return the pseudo-inverse of J_N(x): (..., n_z, n_x) -> (..., n_x, n_z)."""
         if self.identity and J.shape[-1] == 1:
             # one state: a tenth of the time of a singular value decomposition
-            inverse: Array = (J / (J * J).sum(axis=-2, keepdims=True)).swapaxes(-1, -2)
-            return inverse
+            row: Array = J.swapaxes(-1, -2)
+            return row / (row @ J)
         return np.asarray(np.linalg.pinv(J), dtype=np.float64)
 
     @cached_property

@@ -99,12 +99,12 @@ class NetworkObservables(Observables):
         """Return the lift z = x."""
         return cls(np.zeros((0, n_x)), np.zeros(0), np.zeros((0, 0)), identity=True)
 
-    @property
+    @cached_property
     def n_x(self) -> int:
         """Number of states."""
         return self.W.shape[1]
 
-    @property
+    @cached_property
     def n_z(self) -> int:
         """Number of lifted coordinates."""
         return len(self.V) + (self.n_x if self.identity else 0)
@@ -121,40 +121,43 @@ class NetworkObservables(Observables):
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
-        return self._lifted(x, np.tanh(x @ self.W.T + self.b))
+        return self._lifted(x, self._hidden(x))
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x); shapes as in the interface."""
-        h = np.tanh(x @ self.W.T + self.b)
-        return self._lifted(x, h), self._jacobian(1.0 - h * h)
+        h = self._hidden(x)
+        return self._lifted(x, h), self._bent(1.0 - h * h) + self._of_states
 
     def lift_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
         """Evaluate N(x), J_N(x) and the derivatives of J_N; shapes as in the interface."""
-        h, n = np.tanh(x @ self.W.T + self.b), self.n_x
+        h, n = self._hidden(x), self.n_x
         slope = 1.0 - h * h
         products = (self.W[:, :, None] * self.W[:, None, :]).reshape(-1, n * n)
         bend = (self.V * (-2.0 * h * slope)[..., None, :]) @ products
         states = np.zeros((*x.shape[:-1], self.n_z - len(self.V), n, n))
-        return (self._lifted(x, h), self._jacobian(slope), np.concatenate(
+        return (self._lifted(x, h), self._bent(slope) + self._of_states, np.concatenate(
             (states, bend.reshape(*bend.shape[:-1], n, n)), axis=-3))
 
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
         """Evaluate the secants, by divided differences of tanh and of its slope."""
-        a, a_ref = arguments = np.array((x, x_ref)) @ self.W.T + self.b
+        a, a_ref = arguments = np.array((x, x_ref)).dot(self.W.T) + self.b
         h, h_ref = np.tanh(arguments)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
-        apart = a - a_ref + np.copysign(1e-300, a - a_ref)
+        apart = a - a_ref
+        apart += np.copysign(1e-300, apart)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
-        J, M, H = self._bent(np.array((
-            1.0 - h * h, secant, -(h + h_ref) * secant * (self.W @ w))))
-        return J + self._of_states, M + self._of_states, H
+        found = self._bent(np.array((
+            1.0 - h * h, secant, -(h + h_ref) * secant * self.W.dot(w))))
+        found[:2] += self._of_states
+        J, M, H = found
+        return J, M, H
+
+    def _hidden(self, x: Array) -> Array:
+        return np.tanh(x @ self.W.T + self.b)
 
     def _lifted(self, x: Array, h: Array) -> Array:
         free: Array = (h - self.value_at_zero) @ self.V.T
         return np.concatenate((x, free), axis=-1) if self.identity else free
-
-    def _jacobian(self, slope: Array) -> Array:
-        return self._bent(slope) + self._of_states
 
     def _bent(self, slope: Array) -> Array:
         """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""

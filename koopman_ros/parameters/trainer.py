@@ -131,7 +131,8 @@ class TrainerParameters(SignalParameters):
     experiment_min_hold_time: float = parameter(30.0, 'Shortest step.', 's', 0.01, 1e6)
     experiment_max_hold_time: float = parameter(120.0, 'Longest step.', 's', 0.01, 1e6)
     experiment_timeout: float = parameter(
-        10.0, 'Wall time without a newer measurement after which the experiment is aborted.', 's',
+        10.0, 'Wall time without a newer measurement, or in which the controller does not follow, '
+              'after which the experiment is aborted.', 's',
         0.0, 86400.0, open_minimum=True)
     experiment_seed: int = parameter(
         0, 'Random seed of the steps.', '', 0, 2 ** 31)
@@ -202,8 +203,8 @@ class TrainerParameters(SignalParameters):
         0.1, 'A new model is accepted if its held-out error is smaller than that of the current '
              'model and of the best linear model by at least this fraction.', '', 0.0, 0.99)
     max_condition_number: float = parameter(
-        1e4, 'Largest accepted condition number of learned coordinates.', '', 1.0, 1e12,
-        open_minimum=True)
+        1e4, 'Largest accepted condition number of learned coordinates, over that of the states '
+             'among them.', '', 1.0, 1e12, open_minimum=True)
 
     states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
     measured_min: Array = value_column(

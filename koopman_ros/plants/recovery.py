@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.core.solvers import runge_kutta_step, solve_riccati
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem
 
 # Of half the box: so near the nominal state the linear law holds the plant.
@@ -48,7 +48,7 @@ def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike
     half, half_u = 0.5 * (upper - lower), 0.5 * (highest - lowest)
     A, B = system.slope(x0, u0), system.input_matrix(x0)
     riccati = solve_riccati(A, B, np.diag(half ** -2.0), np.diag(half_u ** -2.0))
-    if riccati.status is not RiccatiStatus.SOLVED:
+    if not riccati.solved:
         raise ValueError(f'{system.name}: no state feedback stabilises its nominal state; choose '
                          'another nominal state, or add an input that acts on the unstable modes')
     closed = np.linalg.eigvals(A - B @ riccati.K)

@@ -50,8 +50,7 @@ from koopman_ros.ros.signals import (
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _TICK = 0.1  # s
-_DEVIATIONS = 10  # commands of a controller, and
-_DEVIATION_TIME = 1.0  # s, after which it is said not to follow
+_DEVIATIONS = 10  # commands in `experiment_timeout` after which a controller is said not to follow
 _RETURN_TIME = 2.0  # s for the way back at the end of the process
 _ACKNOWLEDGE_TIME = 0.2  # s for the last command to arrive
 
@@ -251,8 +250,6 @@ class ExperimentRun:
         assert self.progress is not None
         newest_ns, was_running = self.progress.time_ns, self.running
         self._frame_id = frame_id
-        if self._on_setpoints and not self._is_followed(self._tracked, StatusCode.NOT_TRACKED):
-            return
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         if self.progress.time_ns != newest_ns:
             # a stamp that does not advance is no new measurement
@@ -284,10 +281,21 @@ class ExperimentRun:
         self._publisher.send(values, stamp_message(stamp_ns), self._frame_id)
 
     def _on_command(self, received: SignalSample) -> None:
-        """Check that the controller follows the manual commands."""
+        """Check that the controller follows the requests, by its own answers."""
         self._wait.look()
-        if self.progress is not None and not self._on_setpoints:
-            self._is_followed(received.values, StatusCode.NOT_FOLLOWED)
+        if self.progress is None:
+            return
+        values, code = (self._tracked, StatusCode.NOT_TRACKED) if self._on_setpoints else (
+            received.values, StatusCode.NOT_FOLLOWED)
+        now = time.monotonic()
+        for i, name in enumerate(self._units):
+            if name not in values:
+                continue
+            value, asked = values[name], float(self.progress.command[i])
+            monitor = self._monitors[i] = self._monitors[i].after(value, asked, now)
+            if monitor.deviations >= _DEVIATIONS and now - monitor.since >= self._timeout:
+                self._on_end(reason(code, signal=name, value=value, requested=asked))
+                return
 
     def _on_record(self, message: String) -> None:
         """Check that the controller stays in automatic mode."""
@@ -300,20 +308,6 @@ class ExperimentRun:
                     self._on_end(why)
                 elif not self.started.done():
                     self.started.set_result(why)
-
-    def _is_followed(self, values: Mapping[str, float], code: StatusCode) -> bool:
-        """Return whether the controller follows the requests; end the experiment if not."""
-        assert self.progress is not None
-        now = time.monotonic()
-        for i, name in enumerate(self._units):
-            if name not in values:
-                continue
-            value, asked = values[name], float(self.progress.command[i])
-            monitor = self._monitors[i] = self._monitors[i].after(value, asked, now)
-            if monitor.deviations >= _DEVIATIONS and now - monitor.since >= _DEVIATION_TIME:
-                self._on_end(reason(code, signal=name, value=value, requested=asked))
-                return False
-        return True
 
     def _on_tick(self) -> None:
         """Check for other publishers and for missing measurements."""

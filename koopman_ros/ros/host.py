@@ -202,7 +202,6 @@ def _destroy(node: HostedNode) -> None:
     node.destroy_node()
 
 
-
 def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None, file: str,
               arrived: Sequence[int]) -> int:
     """

@@ -168,7 +168,6 @@ class MeasuredInputs:
         near = all(abs(self.get(name)[0] - stamp_ns) <= tolerance_ns for name in self._names)
         return self.latest if near else None
 
-
     def with_ages(self, stamp_ns: int) -> tuple[Array | None, Array | None]:
         """Return the last values (n,) and their ages in s at a time; None without signals."""
         if not self._names:

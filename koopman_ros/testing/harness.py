@@ -255,6 +255,18 @@ class Harness:
         return self.call(SetParameters, f'{node}/set_parameters', SetParameters.Request(
             parameters=_parameters(values))).results
 
+    def rejected_parameters(self, node: str, **values: Any) -> list[str]:
+        """Set parameters one by one; return why, of each that is rejected."""
+        reasons = []
+        for name, value in values.items():
+            # on a busy machine reading a model takes longer than a loop may wait for it
+            while 'still being read' in (reason := ''.join(
+                    result.reason for result in self.set_parameters(node, **{name: value})
+                    if not result.successful)):
+                pass
+            reasons += [reason] if reason else []
+        return reasons
+
     def set_parameters_atomically(self, node: str, **values: Any) -> SetParametersResult:
         """Set parameters all or none."""
         return self.call(

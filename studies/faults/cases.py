@@ -14,7 +14,7 @@ from typing import Any
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from studies.faults import interceptor, late, operators, processes, silence
+from studies.faults import interceptor, operators, processes, silence
 from studies.faults.case import FaultCase
 from studies.faults.interceptor import delayed, frozen, lost, noise, Packet, stamped, twice, value
 from studies.faults.operators import altered, changed_for_good, Maker, REQUESTS, scaled
@@ -50,6 +50,20 @@ def _on(on: FaultPlant, group: str, name: str, does: str, play: Callable[..., No
     return FaultCase(group, f'{on.name}-{name}', does, play, **{
         'on': on, 'setpoint': on.setpoint, 'settle': on.settle, 'afterwards': on.afterwards,
         'recovery': on.recovery, 'band': on.band, **details})
+
+
+def _altered(case: Callable[..., FaultCase], group: str, name: str, does: str, make: Maker,
+             seconds: float, code: StatusCode | None = None, *, step: tuple[float, ...] = (),
+             what: str = 'measurements', wait: float = 0.0, **details: Any) -> FaultCase:
+    """
+    Return a case whose messages are altered for some seconds.
+
+    :param case: makes it, on a plant.
+    :param step: set-point that is requested before, if any; `wait` s before.
+    """
+    return case(group, name, f'{does}, {"while the set-point steps, " * bool(step)}{seconds:g} s',
+                partial(altered, make=make, seconds=seconds, setpoint=step, what=what, wait=wait),
+                between=True, code=code, **details)
 
 
 # Alterations.
@@ -88,20 +102,8 @@ def _twice() -> interceptor.Alteration:
 
 # The reactor: one temperature, one coolant.
 
-def _sensor(name: str, does: str, make: Maker, seconds: float, code: StatusCode | None = None,
-            **details: Any) -> FaultCase:
-    return FaultCase('sensor', name, f'{does}, {seconds:g} s',
-                     partial(altered, make=make, seconds=seconds), True, code=code, **details)
-
-
-def _in_a_step(group: str, name: str, does: str, make: Maker, seconds: float, *,
-               what: str = 'measurements', largest_step: float = 2.0, **details: Any) -> FaultCase:
-    return FaultCase(group, name, f'{does}, while the set-point steps, {seconds:g} s',
-                     partial(altered, make=make, seconds=seconds, setpoint=REACTOR.other,
-                             what=what),
-                     True, largest_step=largest_step, **details)
-
-
+_sensor = partial(_altered, FaultCase, 'sensor')
+_in_a_step = partial(_altered, FaultCase, step=REACTOR.other, largest_step=2.0)
 _clock = partial(_in_a_step, 'clocks')
 _MESSAGES = (
     _sensor('nan-short', 'NaN', _shows(math.nan), 5.0, StatusCode.NOT_FINITE),
@@ -120,10 +122,8 @@ _MESSAGES = (
     _sensor('spikes', 'a spike of +20 K in every seventh sample',
             _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, StatusCode.JUMPED),
     _sensor('frozen-at-rest', 'bit-identical values', frozen, 120.0),
-    FaultCase('sensor', 'frozen-in-a-step',
-              'bit-identical values, 10 s after a step of the set-point, '
-              '90 s', partial(altered, make=frozen, seconds=90.0, setpoint=(42.0,), wait=10.0),
-              True, code=StatusCode.FROZEN),
+    _sensor('frozen-in-a-step', 'bit-identical values', frozen, 90.0, StatusCode.FROZEN,
+            step=(42.0,), wait=10.0),
     _sensor('drift', 'drifts by 1 K/min', _shifted(lambda seconds: seconds / 60.0), 180.0),
     FaultCase('sensor', 'bias', 'wrong by +2 K, 300 s and more', operators.biased, True,
               recovery=360.0, afterwards=420.0),
@@ -295,19 +295,13 @@ _OPERATORS = (
 def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
     last, half = on.states[-1], on.period / 2.0
     long, short = 60.0 * on.period, 10.0 * on.period
-    step = {'largest_step': 2.0 * on.rate * on.period}
+    every = partial(_altered, partial(_on, on), step=on.other,
+                    largest_step=2.0 * on.rate * on.period)
 
     def one(name: str, does: str, make: Maker, seconds: float = short,
             code: StatusCode | None = None, group: str = 'sensor', **details: Any) -> FaultCase:
-        return _on(on, group, name, f'{last}: {does}, {seconds:g} s', partial(
-            altered, make=lambda: interceptor.part(make(), last), seconds=seconds,
-            setpoint=on.other), between=True, code=code, **{**step, **details})
-
-    def every(name: str, does: str, make: Maker, seconds: float = short, group: str = 'clocks',
-              what: str = 'measurements', **details: Any) -> FaultCase:
-        return _on(on, group, name, f'all: {does}, {seconds:g} s', partial(
-            altered, make=make, seconds=seconds, setpoint=on.other, what=what), between=True,
-            **{**step, **details})
+        return every(group, name, f'{last}: {does}', lambda: interceptor.part(make(), last),
+                     seconds, code, **details)
 
     yield one('nan-one', 'NaN', _shows(math.nan), code=StatusCode.NOT_FINITE)
     yield one('huge-one', '1e300', _shows(1e300), code=StatusCode.OUTSIDE_SENSOR)
@@ -324,13 +318,15 @@ def _tank_messages(on: FaultPlant) -> Iterator[FaultCase]:
     yield one('contradicted-one', f'comes twice, first {_SPIKE:g} m too high',
               _twins(_SPIKE, first=True), code=StatusCode.JUMPED)
     yield one('late-one', 'each 3 samples late', lambda: delayed(3), long, group='messages')
-    yield every('lost', '30 % lost', lambda: lost(0.3), long, 'messages')
-    yield every('commands-lost', '30 % of the commands lost', lambda: lost(0.3), long,
-                'messages', 'commands')
-    yield every('clock-stopped', 'stamps do not advance', partial(frozen, 'stamp_ns'))
-    yield every('clock-back', 'stamps jump an hour back, and then ahead', _stamps(-3600), long,
-                plant={**LOCKSTEP, 'start_time': 10_000.0})
-    yield every('clock-forward', 'stamps jump an hour ahead, and then back', _stamps(3600), long)
+    yield every('messages', 'lost', 'all: 30 % lost', lambda: lost(0.3), long)
+    yield every('messages', 'commands-lost', 'all: 30 % of the commands lost', lambda: lost(0.3),
+                long, what='commands')
+    yield every('clocks', 'clock-stopped', 'all: stamps do not advance',
+                partial(frozen, 'stamp_ns'), short)
+    yield every('clocks', 'clock-back', 'all: stamps jump an hour back, and then ahead',
+                _stamps(-3600), long, plant={**LOCKSTEP, 'start_time': 10_000.0})
+    yield every('clocks', 'clock-forward', 'all: stamps jump an hour ahead, and then back',
+                _stamps(3600), long)
     yield one('clock-apart', f'stamps {half:g} s behind those of the others', _stamps(-half),
               group='clocks')
 
@@ -352,7 +348,8 @@ def _tank_operators(on: FaultPlant) -> Iterator[FaultCase]:
                    partial(operators.storm_of_setpoints, asked=tuple(asked)), code=code)
     # the outflow below cannot be less than the inflow from above
     yield case('not-held', 'a set-point that no flow can hold together with the other',
-               operators.not_held, code=StatusCode.SETPOINT_NOT_HELD)
+               partial(operators.setpoint_rejected, asked=on.never, says='cannot be held'),
+               code=StatusCode.SETPOINT_NOT_HELD)
     yield case('mode-once', 'manual mode for 20 samples, and back, without a bump', partial(
         operators.mode_once, seconds=20.0 * on.period), bump=_TANK_BUMP)
     yield case('mode-storm', f'{REQUESTS} changes between automatic and manual mode',
@@ -400,15 +397,7 @@ _MANY = {f'{QUADRUPLE_TANK.name}-{name}' for name in (
 
 # The reactor at its saddle, where it runs away by itself; one of its states is estimated.
 
-def _saddle(group: str, name: str, does: str, make: Maker, seconds: float, *, step: bool = False,
-            what: str = 'measurements', **details: Any) -> FaultCase:
-    return _on(SADDLE, group, name, f'{does}, {seconds:g} s'
-               + (', while the set-point steps' if step else ''),
-               partial(altered, make=make, seconds=seconds,
-                       setpoint=SADDLE.other if step else (), what=what),
-               between=True, largest_step=2.0 * SADDLE.rate, **details)
-
-
+_saddle = partial(_altered, partial(_on, SADDLE), largest_step=2.0 * SADDLE.rate)
 _FEED = 76.85  # degC
 _SADDLE = (
     _saddle('sensor', 'lost', 'no measurement', lost, 5.0),
@@ -418,12 +407,13 @@ _SADDLE = (
             _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0,
             code=StatusCode.JUMPED),
     _saddle('messages', 'measurements-lost', '30 % of the measurements lost', lambda: lost(0.3),
-            120.0, step=True),
+            120.0, step=SADDLE.other),
     _saddle('messages', 'late', 'each measurement 3 samples late', lambda: delayed(3), 60.0,
-            step=True),
-    _saddle('messages', 'doubled', 'each measurement comes twice', _twice, 120.0, step=True),
-    _saddle('actuator', 'valve-stuck', 'the coolant does not move, the set-point steps before',
-            frozen, 20.0, step=True, what='commands'),
+            step=SADDLE.other),
+    _saddle('messages', 'doubled', 'each measurement comes twice', _twice, 120.0,
+            step=SADDLE.other),
+    _saddle('actuator', 'valve-stuck', 'the coolant does not move', frozen, 20.0,
+            step=SADDLE.other, what='commands'),
     *(_on(SADDLE, 'disturbances', name, f'{does}, for good',
           partial(changed_for_good, parameters=parameters), offset=0.3)
       for name, does, parameters in (
@@ -431,7 +421,8 @@ _SADDLE = (
           ('feed-warm', 'T_f +5 K', {'constants.feed_temperature': _FEED + 5.0}),
           ('feed-cold', 'T_f -5 K', {'constants.feed_temperature': _FEED - 5.0}))),
     _on(SADDLE, 'operators', 'setpoint-out-of-reach', 'a set-point of 120 degC',
-        operators.out_of_reach, code=StatusCode.SETPOINT_OUTSIDE),
+        partial(operators.setpoint_rejected, asked={reactor.TEMPERATURE: 120.0},
+                says='request rejected'), code=StatusCode.SETPOINT_OUTSIDE),
     _on(SADDLE, 'operators', 'temperature-limited', 'the temperature may not exceed '
         f'{operators.LIMIT:g} degC, 1 K below the set-point, 240 s', operators.limited),
     _on(SADDLE, 'processes', 'controller-killed', 'the controller is killed and started again',
@@ -511,36 +502,33 @@ _SILENCE = (
         '41.4 degC, and no plan of mpc meets its deadline', partial(
             altered, make=_excursion, seconds=200.0), between=True, controller=_NEVER_IN_TIME))
 
-def _line(group: str, name: str, does: str, make: Maker, seconds: float,
-          what: str = 'measurements', **details: Any) -> FaultCase:
-    return _on(HEATED_LINE, group, name, f'{does}, while the set-point steps, {seconds:g} s',
-               partial(altered, make=make, seconds=seconds, setpoint=HEATED_LINE.other,
-                       what=what), between=True, **details)
-
-
+_line = partial(_altered, partial(_on, HEATED_LINE), step=HEATED_LINE.other)
 _line_operator = partial(_on, HEATED_LINE, 'operators')
 _line_process = partial(_on, HEATED_LINE, 'processes')
 _HEATED_LINE = (
     _line('sensor', 'nan', 'temperature: NaN', _shows(math.nan), 50.0,
           code=StatusCode.NOT_FINITE),
     _on(HEATED_LINE, 'sensor', 'quality-bad', 'temperature: of bad quality, 50 s',
-        partial(late.bad_quality, seconds=50.0), code=StatusCode.BAD_QUALITY,
-        controller={'temperature.quality_topic': late.QUALITY}),
-    _line('sensor', 'feed-nan', 'feed temperature: NaN', _shows(math.nan), 600.0, 'disturbances',
+        partial(operators.bad_quality, seconds=50.0), code=StatusCode.BAD_QUALITY,
+        controller={'temperature.quality_topic': operators.QUALITY}),
+    _line('sensor', 'feed-nan', 'feed temperature: NaN', _shows(math.nan), 600.0,
+          what='disturbances',
           says=('^controller: .*feed_temperature is nan',)),
-    _line('sensor', 'feed-lost', 'feed temperature: no measurement', lost, 600.0, 'disturbances',
+    _line('sensor', 'feed-lost', 'feed temperature: no measurement', lost, 600.0,
+          what='disturbances',
           says=('^controller: control: .*no measurement of feed_temperature',)),
     _line('sensor', 'feed-late', 'feed temperature: 12 samples late', lambda: delayed(12), 600.0,
-          'disturbances'),
-    _line('sensor', 'analyser-lost', 'analyser: no value', lost, 1200.0, 'late'),
-    _line('sensor', 'analyser-nan', 'analyser: NaN', _shows(math.nan), 1200.0, 'late',
+          what='disturbances'),
+    _line('sensor', 'analyser-lost', 'analyser: no value', lost, 1200.0, what='late'),
+    _line('sensor', 'analyser-nan', 'analyser: NaN', _shows(math.nan), 1200.0,
+          what='late',
           code=StatusCode.ANALYSIS_REJECTED),
     _line('sensor', 'analyser-late', 'analyser: each value later than analysis_delay',
-          lambda: delayed(2), 1200.0, 'late', code=StatusCode.ANALYSIS_REJECTED),
+          lambda: delayed(2), 1200.0, what='late', code=StatusCode.ANALYSIS_REJECTED),
     _line('messages', 'measurements-lost', '30 % of the measurements lost', lambda: lost(0.3),
           600.0),
     _line('messages', 'commands-lost', '30 % of the commands lost', lambda: lost(0.3), 600.0,
-          'commands'),
+          what='commands'),
     _line('clocks', 'clock-back', 'stamps jump an hour back, and then ahead', _stamps(-3600),
           600.0, plant={**LOCKSTEP, 'start_time': 10_000.0}),
     _line_process('controller-killed', 'the controller is killed while the set-point steps, and '
@@ -551,16 +539,16 @@ _HEATED_LINE = (
                   partial(processes.plant_again, number=signal.SIGKILL)),
     *(_line_process(f'reloaded-{seconds:g}', f'the model is reloaded with a dead time of '
                     f'{seconds:g} s, while the set-point steps',
-                    partial(late.reloaded, seconds=seconds)) for seconds in (32.0, 58.0)),
+                    partial(processes.reload_later, seconds=seconds)) for seconds in (32.0, 58.0)),
     _line_operator('modes', 'between manual and automatic mode every 15 s, while the set-point '
-                   'steps', late.modes_in_a_step),
+                   'steps', operators.modes_in_a_step),
     _line_operator('mode-storm', f'{REQUESTS} changes between automatic and manual mode',
                    operators.storm_of_modes),
     _line_operator('bad-values-storm', f'{REQUESTS} parameters that cannot be',
                    partial(operators.storm_of_parameters,
                            make=lambda: _cycled(rejected_values(HEATED_LINE)), rejected=True)),
     _line_operator('latched', 'NaN until the safe input is latched, which is cleared then',
-                   partial(late.latched, alteration=_shows(math.nan)(), seconds=200.0),
+                   partial(operators.latched, alteration=_shows(math.nan)(), seconds=200.0),
                    between=True, controller={'safe_latch': True}),
     *(_on(HEATED_LINE, 'disturbances', name, f'{does}, for good, and the set-point steps',
           partial(changed_for_good, parameters=parameters, setpoint=HEATED_LINE.other), **details)

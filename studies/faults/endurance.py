@@ -82,7 +82,7 @@ def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None
             loop.ask(temperature=celsius)
         case 'weights':
             name = f'{day.on.inputs[0]}.weight'
-            loop.set_parameters('controller', **{
+            loop.ros.rejected_parameters('controller', **{
                 name: day.on.default(name) * float(10.0 ** random.uniform(-1.0, 1.0)),
                 'temperature.weight': float(random.choice([1.0, math.nan]))})
         case 'manual mode':
@@ -90,7 +90,7 @@ def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None
             loop.run_for(float(random.uniform(5.0, day.manual)))
             loop.ros.set_bool('controller/set_automatic', True)
         case 'model':
-            loop.set_parameters('controller', model=str(random.choice(day.models)))
+            loop.ros.rejected_parameters('controller', model=str(random.choice(day.models)))
             loop.ros.trigger('controller/reload_model')
         case 'plant reset':
             loop.ros.trigger('plant/reset')

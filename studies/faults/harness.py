@@ -17,14 +17,18 @@ import time
 from types import TracebackType
 from typing import Any, TypeVar
 
-from rclpy.publisher import Publisher
-
-from koopman_ros.core.message_fields import MessageField
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
 from studies.faults.case import FaultCase, LoopTrace
-from studies.faults.interceptor import Alteration, Interceptor, message_of, remapped, unchanged
+from studies.faults.interceptor import (
+    Alteration,
+    Interceptor,
+    Packet,
+    remapped,
+    Sender,
+    unchanged,
+)
 from studies.faults.judge import judge
 from studies.faults.plants import FaultPlant, REACTOR
 
@@ -98,13 +102,12 @@ class FaultHarness:
         self._deadline = time.monotonic() + limit
         self._check = check
         self._between = between
-        self._spoken: list[Publisher] = []
         self.ros = Harness(folder, name='operator', timeout=PATIENCE, lasting=True,
                            each_turn=self._each_turn)
         self.interceptor = Interceptor(self.ros.node, on, between)
         self.trace = self.interceptor.trace
-        self._asks = self._publishers(on.wiring.setpoints)
-        self._hands = self._publishers(on.wiring.manual)
+        self._setpoints, self._manual = (
+            Sender(self.ros.node, places) for places in (on.wiring.setpoints, on.wiring.manual))
 
     def __enter__(self) -> FaultHarness:
         return self
@@ -170,37 +173,19 @@ class FaultHarness:
 
     # The operator.
 
-    def _publishers(self, places: Mapping[str, MessageField]
-                    ) -> dict[str, Callable[[float], None]]:
-        """Return a function that publishes a value of each signal."""
-        made: dict[str, Callable[[float], None]] = {}
-        for topic, kind, names in by_topic(places):
-            publisher = self.ros.node.create_publisher(kind, topic, topics.LOOP_QOS)
-            self._spoken.append(publisher)
-            for name in names:
-                made[name] = partial(self._speak, publisher, kind, name, places)
-        return made
-
-    @staticmethod
-    def _speak(publisher: Publisher, kind: Any, name: str, places: Mapping[str, MessageField],
-               value: float) -> None:
-        publisher.publish(message_of(kind, places, {name: value}))
-
     def _meet_controller(self) -> None:
         self.ros.meet('controller')
-        for publisher in self._spoken:
+        for publisher in (*self._setpoints.publishers, *self._manual.publishers):
             self.wait(publisher.get_subscription_count,
                       f'no node subscribes to {publisher.topic_name}')
 
     def ask(self, **values: float) -> None:
         """Ask for set-points by signal, which the trace is not to hold."""
-        for name, value in values.items():
-            self._asks[name](value)
+        self._setpoints(Packet(0, values))
 
     def by_hand(self, *values: float) -> None:
         """Command the inputs as an operator does in manual mode."""
-        for name, value in zip(self.on.inputs, values, strict=True):
-            self._hands[name](value)
+        self._manual(Packet(0, dict(zip(self.on.inputs, values, strict=True))))
 
     def request(self, *values: float) -> None:
         """Request set-points of all controlled states."""
@@ -236,10 +221,10 @@ class FaultHarness:
             node.destroy_subscription(subscription)
         self.trace.setpoints.append((self.now, values))
 
-    def set_parameters(self, node: str, **values: Any) -> list[str]:
-        """Set parameters one by one; return why they were rejected, if any was."""
-        return [result.reason for result in self.ros.set_parameters(node, **values)
-                if not result.successful]
+    def set_parameters(self, node: str, **values: Any) -> None:
+        """Set parameters, none of which may be rejected."""
+        reasons = self.ros.rejected_parameters(node, **values)
+        self.expect(not reasons, f'{node}: rejected: {reasons}')
 
     @property
     def now(self) -> float:

@@ -144,6 +144,23 @@ def delayed(messages: int) -> Alteration:
     return alter
 
 
+class Sender:
+    """Publishes packets, the values of one topic in one message."""
+
+    def __init__(self, node: Node, places: Mapping[str, MessageField], before: str = '') -> None:
+        self._places = places
+        self._parts = [(node.create_publisher(kind, f'{before}{topic}', topics.LOOP_QOS), kind,
+                        names) for topic, kind, names in by_topic(places)]
+        self.publishers = [publisher for publisher, *_ in self._parts]
+
+    def __call__(self, packet: Packet) -> None:
+        """Publish the values of a packet."""
+        for publisher, kind, names in self._parts:
+            own = {name: packet.values[name] for name in names if name in packet.values}
+            if own:
+                publisher.publish(message_of(kind, self._places, own, packet.stamp_ns))
+
+
 class Interceptor:
     """
     A trace of the messages of plant and controller.
@@ -176,11 +193,11 @@ class Interceptor:
         self._assembler = SampleSynchronizer(on.states)
         wiring, self._parts = on.wiring, list(by_topic(on.wiring.measured))
         if between:
-            self._to_controller = self._publishers(wiring.measured)
-            self._to_plant = self._publishers(wiring.commands, _BEHIND)
+            self._to_controller = Sender(node, wiring.measured)
+            self._to_plant = Sender(node, wiring.commands, _BEHIND)
             for kind, places in (('disturbances', wiring.measured_disturbances),
                                  ('late', wiring.late)):
-                self._listen(places, partial(self._pass_on, kind, self._publishers(places)),
+                self._listen(places, partial(self._pass_on, kind, Sender(node, places)),
                              before=_BEHIND)
         for kind, topic, callback, qos in (
                 (DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS),
@@ -206,20 +223,6 @@ class Interceptor:
         on = self.trace.on
         self._listen(on.wiring.measured, _whole(on.states, self._on_states),
                      before=_BEHIND if self._between else '')
-
-    def _publishers(self, places: Mapping[str, MessageField], before: str = ''
-                    ) -> Callable[[Packet], None]:
-        """Return a function that publishes a packet, the values of one topic in one message."""
-        parts = [(self._node.create_publisher(kind, f'{before}{topic}', topics.LOOP_QOS), kind,
-                  names) for topic, kind, names in by_topic(places)]
-
-        def publish(packet: Packet) -> None:
-            for publisher, kind, names in parts:
-                own = {name: packet.values[name] for name in names if name in packet.values}
-                if own:
-                    publisher.publish(message_of(kind, places, own, packet.stamp_ns))
-
-        return publish
 
     def _listen(self, places: Mapping[str, MessageField], hear: Callable[[Packet], None],
                 qos: QoSProfile = topics.LOOP_QOS, before: str = '') -> list[Subscription]:

@@ -3,6 +3,7 @@
 
 """Processes that end, hang and come back, their files, and their neighbours on the machine."""
 
+from dataclasses import replace
 import os
 from pathlib import Path
 import re
@@ -12,12 +13,14 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.core.paths import model_path
+from koopman_ros.model import load, save
 from koopman_ros.records import read_messages
 from studies.faults.harness import FaultHarness, SkipError
 from studies.faults.plants import LOCKSTEP
@@ -133,11 +136,7 @@ def reload(loop: FaultHarness, spoil: str) -> None:
     """Spoil or change the model file, and load it again."""
     file = loop.folder / 'lift.safetensors'
     shutil.copy(model_path('reactor_nz4'), file)
-    # on a busy machine reading takes longer than the loop may stand still for it
-    while 'still being read' in (rejected := str(loop.set_parameters(
-            'controller', model=str(file)))):
-        pass
-    loop.expect(rejected == '[]', f'the model was rejected: {rejected}')
+    loop.set_parameters('controller', model=str(file))
     with loop.fault():
         if spoil == 'deleted':
             file.unlink()
@@ -154,6 +153,17 @@ def reload(loop: FaultHarness, spoil: str) -> None:
             loop.expect(not answer.success, 'a spoilt model was accepted')
             loop.expect('the current model is kept' in answer.message,
                         f'the reason: {answer.message}')
+
+
+def reload_later(loop: FaultHarness, seconds: float) -> None:
+    """Load the model with another dead time while inputs are on their way."""
+    model = load(model_path(loop.on.name))
+    file = loop.folder / 'late.safetensors'
+    save(replace(model, dead_time=np.full(model.n_u, seconds)), file)
+    loop.request(*loop.on.other)
+    loop.run_for(20.0)
+    with loop.fault():
+        loop.set_parameters('controller', model=str(file))
 
 
 def second_controller(loop: FaultHarness, says: tuple[str, ...] = TWO_CONTROLLERS) -> None:

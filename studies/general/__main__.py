@@ -5,8 +5,7 @@
 
 import sys
 
-from studies.campaign import Campaign, conclude, read_options, run_campaign
-from studies.general import coordinates
+from studies.campaign import conclude, read_options, run_campaign
 from studies.general.report import write_report
 from studies.general.study import EXPERIMENTS
 
@@ -14,21 +13,13 @@ from studies.general.study import EXPERIMENTS
 def main(args: list[str] | None = None) -> int:
     """Run the study and write the report."""
     options = read_options(
-        args, 'general', 'Apply the law on models of several classes to plants that it was not '
-        'made for.', 'out/studies-general', 10, 'joblib', EXPERIMENTS)
+        args, 'studies.general', 'Apply the law on models of several classes to plants that it '
+        'was not made for.', 'out/studies-general', 10, 'joblib', EXPERIMENTS)
     names = options.plants or list(EXPERIMENTS)
-
-    def run() -> Campaign:
-        campaign = run_campaign(options.seeds, {name: EXPERIMENTS[name] for name in names},
-                                options.scheduler)
-        if campaign.complete:
-            campaign.add(run_campaign(min(options.seeds, coordinates.SEEDS), {
-                name: coordinates.EXPERIMENTS[name] for name in (
-                    f'{coordinates.PLACE}/{name}' for name in names)}, options.scheduler))
-        return campaign
-
-    return conclude(options.seeds, options.output, run,
-                    lambda _, summary: write_report(summary, options.output))
+    return conclude(
+        options.seeds, options.output, lambda: run_campaign(
+            options.seeds, {name: EXPERIMENTS[name] for name in names}, options.scheduler),
+        lambda _, summary: write_report(summary, options.output))
 
 
 if __name__ == '__main__':

@@ -38,8 +38,8 @@ SENSOR_EXPERIMENTS: dict[str, Experiment] = {
 def main(args: list[str] | None = None) -> int:
     """Run the experiments and write the report."""
     options = read_options(
-        args, 'paper', "Reproduce the paper's experiments, or learn from sensor data, each from "
-        'several seeds.', 'out/studies', 20, 'joblib',
+        args, 'studies.paper', "Reproduce the paper's experiments, or learn from sensor data, "
+        'each from several seeds.', 'out/studies', 20, 'joblib',
         flags={'sensors': "learn from noisy, sampled data instead of the paper's experiments "
                           '(default folder: out/studies-sensors)'})
     output: Path = options.output

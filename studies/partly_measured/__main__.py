@@ -23,8 +23,8 @@ _PACKAGES = ('numpy', 'casadi', 'do-mpc', 'daqp', 'control')
 def main(args: list[str] | None = None) -> int:
     """Run every controller on every plant from several seeds."""
     options = read_options(
-        args, 'partly_measured', 'Control partly measured plants, compared with do-mpc and an '
-        'LQG.', 'out/studies-partial', 10, plants=CASES)
+        args, 'studies.partly_measured', 'Control partly measured plants, compared with do-mpc '
+        'and an LQG.', 'out/studies-partial', 10, plants=CASES)
     found = {}
     for plant in options.plants or CASES:
         case = CASES[plant]

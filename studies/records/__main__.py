@@ -124,8 +124,9 @@ def campaign_of(names: Sequence[str], folder: Path, output: Path, seeds: int, sc
 def main(args: list[str] | None = None) -> int:
     """Run the sets that are there."""
     options = read_options(
-        args, 'records', 'Learn models of measured records with default settings, compared with '
-        'other methods.', 'out/studies-records', 3, 'joblib', SETS, records='../shared/records')
+        args, 'studies.records', 'Learn models of measured records with default settings, '
+        'compared with other methods.', 'out/studies-records', 3, 'joblib', SETS,
+        records='../shared/records')
     if not options.records.is_dir():
         print(f'there is no folder {options.records}: give it by RECORDS=folder; {_HELP}. '
               'Simulated records only.', file=sys.stderr)

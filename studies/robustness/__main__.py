@@ -18,16 +18,16 @@ from studies.robustness.study import study
 def main(args: list[str] | None = None) -> int:
     """Run the study and write the report."""
     options = read_options(
-        args, 'robustness', 'Compute margins, region of attraction, disturbances, noise and the '
-        'fallback of narrow data.', 'out/studies-robustness', scheduler='')
+        args, 'studies.robustness', 'Compute margins, region of attraction, disturbances, noise '
+        'and the fallback of narrow data.', 'out/studies-robustness', scheduler='')
     output: Path = options.output
     start = time.monotonic()
     with backend_of(options.scheduler) as backend:
-        found = study(backend)
+        figures, courses = study(backend)
     seconds = round(time.monotonic() - start, 1)
     write_figures(output / 'summary.json', {
-        'package_version': __version__, 'wall_seconds': seconds, **found.figures})
-    write_report(found, output)
+        'package_version': __version__, 'wall_seconds': seconds, **figures})
+    write_report(figures, courses, output)
     print(f'wrote {output}/report.md, summary.json and figures in {seconds:.0f} s')
     return 0
 

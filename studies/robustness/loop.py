@@ -106,24 +106,37 @@ def worst(run: Simulation) -> str:
     return max(run.levels, key=run.loop.controller.order.levels.index)
 
 
-def run_loop(controller: Controller, system: plants.ControlAffineSystem, x0: Array,
-             coolant: float, seconds: float, events: Iterable[evaluation.ScheduledChange] = (), *,
-             actuator: plants.Actuator | None = None, tells: bool = False, noise: float = 0.0,
-             **others: Any) -> Simulation:
+def overshoot(run: Simulation, reference: float, since: float) -> float:
+    """Return how far the last state falls below a reference from a time on; 0 for not."""
+    return max(0.0, float(np.max(-errors(run, reference, since))))
+
+
+def run_loop(controller: Controller, system: plants.ControlAffineSystem, seconds: float,
+             events: Iterable[evaluation.ScheduledChange] = (), *, x0: Iterable[float] = (START,),
+             coolant: float | None = None, actuator: plants.Actuator | None = None,
+             tells: bool = False, noise: float = 0.0, **others: Any) -> Simulation:
     """
     Simulate a loop whose controller takes over from an applied input at the state x0 (n,).
 
     :param controller: it measures the plant's last n_x states.
+    :param coolant: applied until then, in K; None for the one that holds x0.
     :param tells: whether the applied input is measured.
     :param noise: standard deviation of the measurement, in state units.
     :param others: of :func:`simulate`.
     """
-    held = np.array([coolant])
-    plant = plants.Process(system, 0, np.asarray(x0, dtype=np.float64), held,
-                           actuator or plants.Actuator(), held)
+    x = np.array([*x0], dtype=np.float64)
+    held = plants.equilibrium_input(system, x) if coolant is None else np.array([coolant])
+    plant = plants.Process(system, 0, x, held, actuator or plants.Actuator(), held)
     n_x = controller.model.n_x
     return evaluation.simulate(
         controller, plant, [evaluation.at(0.0, control.Initialisation(held)), *events],
         duration=seconds, C=np.eye(system.n_x)[-n_x:],
         noise=np.full(n_x, noise) if noise else None,
         input_sensor=evaluation.perfect if tells else None, **others)
+
+
+def run_late(model: LiftedModel, dead_time: float, system: plants.ControlAffineSystem,
+             seconds: float, *events: evaluation.ScheduledChange, **others: Any) -> Simulation:
+    """Run the loop by the default parameters from rest, behind a dead time in s."""
+    return run_loop(reactor_controller(model=model, bandwidth=None), system, seconds, events,
+                    actuator=plants.Actuator(dead_time=dead_time), **others)

@@ -39,9 +39,8 @@ class Trial:
     def run(self, controller: Controller) -> Simulation:
         """Drive the true reactor to its steady state."""
         return loop.run_loop(
-            controller, REACTOR, np.array([self.temperature]), loop.COOLANT, SECONDS,
-            [at(0.0, loop.at_setpoint(START)), *self.changes],
-            stop=lambda x, *_: bool(x[0] > 420.0))
+            controller, REACTOR, SECONDS, [at(0.0, loop.at_setpoint(START)), *self.changes],
+            x0=[self.temperature], coolant=loop.COOLANT, stop=lambda x, *_: bool(x[0] > 420.0))
 
 
 TRIALS = (

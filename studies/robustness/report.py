@@ -6,7 +6,7 @@
 from collections.abc import Iterable, Mapping
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from matplotlib.axes import Axes
 import numpy as np
@@ -14,11 +14,18 @@ import numpy as np
 from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend, Picture, table
 from koopman_ros.core.status import level_words
 from studies import report
-from studies.robustness import disturbances, narrow
+from studies.robustness import disturbances, narrow, stability
 from studies.robustness.loop import BANDWIDTH, shipped_model, START
-from studies.robustness.stability import End, hottest_cooled
-from studies.robustness.study import BANDWIDTHS, COOLANT_WEIGHTS, Found, TEMPERATURES
+from studies.robustness.stability import End, hottest_cooled, Margins
+from studies.robustness.study import (
+    BANDWIDTHS,
+    COOLANT_WEIGHTS,
+    Courses,
+    margin_name,
+    TEMPERATURES,
+)
 
+Figures: TypeAlias = Mapping[str, Any]  # of the study, by their names in its summary
 _MARKS: dict[End, dict[str, Any]] = {
     End.LEARNED: {'marker': 'o', 'color': 'tab:green'},
     End.LINEAR: {'marker': 's', 'color': 'tab:blue'},
@@ -33,33 +40,33 @@ _PATHS: dict[str, dict[str, Any]] = {
     'wide': {'color': '0.5', 'linestyle': ':', 'label': 'lift of wide data, fallback'}}
 
 
-def write_report(found: Found, folder: Path) -> None:
+def write_report(figures: Figures, courses: Courses, folder: Path) -> None:
     """Write tables and pictures."""
-    figures = found.figures
-    ends = found.grids[True], found.grids[False], found.two_state_grid
+    attraction = figures['attraction']
+    ends = [[*attraction[name].values()]
+            for name in ('fallback=True', 'fallback=False', 'two_state')]
     report.write(folder, 'How far the loop can be pushed', [
-        '## Margins, smallest over the trained range', _margin_table(found),
+        '## Margins, smallest over the trained range', _margin_table(figures),
         '## Disturbances: deviation of the temperature; of steps, overshoot',
         _table(figures['disturbances']),
         '## A step by −10 K with a coolant whose dead time is wrong',
         _table(figures['wrong_dead_time']),
-        '## Noise of 0.1 K at 1 Hz, and the time after UA −20 % and a step by −10 K',
+        '## Noise of 0.1 K at 1 Hz, and the time after UA −20 %',
         _table(figures['noise']),
         '## Region of attraction',
         'Under the coldest coolant the reactor heats up by itself above '
         f'{hottest_cooled():.2f} K. The hottest start that comes back:',
-        _table(figures['attraction']['hottest_start']),
+        _table(attraction['hottest_start']),
         table(('of all starts', 'with fallback', 'without', 'two-state reactor'), [
-            (end.value, *(sum(one is end for one in grid.values()) for grid in ends))
-            for end in End]),
-        'Back from the safe coolant:', _table(figures['attraction']['from_the_safe_coolant']),
+            (end.value, *(grid.count(end.value) for grid in ends)) for end in End]),
+        'Back from the safe coolant:', _table(attraction['from_the_safe_coolant']),
         f'## Narrow data: within ±{narrow.HALF_WIDTH:g} K of the steady state',
         'The lift of narrow data alone (narrow) and with fallback (guarded), and the shipped one '
         '(wide):', _table(figures['narrow']['reactor']),
         'The shipped lift after UA −40 %:', _table(figures['narrow']['heat_transfer_-40%']),
-        ], [draw(found, folder / f'{name}.png') for name, draw in (
+        ], [*(draw(figures, folder / f'{name}.png') for name, draw in (
             ('margins', _draw_margins), ('noise', _draw_noise),
-            ('attraction', _draw_attraction), ('narrow', _draw_narrow))])
+            ('attraction', _draw_attraction))), _draw_narrow(courses, folder / 'narrow.png')])
 
 
 def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -84,52 +91,56 @@ def _cell(value: float | bool | None) -> str:
     return '0' if abs(value) < 5e-4 else f'{value:.5g}'
 
 
-def _margin_table(found: Found) -> str:
-    rows = []
-    for weight, bandwidth in product(COOLANT_WEIGHTS, BANDWIDTHS):
-        at = [found.margins[weight, bandwidth, kelvin] for kelvin in TEMPERATURES]
-        rows.append((f'{weight:g}', f'{bandwidth:g}', *(
-            f'{min(getattr(m, name) for m in at):.{digits}f}' for name, digits in (
-                ('gain', 0), ('phase', 0), ('delay', 1), ('distance', 2)))))
-    return table(('coolant_weight', 'observer [1/min]', 'gain', 'phase [°]', 'delay [s]',
-                  'least distance from −1'), rows)
+def _margins(figures: Figures, weight: float, bandwidth: float, name: str) -> list[float]:
+    """Return a margin over the set-points."""
+    return [figures['margins'][margin_name(weight, bandwidth, kelvin)][name]
+            for kelvin in TEMPERATURES]
 
 
-def _draw_margins(found: Found, path: Path) -> Picture:
+def _margin_table(figures: Figures) -> str:
+    rows = [(f'{weight:g}', f'{bandwidth:g}', *(
+        f'{min(_margins(figures, weight, bandwidth, name)):.{digits}f}' for name, digits in (
+            ('gain', 0), ('phase_degrees', 0), ('delay_seconds', 1))))
+        for weight, bandwidth in product(COOLANT_WEIGHTS, BANDWIDTHS)]
+    return table(('coolant_weight', 'observer [1/min]', 'gain', 'phase [°]', 'delay [s]'), rows)
+
+
+def _draw_margins(figures: Figures, path: Path) -> Picture:
     with drawing(path, 1, 3, size=(11.0, 3.8), sharex=True) as (_, axes):
-        for axis, name, unit in zip(axes, ('gain', 'phase', 'delay'), ('', ' [°]', ' [s]'),
-                                    strict=True):
+        for axis, name, label in zip(axes, Margins._fields, ('gain margin', 'phase margin [°]',
+                                                             'delay margin [s]'), strict=True):
             for number, bandwidth in enumerate(BANDWIDTHS):
                 for weight, style in zip(COOLANT_WEIGHTS, ('-', '--'), strict=True):
-                    values = [getattr(found.margins[weight, bandwidth, kelvin], name)
-                              for kelvin in TEMPERATURES]
-                    axis.plot(TEMPERATURES, values, style, color=f'C{number}',
+                    axis.plot(TEMPERATURES, _margins(figures, weight, bandwidth, name), style,
+                              color=f'C{number}',
                               label=f'{bandwidth:g} 1/min' if weight == 1.0 else None)
-            axis.set(xlabel='set-point [K]', ylabel=f'{name} margin{unit}')
+            axis.set(xlabel='set-point [K]', ylabel=label)
         for axis in (axes[0], axes[2]):
             axis.set_yscale('log')
         axes[1].legend(title='observer', fontsize=8)
         axes[0].set_title('solid: coolant_weight 1,  dashed: 0.1', fontsize=9)
-    usual = [found.margins[1.0, BANDWIDTH, kelvin] for kelvin in TEMPERATURES]
+    gain, delay = (min(_margins(figures, 1.0, BANDWIDTH, name))
+                   for name in ('gain', 'delay_seconds'))
     return Picture(path.name, (
         'Margins of the true reactor under the sampled controller, opened at the coolant. With '
-        f'the default parameters the gain may rise {min(m.gain for m in usual):.0f}-fold, and '
-        f'{min(m.delay for m in usual):.0f} s of dead time may be added, anywhere in the range.'))
+        f'the default parameters the gain may rise {gain:.0f}-fold, and {delay:.0f} s of dead '
+        'time may be added, anywhere in the range.'))
 
 
-def _draw_noise(found: Found, path: Path) -> Picture:
+def _draw_noise(figures: Figures, path: Path) -> Picture:
+    found = {bandwidth: figures['noise'][f'bandwidth={bandwidth:g}']
+             for bandwidth in disturbances.BANDWIDTHS}
     with drawing(path, 1, 2, size=(11.0, 3.8)) as (_, (left, right)):
-        bandwidths = list(found.noise)
         for name, label in (('coolant_kelvin', 'coolant'),
                             ('coolant_change_kelvin', 'coolant, change in a second'),
                             ('temperature_kelvin', 'true temperature')):
-            left.plot(bandwidths, [m[name] for m in found.noise.values()], 'o-', label=label)
+            left.plot([*found], [m[name] for m in found.values()], 'o-', label=label)
         left.axhline(disturbances.NOISE, color='0.5', linestyle=':', label='measurement')
         left.axvline(BANDWIDTH, color='0.7', linestyle='--')
         left.set(xlabel='observer_bandwidth [1/min]', ylabel='standard deviation [K]',
                  yscale='log')
         left.legend(fontsize=8)
-        back = {f'{bandwidth:g}': m for bandwidth, m in found.noise.items()
+        back = {f'{bandwidth:g}': m for bandwidth, m in found.items()
                 if m['fouled_to_0.2_kelvin'] is not None}
         noise = [m['coolant_kelvin'] for m in back.values()]
         for tolerance in ('0.2', '0.001'):
@@ -141,18 +152,18 @@ def _draw_noise(found: Found, path: Path) -> Picture:
         right.set(xlabel='standard deviation of the coolant [K]', ylabel='time after UA −20 % [s]',
                   xscale='log', title='numbers: observer_bandwidth [1/min]')
         right.legend(fontsize=8)
-    usual = found.noise[BANDWIDTH]
+    usual = found[BANDWIDTH]
     return Picture(path.name, (
         f'Noise of 0.1 K at 1 Hz against speed. The default of {BANDWIDTH:g} 1/min moves the '
         f'coolant by {usual["coolant_kelvin"]:.2g} K and is within 0.2 K '
         f'{usual["fouled_to_0.2_kelvin"]:.0f} s after the jacket lost a fifth of UA.'))
 
 
-def _scatter(axis: Axes, ends: Iterable[tuple[float, float, End]]) -> None:
+def _scatter(axis: Axes, ends: Iterable[tuple[float, float, str]]) -> None:
     """Mark how the loop ends from some starts, over the trained range."""
     points = list(ends)
     for end, mark in _MARKS.items():
-        chosen = [(x, y) for x, y, found in points if found is end]
+        chosen = [(x, y) for x, y, found in points if found == end.value]
         if chosen:
             x, y = np.array(chosen).T
             axis.scatter(x, y, s=18, label=end.value, **mark)
@@ -160,37 +171,41 @@ def _scatter(axis: Axes, ends: Iterable[tuple[float, float, End]]) -> None:
     axis.axhspan(states.lower[0], states.upper[0], **DRAWN_RANGE)
 
 
-def _draw_attraction(found: Found, path: Path) -> Picture:
+def _draw_attraction(figures: Figures, path: Path) -> Picture:
+    attraction = figures['attraction']
+    hottest = {coolant: attraction['hottest_start'][f'coolant={coolant:g}K']
+               for coolant in stability.COOLANTS}
     with drawing(path, 1, 4, size=(11.0, 4.6)) as (figure, axes):
         for axis, fallback in zip(axes, (True, False), strict=False):
-            _scatter(axis, ((goal, start, end)
-                            for (start, goal), end in found.grids[fallback].items()))
+            ends = attraction[f'fallback={fallback}']
+            _scatter(axis, ((goal, start, ends[f'{start:g}K to {goal:g}K'])
+                            for goal, start in product(stability.SETPOINTS, stability.STARTS)))
             axis.set(title=f'{"with" if fallback else "without"} fallback', xlabel='set-point [K]',
                      ylabel='temperature at the start [K]')
         for name, label, style in (
                 ('physics_kelvin', 'no coolant saves it above', 'k-'),
                 ('fallback_kelvin', 'the loop with fallback', 'o--'),
                 ('no_fallback_kelvin', 'the learned law alone', 'x:')):
-            axes[2].plot(list(found.boundaries), [m[name] for m in found.boundaries.values()],
-                         style, label=label)
+            axes[2].plot([*hottest], [m[name] for m in hottest.values()], style, label=label)
         axes[2].set(title='hottest start that comes back', xlabel='coolant at the start [K]',
                     ylabel='[K]')
         axes[2].legend(fontsize=7)
-        _scatter(axes[3], ((c, kelvin, end) for (kelvin, c), end in found.two_state_grid.items()))
+        _scatter(axes[3], ((c, kelvin, attraction['two_state'][f'{kelvin:g}K, {c:.3g}mol/L'])
+                           for kelvin, c in stability.two_state_starts()))
         axes[3].set(title='two-state reactor', xlabel='C$_A$ at the start [mol/L]')
         legend(figure, (axes[0], axes[1], axes[3]), 5)
     return Picture(path.name, (
         'Where the loop comes back from (grey: the trained range). Above '
         f'{hottest_cooled():.1f} K no coolant within its limits cools the reactor; '
         'with the coolant at 300 K, which falls by 1 K a second at most, none saves it from above '
-        f'{found.boundaries[300.0]["physics_kelvin"]:.1f} K.'))
+        f'{hottest[300.0]["physics_kelvin"]:.1f} K.'))
 
 
-def _draw_narrow(found: Found, path: Path) -> Picture:
+def _draw_narrow(courses: Courses, path: Path) -> Picture:
     with drawing(path, 1, 3, size=(11.0, 4.6), sharey=True) as (figure, axes):
         for axis, trial in zip(axes, narrow.TRIALS, strict=True):
             for kind, style in _PATHS.items():
-                course = found.reactor[trial.name, kind]
+                course = courses[trial.name, kind]
                 minutes, kelvin = course.times / 60.0, course.states[:, 0]
                 axis.plot(minutes, kelvin, **style)
                 # where another level takes over

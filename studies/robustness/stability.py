@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 import math
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import expm
@@ -45,14 +45,12 @@ _SHORT_STEP = 0.25  # s
 _RETURN = 600.0  # s
 
 
-@dataclass(frozen=True)
-class Margins:
+class Margins(NamedTuple):
     """Margins of the loop at the plant's input."""
 
     gain: float  #: factor of the gain
-    phase: float  #: in degrees
-    delay: float  #: additional dead time, in s
-    distance: float  #: smallest distance of the Nyquist curve from -1
+    phase_degrees: float
+    delay_seconds: float  #: additional dead time
 
 
 def linearised_reactor(temperature: float) -> control.StateSpace:
@@ -119,7 +117,7 @@ def margins_at(controller: Controller, temperature: float) -> Margins:
               for phase, frequency in zip(phases, crossings, strict=True)]
     return Margins(
         min(rising, default=math.inf), min(map(abs, phases), default=math.inf),
-        min(delays, default=math.inf), float(np.min(np.abs(1.0 + response))))
+        min(delays, default=math.inf))
 
 
 class End(Enum):
@@ -151,8 +149,8 @@ def end_of(temperature: float, setpoint: float, *, fallback: bool, coolant: floa
 
     x0 = [temperature] if concentration is None else [concentration, temperature]
     course = loop.run_loop(
-        loop.reactor_controller(fallback=fallback), system, np.array(x0), coolant, HORIZON,
-        [at(0.0, at_setpoint(setpoint))], stop=arrived)
+        loop.reactor_controller(fallback=fallback), system, HORIZON,
+        [at(0.0, at_setpoint(setpoint))], x0=x0, coolant=coolant, stop=arrived)
     if course.failure or course.states[-1, -1] > GONE:
         return End.RAN_AWAY
     if near < _SETTLED:
@@ -226,9 +224,8 @@ def back_from_safe(system: ControlAffineSystem, linear_model_margin: float) -> M
         return replace(before, state=replace(before.state, supervisor=Supervisor(SAFE)))
 
     course = loop.run_loop(
-        loop.reactor_controller(linear_model_margin=linear_model_margin), system, rest, coldest,
-        _RETURN,
-        [at(0.0, safe), at(0.0, at_setpoint(SETPOINT))])
+        loop.reactor_controller(linear_model_margin=linear_model_margin), system, _RETURN,
+        [at(0.0, safe), at(0.0, at_setpoint(SETPOINT))], x0=rest, coolant=coldest)
     return {'rest_kelvin': float(rest[0]),
             'outside': loop.shipped_model().states.violation(rest),
             'seconds_to_0.2_kelvin': loop.settling(course, SETPOINT, TOLERANCE)}

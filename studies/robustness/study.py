@@ -4,10 +4,9 @@
 """The study of robustness: all computations, by name."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from itertools import product
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,32 +15,21 @@ from koopman_ros.execution import Backend
 from studies.campaign import over
 from studies.robustness import disturbances, narrow, stability
 from studies.robustness.loop import REACTOR, reactor_controller
-from studies.robustness.stability import End, Margins, margins_at
+from studies.robustness.stability import margins_at
 
 BANDWIDTHS = (0.0, 2.0, 4.0, 6.0, 10.0)  # 1/min
 COOLANT_WEIGHTS = (1.0, 0.1)  # 1/K^2
+Courses: TypeAlias = dict[tuple[str, str], Simulation]  # by trial and kind of lift
 TEMPERATURES = tuple(map(float, np.linspace(305.5, 326.5, 8)))  # K
 
 
-@dataclass(frozen=True)
-class Found:
-    """The results of the study."""
-
-    figures: dict[str, Any]  #: all by name; infinite ones become null in JSON
-    #: by (coolant weight, bandwidth in 1/min, set-point in K)
-    margins: dict[tuple[float, float, float], Margins]
-    noise: dict[float, dict[str, Any]]  #: figures by bandwidth in 1/min
-    #: ends by start and set-point in K, with and without fallback
-    grids: dict[bool, dict[tuple[float, float], End]]
-    #: ends by temperature in K and concentration in mol/L
-    two_state_grid: dict[tuple[float, float], End]
-    #: hottest starts by the applied coolant at the start, in K
-    boundaries: dict[float, dict[str, Any]]
-    reactor: dict[tuple[str, str], Simulation]  #: courses of the lift of narrow data
+def margin_name(coolant_weight: float, bandwidth: float, kelvin: float) -> str:
+    """Return the name of the margins at a set-point in the figures."""
+    return f'coolant_weight={coolant_weight:g}/bandwidth={bandwidth:g}/{kelvin:g}K'
 
 
-def study(backend: Backend | None = None) -> Found:
-    """Compute everything in some minutes."""
+def study(backend: Backend | None = None) -> tuple[dict[str, Any], Courses]:
+    """Compute everything in some minutes; return all figures, and courses of the narrow lift."""
     def spread(line: str, function: Callable[..., Any], keys: Iterable[Any]) -> dict[Any, Any]:
         print(line, file=sys.stderr, flush=True)
         return over(backend, function, keys)
@@ -59,10 +47,6 @@ def study(backend: Backend | None = None) -> Found:
     ends = spread('region of attraction', lambda key: stability.end_of(
         key[2], key[1], fallback=key[0]),
         product((True, False), stability.SETPOINTS, stability.STARTS))
-    grids = {fallback: {
-        (start, setpoint): ends[fallback, setpoint, start]
-        for setpoint, start in product(stability.SETPOINTS, stability.STARTS)}
-        for fallback in (True, False)}
     two_state_grid = spread('region of attraction of the two-state reactor',
                             stability.two_state_end, stability.two_state_starts())
     boundaries = spread('hottest starts', lambda coolant: {
@@ -76,12 +60,8 @@ def study(backend: Backend | None = None) -> Found:
     courses = narrow.reactor_courses()
     far = spread('far from the model', lambda key: narrow.far_from_the_model(*key),
                  product(narrow.LINEAR_MARGINS, narrow.MARGIN_BANDWIDTHS))
-    figures = {
-        'margins': {
-            f'coolant_weight={weight:g}/bandwidth={bandwidth:g}/{kelvin:g}K': {
-                'gain': m.gain, 'phase_degrees': m.phase,
-                'delay_seconds': m.delay, 'distance': m.distance}
-            for (weight, bandwidth, kelvin), m in margins.items()},
+    return {
+        'margins': {margin_name(*key): found._asdict() for key, found in margins.items()},
         'disturbances': disturbed,
         'wrong_dead_time': {
             f'known {known:g} s, {share:g} times as long, {name}': found
@@ -90,9 +70,10 @@ def study(backend: Backend | None = None) -> Found:
         'attraction': {
             'hottest_cooled_kelvin': stability.hottest_cooled(),
             'hottest_start': {f'coolant={u:g}K': m for u, m in boundaries.items()},
-            **{f'fallback={fallback}': {f'{start:g}K to {goal:g}K': end.value
-                                        for (start, goal), end in grid.items()}
-               for fallback, grid in grids.items()},
+            **{f'fallback={fallback}': {
+                f'{start:g}K to {goal:g}K': end.value
+                for (other, goal, start), end in ends.items() if other is fallback}
+               for fallback in (True, False)},
             'from_the_safe_coolant': {f'{name}/linear_model_margin={margin:g}': found
                                       for (name, margin), found in back.items()},
             'two_state': {f'{kelvin:g}K, {c:.3g}mol/L': end.value
@@ -102,5 +83,4 @@ def study(backend: Backend | None = None) -> Found:
                         for key, course in courses.items()},
             'heat_transfer_-40%': {
                 f'linear_model_margin={margin:g}/bandwidth={bandwidth:g}': judged
-                for (margin, bandwidth), judged in far.items()}}}
-    return Found(figures, margins, noise, grids, two_state_grid, boundaries, courses)
+                for (margin, bandwidth), judged in far.items()}}}, courses

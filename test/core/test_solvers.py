@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
-from koopman_ros.core.solvers import (
-    over_interval,
-    RiccatiStatus,
-    runge_kutta_step,
-    solve_riccati,
-    transition,
-)
+from koopman_ros.core.solvers import over_interval, runge_kutta_step, solve_riccati, transition
+from koopman_ros.core.status import StatusCode
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
 
@@ -43,7 +38,7 @@ def test_random_pairs_against_scipy(seed):
     for n, m in SIZES:
         A, B, Q, R = random_problem(n, m, seed)
         solution = solve_riccati(A, B, Q, R)
-        assert solution.status is RiccatiStatus.SOLVED, (n, m)
+        assert solution.solved, (n, m)
         P = solve_continuous_are(A, B, Q, R)
         assert_close(solution, P, np.linalg.solve(R, B.T @ P))
         np.testing.assert_array_equal(solution.P, solution.P.T)
@@ -60,7 +55,7 @@ def test_random_pairs_against_scipy(seed):
     (-0.957887316, 2.092050209, 1.0, 0.1), (1e-8, 1e4, 1e8, 1e-4)])
 def test_scalar_plants_in_closed_form(a, b, q, r):
     solution = solve_riccati(*(np.array([[value]]) for value in (a, b, q, r)))
-    assert solution.status is RiccatiStatus.SOLVED
+    assert solution.solved
     p = r / b ** 2 * (a + np.sqrt(a * a + q * b * b / r))
     assert solution.P[0, 0] == pytest.approx(p, rel=1e-12)
     assert solution.K[0, 0] == pytest.approx(p * b / r, rel=1e-12)
@@ -73,7 +68,7 @@ def test_the_unit_of_the_cost_does_not_matter(factor, h):
         A, B, Q, R = random_problem(n, m, seed=7)
         solution = solve_riccati(A, B, Q, R, interval=h)
         other = solve_riccati(A, B, factor * Q, factor * R, interval=h)
-        assert other.status is RiccatiStatus.SOLVED, (n, m)
+        assert other.solved, (n, m)
         assert_close(other, factor * solution.P, solution.K)
 
 
@@ -89,7 +84,7 @@ def test_the_residual_reported_is_that_of_the_solution_and_bounded(reach):
     # how large it is depends on how the processor rounds; its own rounding errors are of 1e-16
     assert solution.residual == pytest.approx(residual(solution.P, *problem), rel=1e-2, abs=1e-14)
     strict = solve_riccati(*problem, max_residual=0.5 * solution.residual)
-    assert strict.status is RiccatiStatus.INACCURATE
+    assert strict.failure is StatusCode.RICCATI_INACCURATE
     assert strict.residual == solution.residual > 0.0
 
 
@@ -98,11 +93,11 @@ def test_a_bound_on_the_gain(reach):
     problem = nearly_uncontrollable(reach)
     # the unstable mode alone asks for 2 / reach
     solution = solve_riccati(*problem)
-    assert solution.status is RiccatiStatus.SOLVED
+    assert solution.solved
     assert solution.gain > 2.0 / reach
-    assert solve_riccati(*problem, max_gain=1.001 * solution.gain).status is RiccatiStatus.SOLVED
+    assert solve_riccati(*problem, max_gain=1.001 * solution.gain).solved
     rejected = solve_riccati(*problem, max_gain=0.999 * solution.gain)
-    assert rejected.status is RiccatiStatus.GAIN_TOO_LARGE
+    assert rejected.failure is StatusCode.GAIN_TOO_LARGE
     assert rejected.gain == solution.gain
 
 
@@ -110,8 +105,8 @@ def test_a_bound_on_the_gain(reach):
 def test_a_nearly_uncontrollable_mode_is_never_solved_within_a_bound(exponent):
     """Closer still, the gain computed is small again: only the residual tells that it is wrong."""
     solution = solve_riccati(*nearly_uncontrollable(10.0 ** -exponent), max_gain=1e3)
-    assert solution.status in (RiccatiStatus.INACCURATE, RiccatiStatus.GAIN_TOO_LARGE,
-                               RiccatiStatus.NOT_STABILISABLE)
+    assert solution.failure in (StatusCode.RICCATI_INACCURATE, StatusCode.GAIN_TOO_LARGE,
+                               StatusCode.NOT_STABILISABLE)
 
 
 OSCILLATOR = np.array([[0.0, 2.0], [-2.0, 0.0]])
@@ -135,7 +130,7 @@ BEYOND = {
 def test_problems_without_a_stabilising_solution_are_recognised(case, h):
     A, b, Q = BEYOND[case]
     solution = solve_riccati(A, np.array(b)[:, None], Q, np.eye(1), interval=h)
-    assert solution.status is RiccatiStatus.NOT_STABILISABLE
+    assert solution.failure is StatusCode.NOT_STABILISABLE
     assert not np.any(solution.K)
     assert not np.any(solution.P)
     assert (solution.gain, solution.residual) == (np.inf, np.inf)
@@ -145,7 +140,7 @@ def test_problems_without_a_stabilising_solution_are_recognised(case, h):
         inverse = np.linalg.inv(T)
         solution = solve_riccati(T @ A @ inverse, (T @ b)[:, None], inverse.T @ Q @ inverse,
                                  np.eye(1), interval=h)
-        assert solution.status is not RiccatiStatus.SOLVED, seed
+        assert not solution.solved, seed
 
 
 @pytest.mark.parametrize('h', [0.0, 0.3])
@@ -155,9 +150,9 @@ def test_riccati_problems_with_bad_numbers_are_not_solved(h):
             problem = [-np.eye(2), np.eye(2), np.eye(2), np.eye(2)]
             problem[place] = np.full((2, 2), value)
             solution = solve_riccati(*problem, interval=h)
-            assert solution.status is not RiccatiStatus.SOLVED, (name, value)
+            assert not solution.solved, (name, value)
     solution = solve_riccati(-np.eye(2), np.eye(2), np.zeros((2, 2)), np.eye(2), interval=h)
-    assert solution.status is RiccatiStatus.NOT_STABILISABLE
+    assert solution.failure is StatusCode.NOT_STABILISABLE
 
 
 @pytest.mark.parametrize('h', [0.0, 0.3])
@@ -169,7 +164,7 @@ def test_nothing_escapes_at_any_magnitude(h):
         A, B, Q, R = (array * 10.0 ** rng.uniform(-300.0, 300.0)
                       for array in random_problem(n, m, seed=1))
         solution = solve_riccati(A, B, Q, R, interval=h)
-        if solution.status is RiccatiStatus.SOLVED:
+        if solution.solved:
             solved += 1
             assert np.all(np.isfinite(solution.K))
             assert solution.residual <= 1e-6
@@ -178,11 +173,11 @@ def test_nothing_escapes_at_any_magnitude(h):
 
 def test_riccati_without_an_input_gives_its_cost_and_without_an_input_weight_none():
     solution = solve_riccati(-np.eye(2), np.zeros((2, 1)), np.eye(2), np.eye(1))
-    assert solution.status is RiccatiStatus.SOLVED
+    assert solution.solved
     np.testing.assert_allclose(solution.P, 0.5 * np.eye(2), rtol=1e-14)
     np.testing.assert_array_equal(solution.K, np.zeros((1, 2)))
     solution = solve_riccati(-np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1)))
-    assert solution.status is RiccatiStatus.NOT_STABILISABLE
+    assert solution.failure is StatusCode.NOT_STABILISABLE
 
 
 # The sampled regulator.
@@ -195,7 +190,7 @@ def test_sampled_random_pairs_against_scipy(h):
         D, W = over_interval(A, B, Q, R, h)
         phi, gamma, N, R_d = np.eye(n) + D[:n, :n], D[:n, n:], W[:n, n:], W[n:, n:]
         solution = solve_riccati(A, B, Q, R, interval=h)
-        assert solution.status is RiccatiStatus.SOLVED
+        assert solution.solved
         P = solve_discrete_are(phi, gamma, W[:n, :n], R_d, s=N)
         assert_close(solution, P, np.linalg.solve(
             R_d + gamma.T @ P @ gamma, gamma.T @ P @ phi + N.T))
@@ -246,7 +241,7 @@ def test_modes_that_decay_within_an_interval(rate):
     A, B = np.diag([-rate, 0.5]), np.array([[rate], [1.0]])
     found = solve_riccati(A, B, np.diag([0.3, 1.0]), 0.2 * np.eye(1), interval=h)
     reduced = solve_riccati(slow, np.eye(1), np.eye(1), 0.5 * np.eye(1), interval=h)
-    assert found.status is RiccatiStatus.SOLVED
+    assert found.solved
     assert found.K[0, 1] == pytest.approx(reduced.K[0, 0], rel=2.0 / (h * rate) + 1e-12)
     # and one without weight that moves nothing else does not count
     found = solve_riccati(A, B, np.diag([0.0, 1.0]), 0.5 * np.eye(1), interval=h)
@@ -257,9 +252,9 @@ def test_modes_that_decay_within_an_interval(rate):
 @pytest.mark.parametrize('periods', [1, 2, 5])
 def test_samples_as_far_apart_as_a_period_do_not_see_an_oscillation(gain, periods):
     problem = OSCILLATOR, np.array([[0.0], [gain]]), np.eye(2), np.eye(1)
-    assert solve_riccati(*problem, interval=0.9 * np.pi).status is RiccatiStatus.SOLVED
+    assert solve_riccati(*problem, interval=0.9 * np.pi).solved
     found = solve_riccati(*problem, interval=periods * np.pi)
-    assert found.status is not RiccatiStatus.SOLVED
+    assert not found.solved
 
 
 # The integrals over an interval, which the sampled regulator is made of.

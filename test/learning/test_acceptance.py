@@ -170,6 +170,7 @@ def test_margin_and_condition_number_decide_and_warnings_are_passed_on(found, tr
     assert judged(margin=1.0 - 1.01 * ratio).accepted
     (reason,) = judged(margin=1.0 - 0.99 * ratio).reasons
     assert 'the best linear model' in reason
+    assert trained.figures.fit.cond_of_states == 1.0
     assert judged(condition=1.01 * cond).accepted
     (reason,) = judged(condition=0.99 * cond).reasons
     assert f'condition number of its coordinates, {cond:.3g}' in reason

@@ -239,7 +239,7 @@ def test_a_state_within_the_ranges_is_far_from_the_data_beyond_the_margin(
         degrees: float, outside: float, words: str) -> None:
     own, state, report = measured(Mode.AUTOMATIC)
     now = context(own, state, replace(
-        report, measurement=replace(report.measurement, outside=outside)))
+        report, measurement=report.measurement._replace(outside=outside)))
     now.measured = np.array([degrees + 273.15])
     found = statuses(now)['model']
     assert found.level is (Severity.WARN if words else Severity.OK)
@@ -250,6 +250,6 @@ def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
     own, state, report = measured(Mode.AUTOMATIC)
     assert statuses(context(own, state, report))['model'].level is Severity.OK
     found = statuses(context(own, state, replace(
-        report, estimate=replace(report.estimate, at_bound=True))))
+        report, estimate=report.estimate._replace(at_bound=True))))
     assert (found['model'].level, found['control'].level) == (Severity.WARN,) * 2
     assert 'at its bound' in found['model'].message

@@ -25,6 +25,7 @@ from koopman_ros.plants import (
 from studies import saddle
 from studies.paper import reactor
 from studies.paper.reactor import SETPOINT, SYSTEM, training_samples
+from studies.robustness.loop import on_plant
 from studies.shipped_models import (
     FEED,
     library_system,
@@ -291,7 +292,7 @@ def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone():
     loop = simulate(
         saddle.controller(model, ('sdre',), saddle.WIDE), Process(saddle.SYSTEM, 0, x0, u0), [
             at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([wanted]))),
-            at(60.0, saddle.becomes(saddle.reactor(saddle.FOULING)))],
+            at(60.0, on_plant(system=saddle.reactor(saddle.FOULING)))],
         duration=400.0, noise=np.array([saddle.NOISE]), seed=0)
     away = loop.states[:, 1] - wanted
     # with the reactor's own equations and both states known it is 3.85 K

@@ -29,7 +29,7 @@ from koopman_ros.ros.simulated_plant import SimulatedPlant
 from studies import saddle, saddle_act, unstable
 from studies.campaign import Campaign, Experiment, Metrics, Models, run_campaign
 from studies.equations import EQUATIONS
-from studies.general import coordinates, learners, study
+from studies.general import learners, study
 from studies.general.__main__ import main as general
 from studies.general.systems import CASES, oscillator
 from studies.paper import figures, reactor, report, scalar, two_state
@@ -204,14 +204,10 @@ def van_der_pol(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, 'LEARNERS', {
             'EDMD-3': learners.LEARNERS['EDMD-3'],
-            'hasty lift': learners._trained(lambda n_x: IncrementalTraining(n_x + 1,
-                                                                            max_iterations=5))})
+            'identity lift': partial(learners.trained, lambda n_x: IncrementalTraining(
+                n_x + 1, max_iterations=5))})
         patch.setitem(study.EXPERIMENTS, 'van_der_pol', partial(
             study.run, 'van_der_pol', starts=3))
-        patch.setattr(coordinates, 'RECIPES', {
-            'identity lift': lambda n_x: IncrementalTraining(n_x + 1, max_iterations=5)})
-        patch.setitem(coordinates.EXPERIMENTS, 'coordinates/van_der_pol', partial(
-            coordinates.run, 'van_der_pol', starts=3))
         assert general(['van_der_pol', '--seeds', '1', '--scheduler', '',
                         '--output', str(output)]) == 0
     return output
@@ -221,13 +217,12 @@ def test_a_cubic_drift_is_found_by_cubic_models(van_der_pol: Path) -> None:
     summary = json.loads((van_der_pol / 'summary.json').read_text())
     found = {label: {name: values[0] for name, values in of.items()}
              for label, of in summary['van_der_pol'].items()}
-    assert found['EDMD-3']['rx'] < 1e-20
-    assert found['hasty lift']['accepted'] in (True, False)
+    assert found['EDMD-3']['accepted'] is None
+    assert found['identity lift']['accepted'] in (True, False)
     for of in found.values():
         assert 0 <= of['no_gain'] <= of['not_arrived'] <= of['missed'] <= 3
-    used = summary['coordinates']['van_der_pol']
-    assert used['EDMD-3']['rx'][0] < 1e-20 < used['EDMD-3']['rx_noisy'][0]
-    assert used['identity lift']['rollout'][0] < used['identity lift']['rollout_z'][0]
+    assert found['EDMD-3']['rx'] < 1e-20 < found['EDMD-3']['rx_noisy']
+    assert found['identity lift']['rollout'] < found['identity lift']['rollout_z']
     text = (van_der_pol / 'report.md').read_text()
     assert re.search(r'^\| natural SDRE on the truth \| 1 of 1 \|$', text, re.MULTILINE)
     assert 'nan' not in text
@@ -238,7 +233,7 @@ def test_predictions_of_a_linear_plant_are_exact() -> None:
     spring = oscillator('spring', lambda x1, x2: x1 - x2, lambda x1, x2: (1.0, -1.0))
     case = replace(CASES['duffing'], system=spring)
     held_out = case.samples(1, 10)
-    np.testing.assert_allclose(coordinates.rolled_in_z(case.truth, held_out),
+    np.testing.assert_allclose(study.rolled_in_z(case.truth, held_out),
                                rollout_rmse(case.truth, held_out), rtol=1e-3, atol=1e-9)
 
 
@@ -292,8 +287,8 @@ def grows(controller: Controller, temperature: float, delay: float) -> bool:
     """Simulate for 450 s whether a deviation grows when the coolant is late by some s."""
     held = float(equilibrium_input(REACTOR, [temperature])[0])
     course = loop.run_loop(
-        controller, REACTOR, np.array([temperature + 1e-4]), held, 450.0,
-        [at(0.0, loop.at_setpoint(temperature))], actuator=Actuator(delay=delay))
+        controller, REACTOR, 450.0, [at(0.0, loop.at_setpoint(temperature))],
+        x0=[temperature + 1e-4], coolant=held, actuator=Actuator(delay=delay))
     # the swing at the end
     late = loop.errors(course, temperature)[-len(course.times) // 3:]
     return bool(np.ptp(late) > 2e-4)
@@ -301,7 +296,7 @@ def grows(controller: Controller, temperature: float, delay: float) -> bool:
 
 def test_the_simulated_loop_oscillates_beyond_its_delay_margin() -> None:
     controller = loop.reactor_controller(bandwidth=10.0, coolant_weight=0.1)
-    margin = stability.margins_at(controller, 316.0).delay
+    margin = stability.margins_at(controller, 316.0).delay_seconds
     assert margin == pytest.approx(8.92, abs=0.05)
     assert not grows(controller, 316.0, 0.95 * margin)
     assert grows(controller, 316.0, 1.05 * margin)

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -114,8 +114,7 @@ class Weights:
         return cls(Q, R)
 
 
-@dataclass(frozen=True, slots=True)
-class SolutionInfo:
+class SolutionInfo(NamedTuple):
     """Figures of a law's solution; NaN and '' for those that it does not have."""
 
     form: str = ''  #: which form of the law was used, for the operator

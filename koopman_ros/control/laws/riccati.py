@@ -3,10 +3,10 @@
 
 """Laws by Riccati equations: state-dependent, re-centred and averaged, and the linear one."""
 
-from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
-from typing import Any, ClassVar, TypedDict, Unpack
+import math
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from koopman_ros.control.laws.base import (
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import (
     RiccatiSolution,
-    RiccatiStatus,
     solve_riccati,
     spectral_radius,
     transition,
@@ -43,8 +42,7 @@ class Form(Enum):
     AVERAGED = 'averaged'
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
+class Feedback(NamedTuple):
     """The outcome of one state-dependent Riccati solution."""
 
     u: Array  #: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved
@@ -56,7 +54,7 @@ class Feedback:
     @property
     def solved(self) -> bool:
         """Whether `u` may be used."""
-        return self.riccati.status is RiccatiStatus.SOLVED
+        return self.riccati.solved
 
     def growth(self, interval: float) -> float:
         """
@@ -83,16 +81,8 @@ def closed(model: LiftedModel) -> bool:
     return model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes
 
 
-class RiccatiOptions(TypedDict, total=False):
-    """How an equation is solved; see :func:`solve_riccati`."""
-
-    interval: float  #: for which the input will be held, in the model's time unit
-    max_gain: float  #: largest norm of the gain
-    max_residual: float  #: largest relative residual
-
-
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights,
-             **how: Unpack[RiccatiOptions]) -> Feedback:
+             **how: float) -> Feedback:
     """
     Evaluate the law that suits the model.
 
@@ -102,6 +92,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights,
     lift, is a poor factorisation of the drift away from its nominal point.
 
     :param x: (n_x,) scaled deviation of the measured state.
+    :param how: interval and bounds of :func:`solve_riccati`.
     """
     if closed(model):
         result = recentred(model, x, target, weights, **how)
@@ -111,7 +102,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights,
 
 
 def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights,
-              **how: Unpack[RiccatiOptions]) -> Feedback:
+              **how: float) -> Feedback:
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
 
@@ -151,7 +142,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights,
 
 
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights,
-             **how: Unpack[RiccatiOptions]) -> Feedback:
+             **how: float) -> Feedback:
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 
@@ -227,12 +218,13 @@ def _result(model: LiftedModel, found: Feedback, interval: float, u: Array | Non
             growth: float | None = None) -> LawResult:
     """Return the input of a feedback, or (n_u,) of its gain, unless it must not be used."""
     riccati = found.riccati
-    info = SolutionInfo(found.form.value, riccati.residual, riccati.gain)
     if not found.solved:
-        return LawResult(None, reason(StatusCode(riccati.status.value)), info)
-    if growth is None:
+        growth = math.nan
+    elif growth is None:
         growth = found.growth(interval / model.seconds_per_time_unit)
     info = SolutionInfo(found.form.value, riccati.residual, riccati.gain, growth)
+    if riccati.failure is not None:
+        return LawResult(None, reason(riccati.failure), info)
     if not growth < 1.0:
         return LawResult(None, reason(StatusCode.PREDICTED_UNSTABLE, interval=interval), info)
     return LawResult(model.inputs.to_physical(found.u if u is None else u), info=info)

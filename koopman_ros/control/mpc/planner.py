@@ -20,7 +20,6 @@ from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import (
     RiccatiSolution,
-    RiccatiStatus,
     runge_kutta_step,
     solve_riccati,
 )
@@ -172,7 +171,7 @@ class Planner:
         found = self._regulator(A, B, sample)
         horizon = _MAX_INTERVALS * sample
         closed = np.linalg.eigvals(A - B @ found.K).real
-        if found.status is RiccatiStatus.SOLVED and np.all(closed < 0.0):
+        if found.solved and np.all(closed < 0.0):
             horizon = _CLOSED_LOOP / float(np.min(-closed))
         growing = float(np.max(np.linalg.eigvals(A).real))
         if growing > 0.0:
@@ -194,7 +193,7 @@ class Planner:
             A = A + model.forcing_jacobian(x, np.array(u_ref))
         found = self._regulator(A, model.input_matrix(x), sample)
         # without a regulator the horizon alone counts
-        return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
+        return fastest, found.P if found.solved else (
             self._weights.Q * float(self._grid(sample, 0.0).lengths[-1]))
 
     def _regulator(self, A: Array, B: Array, sample: float) -> RiccatiSolution:

@@ -55,5 +55,5 @@ def information(model: DriftModel, segments: Segments, learned_B: bool, colour: 
     # an error below rounding tells nothing
     rmse = np.maximum(prediction_error(model.rate, segments, scale) / scale, 1e-12)
     count = np.sum(segments.sampled) * (1.0 - colour) / (1.0 + colour)
-    size = model.coefficients.size + learned_B * model.B.size
+    size = np.count_nonzero(model.free) + learned_B * model.B.size
     return 2.0 * float(np.sum(count * np.log(rmse))) + size * math.log(np.mean(count))

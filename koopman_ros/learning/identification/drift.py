@@ -30,6 +30,10 @@ Rate = Callable[[Array, Array], Array]
 # A state; features that depend on it, their derivatives, and factors.
 _Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
+# Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
+# minutes for more, and an hour does not determine them: then few of them are chosen.
+MOST_COEFFICIENTS = 150
+
 # Of the search of a steady state: the range is that of noisy measurements, and a search that is so
 # far outside does not come back.
 _SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
@@ -147,6 +151,12 @@ class DriftModel(Drift):
     def varying_input_matrix(self) -> bool:
         """Whether B depends on the state."""
         return self.input_degree > 0
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """(1 + m, n_x) which coefficients an estimate may change: of many only those it chose."""
+        few = self.degree == 1 or self.coefficients.size <= MOST_COEFFICIENTS
+        return (self.coefficients != 0.0) | few
 
     @property
     def linear(self) -> bool:

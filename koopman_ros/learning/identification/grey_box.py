@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.core.datasets import Array, Episode, PlantDescription
-from koopman_ros.core.solvers import RiccatiStatus, solve_riccati
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.learning.identification.identify import (
@@ -111,7 +111,7 @@ def _filter(record: SplitRecord, model: Equations, n_y: int) -> Predictor[Equati
     for noise in _NOISES:
         # the filter's equation is the regulator's, transposed
         solution = solve_riccati(A.T, C.T, noise ** 2 / h * np.eye(len(A)), h * np.eye(n_y))
-        if solution.status is RiccatiStatus.SOLVED:
+        if solution.solved:
             one = Predictor(model, h * solution.K.T)
             with contextlib.suppress(ValueError):  # it diverges
                 tried.append((float(np.mean(record.innovations(one) ** 2)), noise, one))

@@ -32,6 +32,7 @@ from koopman_ros.learning.identification.drift import (
     Drift,
     DriftModel,
     longest_step,
+    MOST_COEFFICIENTS,
     prediction_error,
     Segments,
 )
@@ -42,9 +43,8 @@ from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.model import Box
 
 DEGREES = (1, 2, 3, 4, 5, 6)
-# Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
-# minutes for more, and an hour does not determine them.
-MOST_COEFFICIENTS = 150
+# Up to this degree monomials are tried that are too many to estimate all of them
+_DEGREE, _MOST_MONOMIALS = 3, 500
 OUTPUT_ERROR = 'output error'
 INNOVATIONS_FORM = 'innovations form'
 
@@ -198,7 +198,7 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
     """
     expect(plant=(plant, PlantDescription))
     n_x, n_u = len(plant.state_names), len(plant.input_names)
-    degrees = degrees or usual_degrees(n_x)
+    degrees = degrees or usual_degrees(n_x, chosen=True)
     parts = segments_of(episodes, n_x + n_u)
     box = box_of(plant, parts)
     warnings = check_inputs(plant, episodes)
@@ -264,10 +264,18 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
                       disturbances=plant.disturbance_names)
 
 
-def usual_degrees(n_x: int) -> tuple[int, ...]:
-    """Return the degrees of a drift with few enough coefficients for a number of states."""
-    return tuple(degree for degree in DEGREES if degree == 1
-                 or n_x * math.comb(n_x + degree, degree) <= MOST_COEFFICIENTS)
+def usual_degrees(n_x: int, *, chosen: bool = False) -> tuple[int, ...]:
+    """
+    Return the degrees of a drift with few enough coefficients for a number of states.
+
+    :param chosen: also those of which an estimate chooses the terms.
+    """
+    def suits(degree: int) -> bool:
+        count = math.comb(n_x + degree, degree)
+        return degree == 1 or n_x * count <= MOST_COEFFICIENTS or (
+            chosen and degree <= _DEGREE and count <= _MOST_MONOMIALS)
+
+    return tuple(filter(suits, DEGREES))
 
 
 @dataclass(frozen=True)

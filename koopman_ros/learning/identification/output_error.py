@@ -62,29 +62,34 @@ class PolynomialCoefficients:
     @property
     def theta(self) -> Array:
         """Coefficients, then B where it is learned."""
-        return np.concatenate((self.drift.coefficients.ravel(), self.drift.B.ravel()[:self._n_B]))
+        return np.concatenate((self.drift.coefficients[self.drift.free],
+                               self.drift.B.ravel()[:self._n_B]))
 
     def at(self, theta: Array) -> PolynomialCoefficients:
         """Return the same with other weights."""
         drift = self.drift
-        n = drift.coefficients.size
+        free = drift.free
+        n = np.count_nonzero(free)
         B = theta[n:].reshape(drift.B.shape) if self.learn_input_matrix else drift.B
-        return replace(self, drift=replace(
-            drift, B=B, coefficients=theta[:n].reshape(drift.coefficients.shape)))
+        coefficients = np.zeros(free.shape)
+        coefficients[free] = theta[:n]
+        return replace(self, drift=replace(drift, B=B, coefficients=coefficients))
 
     def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
         """Evaluate rates of states and sensitivities; see :class:`Refinable`."""
-        drift, n_x = self.drift, xi.shape[1]
+        drift = self.drift
         features, inputs = drift.features(xi), drift.regressors(xi, v)
         rate = drift.rate_of(features, inputs)
         if not S.shape[-1]:
             return rate, S
         dS = drift.slope_of(features, xi, v) @ S
-        m, n_B = features.shape[1], inputs.shape[1]
-        for i in range(n_x):
-            dS[:, i, i:m * n_x:n_x] += features
+        free = drift.free
+        place, n_B = np.cumsum(free).reshape(free.shape) - 1, inputs.shape[1]
+        n = np.count_nonzero(free)
+        for i, own in enumerate(free.T):
+            dS[:, i, place[own, i]] += features[:, own]
             if self.learn_input_matrix:
-                first = m * n_x + i * n_B
+                first = n + i * n_B
                 dS[:, i, first:first + n_B] += inputs
         return rate, dS
 

@@ -26,10 +26,11 @@ from koopman_ros.learning.identification.drift import (
     DriftModel,
     fitted_starts,
     longest_step,
+    MOST_COEFFICIENTS,
     prediction_error,
     Segments,
 )
-from koopman_ros.learning.identification.identify import Identified, MOST_COEFFICIENTS, Watch
+from koopman_ros.learning.identification.identify import Identified, Watch
 from koopman_ros.learning.identification.structure_candidates import compared
 from koopman_ros.learning.identification.unmeasured_states import (
     BUDGET,

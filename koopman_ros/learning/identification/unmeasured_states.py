@@ -60,6 +60,7 @@ from koopman_ros.learning.identification.structure_candidates import (
 
 HIGHEST_DEGREE = 3
 BUDGET = 300.0  # s of processor time of a search
+_NONLINEAR = 0.5  # share of the time that linear models leave to others
 EXPLAINED = 1.2  # times the innovation variance of a filter: nothing is left to learn
 
 
@@ -92,7 +93,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     :param networks: whether networks are tried, too.
     :param dead_times: whether dead times are tried, too.
     :param seed: of the split, and of networks.
-    :param budget: processor time in s, after which the best so far is taken and the rest left out.
+    :param budget: processor time in s, after which the best so far is taken and the rest left out;
+        linear models take no more than half of it.
     :param backend: where networks are fitted; this process by default.
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, their inputs do not determine B, or
@@ -106,7 +108,8 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     least = 1 if measured is None else 0
     sizes = network_starts(seed) if networks else {}
     total = hidden + 1 - least + highest_degree + len(sizes) + 6
-    end, choice = time.process_time() + budget, Choice(() if measured is None else measured.steps)
+    now, choice = time.process_time(), Choice(() if measured is None else measured.steps)
+    end = now + budget
     begun = itertools.count()
 
     def stage(text: str, limit: float = end) -> Callable[..., bool]:
@@ -116,21 +119,24 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
             return told() or time.process_time() > limit
 
         if monitor():
-            choice.steps.append(f'stopped after {budget:.0f} s: {text}')
+            choice.steps.append(f'stopped after {limit - now:.0f} s: {text}')
         return monitor
+
+    def linear_stage(text: str) -> Callable[..., bool]:
+        return stage(text, end - _NONLINEAR * budget)
 
     n_y, search = len(plant.state_names), PolynomialSearch(record)
     manipulated = [dead_times and name not in plant.disturbance_names
                    for name in plant.input_names]
-    rising = search.rising(range(least, hidden + 1), choice, stage)
+    rising = search.rising(range(least, hidden + 1), choice, linear_stage)
     if not rising:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
     linear, first = smallest_adequate(rising), search
     late = least_late = None
     if any(manipulated):
-        late = late_linear(search, linear, manipulated, stage('dead time'))
+        late = late_linear(search, linear, manipulated, linear_stage('dead time'))
         # states may stand for a dead time that a nonlinear drift shows
-        least_late = late_linear(search, rising[0], manipulated, stage('dead time')) if (
+        least_late = late_linear(search, rising[0], manipulated, linear_stage('dead time')) if (
             rising[0] is not linear) else None
     if least_late is not None and compared(least_late.errors, rising[0].errors)[0]:
         choice.gains(least_late)
@@ -140,10 +146,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         # without the dead time some of the states may have stood for it
         assert late is not None
         search = PolynomialSearch(late.record, first.samples)
-        rising = [*search.rising(range(least, late.hidden), choice, stage), late]
+        rising = [*search.rising(range(least, late.hidden), choice, linear_stage), late]
         linear = smallest_adequate(rising)
     if plant.B is None and 1 < len(episodes) <= MOST_EPISODES:
-        monitor = stage('constant offset of each episode')
+        monitor = linear_stage('constant offset of each episode')
         extended = SplitRecord(
             *with_episode_inputs(plant, episodes), seed, hidden=True, offsets=True)
         more = PolynomialSearch(extended.later(search.record.late), first.samples)

@@ -15,7 +15,8 @@ from koopman_ros.learning.identification.base import (
     DriftProblem,
     IdentificationMethod,
 )
-from koopman_ros.learning.identification.drift import DriftModel
+from koopman_ros.learning.identification.drift import DriftModel, MOST_COEFFICIENTS
+from koopman_ros.learning.identification.term_selection import chosen_terms, OVERLAP
 from koopman_ros.model import Box, InputTerms
 
 # Exponent of the test functions (1 - s^2)^p, which are zero at the first and at the last sample.
@@ -31,6 +32,8 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
     Fit rates = features @ coefficients + inputs @ B' by linear least squares.
 
     Features (K, 1 + m), inputs (K, n_u) and rates (K, n_x), or integrals of them, in deviations.
+    Of more than ``MOST_COEFFICIENTS`` those of nonlinear terms are chosen by
+    :func:`chosen_terms`; the others are 0.
 
     :param B: (n_x, n_u) scaled, where it is known; None to fit it. Inputs and it may have more
         columns, see :class:`DriftModel`.
@@ -42,11 +45,16 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
         left, right = np.hstack([features, inputs]), rates
     # columns of integrals differ in size with their monomial's degree
     norms = np.linalg.norm(left, axis=0)
-    if len(left) < left.shape[1] or np.any(norms == 0.0):
+    n_x, m = rates.shape[1], features.shape[1]
+    chosen = degree > 1 and n_x * m > MOST_COEFFICIENTS
+    always = [*range(1 + n_x), *range(m, left.shape[1])]
+    # half of what the equations are worth is left to choose from
+    if np.any(norms == 0.0) or len(left) < (
+            2 * OVERLAP * len(always) if chosen else left.shape[1]):
         raise ValueError(f'{len(left)} equations do not determine {left.shape[1]} coefficients: '
                          'record more, or choose a lower degree')
-    solution = np.linalg.lstsq(left / norms, right, rcond=1e-12)[0] / norms[:, None]
-    m = features.shape[1]
+    solution = (chosen_terms(left / norms, right, always) if chosen else np.linalg.lstsq(
+        left / norms, right, rcond=1e-12)[0]) / norms[:, None]
     return DriftModel(box, degree, solution[:m], solution[m:].T if B is None else B)
 
 

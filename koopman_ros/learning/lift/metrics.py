@@ -31,6 +31,8 @@ class Fit:
     rw: float
     rx: float  #: relative mean-square error of the drift of x that the lift implies
     cond: float  #: condition number of S; large when coordinates have collapsed onto each other
+    #: that of the states among its coordinates, which are not learned; 1 where there are none
+    cond_of_states: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,9 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     reference = np.linalg.solve(factor, dz.T)
     return Fit(rw=float(np.sum(residual ** 2) / np.sum(reference ** 2)),
                rx=_relative_error(model, xi, f),
-               cond=cond)
+               cond=cond,
+               cond_of_states=float(np.linalg.cond(S[:model.n_x, :model.n_x])) if (
+                   model.observables.identity) else 1.0)
 
 
 def drift_error(model: LiftedModel, samples: DriftSamples) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from koopman_ros.core.datasets import Array
-from koopman_ros.core.solvers import RiccatiStatus, solve_riccati
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.model import NetworkObservables
 
@@ -55,7 +55,7 @@ class PrestabilizedFrame:
         A = fitted[:, :n_x]
         B = inputs.matrix(None if regressors is None else fitted[:, n_x:])[0]
         riccati = solve_riccati(A, B, np.eye(n_x), weight * np.eye(n_u))
-        if riccati.status is not RiccatiStatus.SOLVED:
+        if not riccati.solved:
             raise ValueError(
                 'no feedback of the inputs stabilises the linear fit of the samples, whose '
                 f'eigenvalues are {np.round(np.linalg.eigvals(A), 3).tolist()} in 1/time unit: '

@@ -209,7 +209,7 @@ def test_degenerate_records(records, words):
         identify(CUBIC.plant, records)
 
 
-@pytest.mark.parametrize(('n_x', 'highest'), [(1, 6), (2, 6), (3, 4), (4, 3), (12, 1)])
+@pytest.mark.parametrize(('n_x', 'highest'), [(1, 6), (2, 6), (3, 4), (4, 3), (12, 3), (13, 2)])
 def test_degrees_are_as_many_as_an_hour_determines(n_x, highest):
     plant = replace(PAIR.plant, state_names=tuple(map(str, range(n_x))), state_units=('m',) * n_x,
                     nominal_state=np.zeros(n_x))

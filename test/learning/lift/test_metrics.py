@@ -79,6 +79,17 @@ def test_rw_is_the_residual_in_whitened_coordinates():
     assert found.cond == pytest.approx(values[-1] / values[0], rel=1e-9)
 
 
+def test_states_that_move_together_are_not_coordinates_that_collapsed():
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(200, 1)) + 1e-3 * rng.normal(size=(200, 2))
+    dxdt, u = rng.normal(size=(200, 2)), rng.normal(size=(200, 1))
+    states = fit(random_lift(n_free=0), x, dxdt, u)
+    assert states.cond == states.cond_of_states > 100.0
+    lift = fit(random_lift(n_free=1), x, dxdt, u)
+    assert lift.cond_of_states == pytest.approx(states.cond, rel=1e-9)
+    assert lift.cond > lift.cond_of_states
+
+
 @pytest.mark.parametrize('movement', [0.0, 1e-5])
 def test_samples_that_hardly_move_are_rejected(movement):
     still = 3.5 + movement * np.random.default_rng(0).normal(size=(40, 1))
