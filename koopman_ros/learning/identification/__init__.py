@@ -13,6 +13,7 @@ from koopman_ros.learning.identification.base import (
     DriftEstimate,
     DriftProblem,
     IdentificationMethod,
+    methods_of,
 )
 from koopman_ros.learning.identification.characteristics import identify_with_characteristics
 from koopman_ros.learning.identification.dead_time import DeadTimes, find_dead_times
@@ -31,7 +32,6 @@ from koopman_ros.learning.identification.identify import (
     EstimateStatus,
     Identified,
     identify,
-    methods_of,
     Score,
     Stopped,
 )

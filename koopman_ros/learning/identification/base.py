@@ -1,18 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The contract of an identification method: a plug-in that estimates a polynomial drift."""
+"""Methods that estimate a polynomial drift: their contract, and those of a list by name."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.declaration import NoParameters
+from koopman_ros.core.plugins import contained, plugin_class, short_name
+from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.drift import DriftModel
 from koopman_ros.model import Box
 
@@ -70,3 +72,25 @@ class IdentificationMethod(ABC):
 
         :raises ValueError: for a problem that the method does not suit, such as short segments.
         """
+
+
+def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
+               ) -> dict[str, IdentificationMethod]:
+    """
+    Return methods of identification by name.
+
+    :param names: of ``METHODS``, or ``module:Class`` for one of your own.
+    :param parameters: fields of its `Parameters` by the name of the method.
+    :raises ValueError: for a name without a method, a class that does not fulfil the contract, or
+        parameters that it does not have.
+    """
+    found: dict[str, IdentificationMethod] = {}
+    for name in names:
+        kind = plugin_class(name, 'identification method', METHODS, IdentificationMethod)
+        short = short_name(name)
+        try:
+            found[short] = kind(kind.Parameters(**parameters.get(short, {})))
+        except Exception as error:
+            raise ValueError(f'the identification method {name!r} cannot be configured: '
+                             f'{contained(error)}') from error
+    return found

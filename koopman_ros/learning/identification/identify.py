@@ -16,10 +16,14 @@ import numpy as np
 
 from koopman_ros.core.arrays import expect, short_repr
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
-from koopman_ros.core.plugins import contained, plugin_class, short_name
+from koopman_ros.core.plugins import contained
 from koopman_ros.execution import Backend, Serial, Tell
 from koopman_ros.identification_methods import METHODS
-from koopman_ros.learning.identification.base import DriftProblem, IdentificationMethod
+from koopman_ros.learning.identification.base import (
+    DriftProblem,
+    IdentificationMethod,
+    methods_of,
+)
 from koopman_ros.learning.identification.degree_choice import (
     following,
     information,
@@ -377,28 +381,6 @@ def _estimates(given: _Given, degree: int
         except Exception as error:
             failures.append(f'the method {name} failed: {contained(error)}')
     return found, tuple(failures)
-
-
-def methods_of(names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
-               ) -> dict[str, IdentificationMethod]:
-    """
-    Return methods of identification by name.
-
-    :param names: of ``METHODS``, or ``module:Class`` for one of your own.
-    :param parameters: fields of its `Parameters` by the name of the method.
-    :raises ValueError: for a name without a method, a class that does not fulfil the contract, or
-        parameters that it does not have.
-    """
-    found: dict[str, IdentificationMethod] = {}
-    for name in names:
-        kind = plugin_class(name, 'identification method', METHODS, IdentificationMethod)
-        short = short_name(name)
-        try:
-            found[short] = kind(kind.Parameters(**parameters.get(short, {})))
-        except Exception as error:
-            raise ValueError(f'the identification method {name!r} cannot be configured: '
-                             f'{contained(error)}') from error
-    return found
 
 
 def _score(model: DriftModel, segments: Segments, method: str) -> Score:
