@@ -91,8 +91,9 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
 
     # one that the controller rejects
     assert ros.set_bool(SERVICE, False).success
-    (result,) = ros.set_parameters('trainer', **{'level_2.setpoint_max': 5.0})
-    assert result.successful, result.reason
+    for result in ros.set_parameters('trainer', experiment_length=60000.0, **{
+            'level_2.setpoint_max': 5.0}):
+        assert result.successful, result.reason
     assert ros.set_bool(SERVICE, True).success
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert re.fullmatch(r'aborted: the controller tracks [0-9.]+ m instead of the requested [0-9.]'
@@ -109,7 +110,7 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     assert ros.set_bool(SERVICE, True).message == f'rejected: {words}'
 
     # but passes on the pumps that an experiment asks for by hand, until it is automatic again
-    ros.set_parameters('trainer', experiment_signal='manual', experiment_length=60000.0)
+    ros.set_parameters('trainer', experiment_signal='manual')
     commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
     assert ros.set_bool(SERVICE, True).message == (
         'started on /manual_pump_1_setpoint, /manual_pump_2_setpoint')
