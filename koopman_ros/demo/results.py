@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _AVERAGED = 600.0  # s over which an offset is averaged
+_UNDER_WAY = 20  # most samples on their way to the recorder when the plant is stopped
 
 
 @dataclass(frozen=True)
@@ -95,17 +96,18 @@ def read_run(wiring: SignalTopics, *bags: Path) -> DemoRun:
 
 
 def _check_complete(bag: Path, stamps: Mapping[str, Array]) -> None:
-    """Raise a ValueError if signals that are sampled together lack samples before the last."""
+    """Raise a ValueError if signals that are sampled together lack samples before the end."""
     found = np.unique(np.concatenate(list(stamps.values())))
     period = np.diff(found).min(initial=2 ** 62)
     numbers = {name: np.rint((of - found[0]) / period) for name, of in stamps.items()}
-    # a plant that is stopped gets no answer to its last measurement
-    expected = np.arange(float(np.rint((found[-1] - found[0]) / period)))
+    count = round((found[-1] - found[0]) / period) + 1
+    # a plant that is stopped gets no answer to its last measurement, and takes messages with it
+    expected = np.arange(float(count - _UNDER_WAY))
     lost = {name: len(np.setdiff1d(expected, of)) for name, of in numbers.items()}
     if any(lost.values()):
         raise ValueError(f'{bag} lacks ' + ', '.join(
-            f'{count} of {len(expected) + 1} samples of {name}'
-            for name, count in lost.items() if count) + f': {BUSY}')
+            f'{missing} of {count} samples of {name}'
+            for name, missing in lost.items() if missing) + f': {BUSY}')
 
 
 def draw_phases(panels: Sequence[Axes], phases: Sequence[tuple[str, float]]) -> None:

@@ -131,8 +131,7 @@ class TrainerParameters(SignalParameters):
     experiment_min_hold_time: float = parameter(30.0, 'Shortest step.', 's', 0.01, 1e6)
     experiment_max_hold_time: float = parameter(120.0, 'Longest step.', 's', 0.01, 1e6)
     experiment_timeout: float = parameter(
-        10.0, 'Wall time without a newer measurement, or in which the controller does not follow, '
-              'after which the experiment is aborted.', 's',
+        10.0, 'Wall time without a newer measurement after which the experiment is aborted.', 's',
         0.0, 86400.0, open_minimum=True)
     experiment_seed: int = parameter(
         0, 'Random seed of the steps.', '', 0, 2 ** 31)

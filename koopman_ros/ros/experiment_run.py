@@ -50,7 +50,8 @@ from koopman_ros.ros.signals import (
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
 _TICK = 0.1  # s
-_DEVIATIONS = 10  # commands in `experiment_timeout` after which a controller is said not to follow
+_DEVIATIONS = 10  # commands of a controller, and
+_DEVIATION_TIME = 5.0  # s, after which it is said not to follow; a busy machine may take a while
 _RETURN_TIME = 2.0  # s for the way back at the end of the process
 _ACKNOWLEDGE_TIME = 0.2  # s for the last command to arrive
 
@@ -293,7 +294,7 @@ class ExperimentRun:
                 continue
             value, asked = values[name], float(self.progress.command[i])
             monitor = self._monitors[i] = self._monitors[i].after(value, asked, now)
-            if monitor.deviations >= _DEVIATIONS and now - monitor.since >= self._timeout:
+            if monitor.deviations >= _DEVIATIONS and now - monitor.since >= _DEVIATION_TIME:
                 self._on_end(reason(code, signal=name, value=value, requested=asked))
                 return
 

@@ -50,7 +50,6 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     asked = [ros.speak(JointState, f'{name}/setpoint', to='controller') for name in LEVELS]
     ros.start('trainer', {
         **TRAINER, 'model': model, 'experiment_signal': 'setpoint', 'experiment_length': 250.0,
-        'experiment_timeout': 3.0,
         'experiment_min_hold_time': 20.0, 'experiment_max_hold_time': 50.0, **{
             f'{name}.setpoint_{end}': float(bound[i]) for i, name in enumerate(LEVELS)
             for end, bound in (('min', low), ('max', high))}})

@@ -299,8 +299,14 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))
     assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(
         False, 'the controller is not running: start it')
-    ros.wait_until(lambda: len(actions) >= 12)
-    first, last = (json.loads(actions[at].data) for at in (0, -1))
+
+    def audited(at: int) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(actions[at].data)
+        return found
+
+    # the last one, which comes after that to cancel a training
+    ros.wait_until(lambda: len(actions) >= 12 and audited(-1)['what'] != 'cancel trainer')
+    first, last = audited(0), audited(-1)
     assert (first['who'], first['what']) == ('anna', 'setpoint temperature')
     assert (first['new'], first['unit'], first['accepted'], first['answer']) == (
         46.0, 'degC', True, 'accepted')
