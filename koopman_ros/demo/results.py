@@ -102,8 +102,8 @@ def _check_complete(bag: Path, stamps: Mapping[str, Array]) -> None:
     numbers = {name: np.rint((of - found[0]) / period) for name, of in stamps.items()}
     count = round((found[-1] - found[0]) / period) + 1
     # a plant that is stopped gets no answer to its last measurement, and takes messages with it
-    expected = np.arange(float(count - _UNDER_WAY))
-    lost = {name: len(np.setdiff1d(expected, of)) for name, of in numbers.items()}
+    lost = {name: len(np.setdiff1d(np.arange(max(float(count - _UNDER_WAY), *of)), of))
+            for name, of in numbers.items()}
     if any(lost.values()):
         raise ValueError(f'{bag} lacks ' + ', '.join(
             f'{missing} of {count} samples of {name}'

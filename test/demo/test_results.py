@@ -32,6 +32,7 @@ def without(bag: Path, lost: dict[str, tuple[int, ...]]) -> Path:
 
 @pytest.mark.parametrize(('lost', 'words'), [
     ({}, ''), ({COOLANT: (COUNT - 1,)}, ''), ({COOLANT: tuple(range(COUNT - 4, COUNT))}, ''),
+    ({COOLANT: (COUNT - 5, COUNT - 4)}, f'lacks 2 of {COUNT} samples of coolant_temperature'),
     ({COOLANT: (2, 5)}, f'lacks 2 of {COUNT} samples of coolant_temperature'),
     ({'/temperature': (0,), COOLANT: (3,)},
      f'lacks 1 of {COUNT} samples of temperature, 1 of {COUNT} samples of coolant_temperature'),
