@@ -135,9 +135,7 @@ class EstimateReport(NamedTuple):
         states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
         try:
             disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
-            # but for rounding
-            at_bound = any(abs(one) >= (1.0 - 1e-9) * most for one, most in zip(
-                disturbance.tolist(), estimator.tuning.max_disturbance.tolist(), strict=True))
+            at_bound = bool(estimator.at_bound(estimate.w))
         except BaseException as error:
             contained(error)
             disturbance, at_bound = np.full(len(inputs), np.nan), False

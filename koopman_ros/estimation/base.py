@@ -226,13 +226,20 @@ class Estimator(ABC):
         found[:, rows] = self.model.input_inverse()[:, rows]
         return found
 
+    def at_bound(self, w: Array) -> bool:
+        """Return whether a disturbance is at `max_disturbance`, but for rounding."""
+        return self._share(w) >= 1.0 - 1e-9
+
     def bounded(self, w: Array) -> Array:
         """Return a disturbance within `max_disturbance`; none where it is not finite."""
-        # of its bound, as an input
-        shares = [abs(one) for one in (self.as_input(w) / self._max_disturbance).tolist()]
-        if not math.isfinite(sum(shares)):
-            return np.zeros_like(w)
-        return w / share if (share := max(shares, default=0.0)) > 1.0 else w
+        share = self._share(w)
+        if share <= 1.0:
+            return w
+        return w / share if math.isfinite(share) else np.zeros_like(w)
+
+    def _share(self, w: Array) -> float:
+        """Return the largest share of its bound that a disturbance has as an input."""
+        return float((np.abs(self.as_input(w)) / self._max_disturbance).max(initial=0.0))
 
     @cached_property
     def _max_disturbance(self) -> Array:
