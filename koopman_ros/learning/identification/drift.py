@@ -34,6 +34,13 @@ _Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]
 # minutes for more, and an hour does not determine them: then few of them are chosen.
 MOST_COEFFICIENTS = 150
 
+
+def chooses_terms(degree: int, coefficients: int) -> bool:
+    """Return whether an estimate with this number of coefficients keeps only some terms."""
+    return degree > 1 and coefficients > MOST_COEFFICIENTS
+
+
+
 # Of the search of a steady state: the range is that of noisy measurements, and a search that is so
 # far outside does not come back.
 _SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
@@ -155,8 +162,8 @@ class DriftModel(Drift):
     @cached_property
     def free(self) -> NDArray[np.bool_]:
         """(1 + m, n_x) which coefficients an estimate may change: of many only those it chose."""
-        few = self.degree == 1 or self.coefficients.size <= MOST_COEFFICIENTS
-        return (self.coefficients != 0.0) | few
+        return (self.coefficients != 0.0) | (
+            not chooses_terms(self.degree, self.coefficients.size))
 
     @property
     def linear(self) -> bool:

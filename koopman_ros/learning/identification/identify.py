@@ -33,10 +33,10 @@ from koopman_ros.learning.identification.degree_choice import (
 from koopman_ros.learning.identification.drift import (
     autocorrelation,
     box_of,
+    chooses_terms,
     Drift,
     DriftModel,
     longest_step,
-    MOST_COEFFICIENTS,
     prediction_error,
     Segments,
 )
@@ -47,7 +47,7 @@ from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.model import Box
 
 DEGREES = (1, 2, 3, 4, 5, 6)
-# Up to this degree monomials are tried that are too many to estimate all of them
+# Highest degree, and most monomials, of a drift whose terms are chosen.
 _DEGREE, _MOST_MONOMIALS = 3, 500
 OUTPUT_ERROR = 'output error'
 INNOVATIONS_FORM = 'innovations form'
@@ -276,7 +276,7 @@ def usual_degrees(n_x: int, *, chosen: bool = False) -> tuple[int, ...]:
     """
     def suits(degree: int) -> bool:
         count = math.comb(n_x + degree, degree)
-        return degree == 1 or n_x * count <= MOST_COEFFICIENTS or (
+        return not chooses_terms(degree, n_x * count) or (
             chosen and degree <= _DEGREE and count <= _MOST_MONOMIALS)
 
     return tuple(filter(suits, DEGREES))

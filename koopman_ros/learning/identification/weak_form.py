@@ -15,7 +15,7 @@ from koopman_ros.learning.identification.base import (
     DriftProblem,
     IdentificationMethod,
 )
-from koopman_ros.learning.identification.drift import DriftModel, MOST_COEFFICIENTS
+from koopman_ros.learning.identification.drift import chooses_terms, DriftModel
 from koopman_ros.learning.identification.term_selection import chosen_terms, OVERLAP
 from koopman_ros.model import Box, InputTerms
 
@@ -32,7 +32,7 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
     Fit rates = features @ coefficients + inputs @ B' by linear least squares.
 
     Features (K, 1 + m), inputs (K, n_u) and rates (K, n_x), or integrals of them, in deviations.
-    Of more than ``MOST_COEFFICIENTS`` those of nonlinear terms are chosen by
+    Of too many, see :func:`chooses_terms`, those of nonlinear terms are chosen by
     :func:`chosen_terms`; the others are 0.
 
     :param B: (n_x, n_u) scaled, where it is known; None to fit it. Inputs and it may have more
@@ -46,7 +46,7 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
     # columns of integrals differ in size with their monomial's degree
     norms = np.linalg.norm(left, axis=0)
     n_x, m = rates.shape[1], features.shape[1]
-    chosen = degree > 1 and n_x * m > MOST_COEFFICIENTS
+    chosen = chooses_terms(degree, n_x * m)
     always = [*range(1 + n_x), *range(m, left.shape[1])]
     # half of what the equations are worth is left to choose from
     if np.any(norms == 0.0) or len(left) < (
