@@ -71,7 +71,7 @@ def found():
 
 @pytest.fixture(scope='module')
 def course():
-    """Return what is told of a comparison: of the starts, and of the closed loops."""
+    """Return the progress that a comparison reports: its starts, and its closed loops."""
     return [], []
 
 
