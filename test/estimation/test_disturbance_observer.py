@@ -90,6 +90,8 @@ def test_the_disturbance_is_bounded():
     observer = observing(MODEL, 0.1, 0.5)
     huge = observer.correct(Estimate(np.zeros(1), np.zeros(1)), np.array([1e6]), 1.0)
     np.testing.assert_allclose(np.abs(observer.as_input(huge.w)), 0.5, rtol=1e-12)
+    assert observer.at_bound(huge.w)
+    assert not observer.at_bound(0.99 * huge.w)
     np.testing.assert_array_equal(observer.bounded(np.array([np.nan])), [0.0])
     np.testing.assert_array_equal(observer.bounded(np.array([np.inf])), [0.0])
 
