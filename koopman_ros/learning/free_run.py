@@ -116,6 +116,8 @@ class FreeRun:
                         axes.axvspan(episode.time[0], episode.time[
                             min(self.init, len(episode)) - 1], color='0.93', label='start')
                         name = self.names[i]
+                        if not k:
+                            axes.set_title(f'fit {self.fit[i]:.1f} %', loc='left', fontsize=8)
                     else:
                         j = i - n_y
                         name, unit = inputs[j], self.plant.input_units[j]
@@ -126,9 +128,7 @@ class FreeRun:
                 panels[k].legend(fontsize=8, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=3,
                                  frameon=False)
                 panels[(rows - 1) * columns + k].set_xlabel(f'time [{self.plant.time_unit}]')
-            figure.suptitle('Free run, ' + ', '.join(
-                f'{name}: fit {fit:.1f} %' for name, fit in zip(self.names, self.fit, strict=True)
-            ))
+            figure.suptitle('Free run')
 
 
 def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | None = None,
