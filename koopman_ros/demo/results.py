@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _AVERAGED = 600.0  # s over which an offset is averaged
-_UNDER_WAY = 20  # most samples on their way to the recorder when the plant is stopped
 
 
 @dataclass(frozen=True)
@@ -96,17 +95,16 @@ def read_run(wiring: SignalTopics, *bags: Path) -> DemoRun:
 
 
 def _check_complete(bag: Path, stamps: Mapping[str, Array]) -> None:
-    """Raise a ValueError if signals that are sampled together lack samples before the end."""
+    """Raise a ValueError if signals that are sampled together lack samples before the last."""
     found = np.unique(np.concatenate(list(stamps.values())))
     period = np.diff(found).min(initial=2 ** 62)
-    numbers = {name: np.rint((of - found[0]) / period) for name, of in stamps.items()}
-    count = round((found[-1] - found[0]) / period) + 1
-    # a plant that is stopped gets no answer to its last measurement, and takes messages with it
-    lost = {name: len(np.setdiff1d(np.arange(max(float(count - _UNDER_WAY), *of)), of))
-            for name, of in numbers.items()}
+    # a plant that is stopped gets no answer to its last measurement
+    expected = np.arange(np.rint((found[-1] - found[0]) / period))
+    lost = {name: len(np.setdiff1d(expected, np.rint((of - found[0]) / period)))
+            for name, of in stamps.items()}
     if any(lost.values()):
         raise ValueError(f'{bag} lacks ' + ', '.join(
-            f'{missing} of {count} samples of {name}'
+            f'{missing} of {len(expected) + 1} samples of {name}'
             for name, missing in lost.items() if missing) + f': {BUSY}')
 
 

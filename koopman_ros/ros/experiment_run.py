@@ -13,7 +13,6 @@ import time
 from typing import Any
 
 import numpy as np
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
@@ -53,7 +52,6 @@ _TICK = 0.1  # s
 _DEVIATIONS = 10  # commands of a controller, and
 _DEVIATION_TIME = 5.0  # s, after which it is said not to follow; a busy machine may take a while
 _RETURN_TIME = 2.0  # s for the way back at the end of the process
-_ACKNOWLEDGE_TIME = 0.2  # s for the last command to arrive
 
 
 def stepped(settings: TrainerParameters, wiring: SignalTopics) -> dict[str, MessageField]:
@@ -217,8 +215,6 @@ class ExperimentRun:
                 self.progress = advance(self.plan, self.progress, None, stamp_ns)
                 self._command(self.progress.command, stamp_ns)
             time.sleep(0.001)
-        for publisher in self._publisher.publishers:
-            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_TIME))
         if not self._returned:
             self._node.get_logger().warning(
                 'experiment: ended during the return: '

@@ -9,8 +9,10 @@ from pathlib import Path
 import re
 import signal
 import sys
+import time
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
@@ -28,6 +30,7 @@ _LOOPS = '--loops'
 # (arguments, file of loops, signals as they come) to the exit code
 LoopRunner = Callable[[list[str] | None, str, list[int]], int]
 LONGEST_WAIT = 0.1  # s from a signal to the end
+LAST_MESSAGES_TIME = 0.5  # s for the last messages to reach their subscribers
 TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
@@ -126,6 +129,11 @@ def take_down(name: str, node: LoopNode | None, executor: Executor | None,
         # its threads would call into the interpreter while that ends
         executor.shutdown()
     if node is not None:
+        # what is still under way would be lost with its sender
+        deadline = time.monotonic() + LAST_MESSAGES_TIME
+        for publisher in node.publishers:
+            publisher.wait_for_all_acked(
+                Duration(seconds=max(0.0, deadline - time.monotonic())))
         node.destroy_node()
     rclpy.try_shutdown()
     # the caller may continue

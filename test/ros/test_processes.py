@@ -144,6 +144,48 @@ def test_signals_during_the_start_end_a_node_cleanly(shared_ros: Harness, name: 
     assert re.fullmatch(words, plant.output(), re.DOTALL)
 
 
+SENDER = """
+import os, signal, sys, time
+import rclpy
+from std_msgs.msg import String
+from koopman_ros.ros import process, topics
+process.LAST_MESSAGES_TIME = 20.0
+rclpy.init()
+node = rclpy.create_node('sender')
+publisher = node.create_publisher(String, 'text', topics.profile(200, reliable=True))
+while not publisher.get_subscription_count():
+    time.sleep(0.01)
+os.kill(int(sys.argv[1]), signal.SIGSTOP)
+for _ in range(200):
+    publisher.publish(String(data=10_000 * '.'))
+print('sent', flush=True)
+process.take_down('sender', node, None, 30.0)
+"""
+RECEIVER = """
+import rclpy
+from std_msgs.msg import String
+from koopman_ros.ros import topics
+rclpy.init()
+node = rclpy.create_node('receiver')
+node.create_subscription(
+    String, 'text', lambda _: print('.', end='', flush=True), topics.profile(200, reliable=True))
+rclpy.spin(node)
+"""
+
+
+def test_the_last_messages_arrive_before_their_sender_ends(ros: Harness) -> None:
+    receiver = ros.start('receiver', command=(sys.executable, '-c', RECEIVER))
+    sender = ros.start('sender', command=(sys.executable, '-c', SENDER, str(receiver.process.pid)))
+    ros.wait_until(lambda: 'sent' in sender.output())
+    # a sender that does not wait ends here, and what a stopped receiver has no room for is lost
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        sender.process.wait(0.5)
+    receiver.send(signal.SIGCONT)
+    ros.wait_until(lambda: receiver.output().count('.') == 200)
+    assert ros.wait_for_end(sender) == 0
+    receiver.send(signal.SIGKILL)
+
+
 def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path) -> None:
     process = ros.start('trainer', {'output': tmp_path / 'bag.mcap'}, command=(
         'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh',
