@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from koopman_ros import __version__
 from koopman_ros.core.plots import write_figures
-from koopman_ros.execution import Backend, backend_of, SchedulerLost, Serial, Tell, WorkerLost
+from koopman_ros.execution import Backend, backend_of, Notify, SchedulerLost, Serial, WorkerLost
 from koopman_ros.model import LiftedModel
 
 Key = TypeVar('Key')
@@ -81,7 +81,7 @@ def over(backend: Backend | None, function: Callable[[Key], Found], keys: Iterab
         _called, by_name, shared=function)}
 
 
-def _called(function: Callable[[Key], Found], key: Key, _: Tell) -> Found:
+def _called(function: Callable[[Key], Found], key: Key, _: Notify) -> Found:
     return function(key)
 
 
@@ -165,7 +165,7 @@ def run_campaign(seeds: int, experiments: Mapping[str, Experiment], scheduler: s
     return campaign
 
 
-def _run(_: None, item: tuple[str, int, Experiment], __: Tell) -> tuple[Metrics, Models] | str:
+def _run(_: None, item: tuple[str, int, Experiment], __: Notify) -> tuple[Metrics, Models] | str:
     _name, seed, experiment = item
     try:
         return experiment(seed)

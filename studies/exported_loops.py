@@ -27,7 +27,7 @@ from koopman_ros.control import Controller
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.status import StatusCode
-from koopman_ros.execution import backend_of, Tell
+from koopman_ros.execution import backend_of, Notify
 from koopman_ros.export import c_code, compiled
 from koopman_ros.export.c_code import CODES
 from koopman_ros.export.command_line import loop
@@ -143,7 +143,7 @@ def random_loops() -> Iterator[tuple[str, Controller, float]]:
                 raise
 
 
-def _row(samples: int, named: tuple[str, int], _: Tell) -> dict[str, Any]:
+def _row(samples: int, named: tuple[str, int], _: Notify) -> dict[str, Any]:
     """Compare a loop, and measure the code of a bundled one; for the summary."""
     name, seed = named
     loops = itertools.chain(bundled_loops(), random_loops())

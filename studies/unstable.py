@@ -23,7 +23,7 @@ from koopman_ros.core.signals import Outputs
 from koopman_ros.evaluation import at, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory, optimum, Task
 from koopman_ros.evaluation.simulate import Simulation
-from koopman_ros.execution import Backend, backend_of, Tell
+from koopman_ros.execution import Backend, backend_of, Notify
 from koopman_ros.learning import compare, fit, IncrementalTraining, NeuralDrift, TrainingFailed
 from koopman_ros.learning.lift.multistart import Recipe
 from koopman_ros.model import LiftedModel
@@ -187,7 +187,7 @@ def main(args: list[str] | None = None) -> int:
         return _report(options.seeds, backend)
 
 
-def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
+def judged(_: None, seed: int, __: Notify) -> tuple[LiftedModel, list[str]] | str:
     """Learn from a seed; return the lift and its row, or why there is none."""
     begin = time.process_time()
     try:

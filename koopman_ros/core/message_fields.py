@@ -84,8 +84,8 @@ class MessageField:
         usual = KNOWN_TYPES.get(self.type, _ANY)
         if self.field != usual.field:
             return -math.inf, math.inf
-        here = conversion(usual.unit or self.unit, self.unit)
-        return here(usual.lowest), here(usual.highest)
+        convert = conversion(usual.unit or self.unit, self.unit)
+        return convert(usual.lowest), convert(usual.highest)
 
     def get(self, message: Any) -> float:
         """Return the number in a message; LookupError where it has none there."""
@@ -195,16 +195,16 @@ def place(topic: str, name: str, unit: str,
     :param unit: of the signal itself.
     :raises ValueError: for a type without a usual field where none is given.
     """
-    said = {key: value for key, value in (given or {}).items() if value}
+    chosen = {key: value for key, value in (given or {}).items() if value}
     kind, array = _TYPES.get(unit, (JOINT_STATE, ''))
-    kind = full_type_name(said.get('type', kind))
+    kind = full_type_name(chosen.get('type', kind))
     carrier = KNOWN_TYPES.get(kind, _ANY)
-    field = said.get('field') or (array if kind == JOINT_STATE and array else carrier.field)
+    field = chosen.get('field') or (array if kind == JOINT_STATE and array else carrier.field)
     if not field:
         raise ValueError(f'the field of a {kind} that holds the value is unknown: name it, e.g. '
                          'twist.linear.x or data[2]')
-    return MessageField(said.get('topic', topic), kind, field.replace('{name}', name),
-                        said.get('unit') or carrier.unit or display_unit(unit))
+    return MessageField(chosen.get('topic', topic), kind, field.replace('{name}', name),
+                        chosen.get('unit') or carrier.unit or display_unit(unit))
 
 
 def base_name(name: str, unit: str) -> str:

@@ -26,7 +26,7 @@ _POINTS = 2000
 
 
 @dataclass(frozen=True)
-class Course:
+class Response:
     """A run under some law."""
 
     states: Array  #: (N, n_x) at the samples
@@ -61,7 +61,7 @@ class LateRun:
         """The dead time in samples."""
         return round(float(np.max(self.start.actuator.dead_time)) / self.period)
 
-    def under(self, law: Commands) -> Course:
+    def under(self, law: Commands) -> Response:
         """Return the run under a law."""
         process, ends = self.start, {piece.begin: piece for piece in self.pieces}
         states, commands, effects = [], [], []
@@ -78,9 +78,9 @@ class LateRun:
         cost = sum(cost_along(self._task(piece, x[piece.begin], end - piece.begin),
                               x[piece.begin:end], acting[piece.begin:end])
                    for piece, end in self._ends())
-        return Course(x, np.array(commands), acting, cost)
+        return Response(x, np.array(commands), acting, cost)
 
-    def optimum(self) -> Course:
+    def optimum(self) -> Response:
         """
         Return the run of least cost on the true equations.
 

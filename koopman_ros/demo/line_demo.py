@@ -21,7 +21,7 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import draw_limits, drawing, legend, write_figures
 from koopman_ros.core.units import display_unit, shown, to_celsius, unit_label
 from koopman_ros.demo.console import LiveTable
-from koopman_ros.demo.late_input import Course, FirstOrder, LateRun, pi_law, Piece
+from koopman_ros.demo.late_input import FirstOrder, LateRun, pi_law, Piece, Response
 from koopman_ros.demo.loop import FIRST_STAMP_NS, running_loop, Scenario
 from koopman_ros.demo.results import read_run, read_signal
 from koopman_ros.model import load
@@ -66,22 +66,22 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
     colder = feed[0][np.argmax(feed[1] < 0.5 * (feed[1][0] + COLD))]
     # a plant in lock-step goes on while it is given the constant, and until it is stopped
     commands = run.commanded[VALVE][run.command_seconds <= colder + _DURATION - FEED_TIME]
-    courses = _courses(commands, round(colder / scenario.sample_period))
-    best, seconds = courses['optimum'], scenario.sample_period * np.arange(float(len(commands)))
+    responses = _responses(commands, round(colder / scenario.sample_period))
+    best, seconds = responses['optimum'], scenario.sample_period * np.arange(float(len(commands)))
     result: dict[str, object] = {'unit': 'K', 'feed_step': COLD - float(feed[1][0])} | {
         f'{name.lower().replace(" ", "_")}': {
-            'cost_by_optimum': course.cost / best.cost, **_figures(course, seconds, colder)}
-        for name, course in courses.items()}
+            'cost_by_optimum': response.cost / best.cost, **_figures(response, seconds, colder)}
+        for name, response in responses.items()}
     analysed = read_signal(bag, place(CONCENTRATION, CONCENTRATION, 'mol/L'), 'mol/L')
     estimated = read_signal(bag, replace(
         place(CONTROLLER_INTERNALS, CONCENTRATION, 'mol/L'),
         field=f'position[estimated_{CONCENTRATION} [mol/L]]'), 'mol/L')
-    _draw(output / 'closed_loop.png', seconds, courses, feed, analysed, estimated)
+    _draw(output / 'closed_loop.png', seconds, responses, feed, analysed, estimated)
     write_figures(output / 'summary.json', result)
     return result
 
 
-def _courses(commands: Array, colder: int) -> dict[str, Course]:
+def _responses(commands: Array, colder: int) -> dict[str, Response]:
     """Return the recorded run on the plant's equations, and those of the others, by name."""
     table = PlantTable({'system': PLANT})
     values = table.snapshot({})
@@ -112,9 +112,9 @@ def _courses(commands: Array, colder: int) -> dict[str, Course]:
         for name, predicts in (('PI', False), ('Smith predictor', True))}}
 
 
-def _figures(course: Course, seconds: Array, colder: float) -> dict[str, float]:
+def _figures(response: Response, seconds: Array, colder: float) -> dict[str, float]:
     """Return how far the temperature goes beyond its set-points, and from it by the feed."""
-    kelvin = course.states[:, 1]
+    kelvin = response.states[:, 1]
     (first, high), (second, low) = STEPS
     return {'overshoot_up': float(np.max(kelvin[(seconds > first) & (seconds <= second)]) - high),
             'overshoot_down': float(low - np.min(kelvin[
@@ -123,11 +123,11 @@ def _figures(course: Course, seconds: Array, colder: float) -> dict[str, float]:
             'final_error': float(abs(np.mean(kelvin[-60:]) - low))}
 
 
-def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
+def _draw(path: Path, seconds: Array, responses: Mapping[str, Response],
           feed: tuple[Array, Array], analysed: tuple[Array, Array],
           estimated: tuple[Array, Array]) -> None:
     """Draw temperature, valve, concentration and feed over minutes."""
-    minutes, best = seconds / 60.0, courses['optimum'].cost
+    minutes, best = seconds / 60.0, responses['optimum'].cost
     with drawing(path, 4, 1, sharex=True, size=(9.0, 9.0), gridspec_kw={
             'height_ratios': (6, 4, 4, 3)}) as (figure, panels):
         temperature, valve, concentration, cold = panels
@@ -135,12 +135,12 @@ def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
         for (at, kelvin), end in zip(STEPS, edges[1:], strict=True):
             temperature.plot([at / 60.0, end / 60.0], [to_celsius(kelvin)] * 2, 'k--',
                              linewidth=1.0, label='set-point')
-        for name, course in courses.items():
-            temperature.plot(minutes, shown(course.states[:, 1], 'K'), label=name,
+        for name, response in responses.items():
+            temperature.plot(minutes, shown(response.states[:, 1], 'K'), label=name,
                              **_STYLES[name])
-            valve.step(minutes, course.commands[:, 0], where='post', label=name, **_STYLES[name])
+            valve.step(minutes, response.commands[:, 0], where='post', label=name, **_STYLES[name])
         draw_limits(valve, (0.0, 100.0), 'limits')
-        concentration.plot(minutes, courses['learned'].states[:, 0], color='tab:gray',
+        concentration.plot(minutes, responses['learned'].states[:, 0], color='tab:gray',
                            linewidth=2.5, label='true')
         concentration.plot(estimated[0] / 60.0, estimated[1], color='tab:purple',
                            linewidth=1.0, label='estimated')
@@ -151,7 +151,7 @@ def _draw(path: Path, seconds: Array, courses: Mapping[str, Course],
                 'K', 'percent', 'mol/L', 'K'), strict=True):
             panel.set_ylabel(f'{name} [{unit_label(display_unit(unit))}]')
         temperature.set_title('heated line, 45 s late. Cost over the optimum: ' + ', '.join(
-            f'{name} {course.cost / best:.3f}' for name, course in courses.items()
+            f'{name} {response.cost / best:.3f}' for name, response in responses.items()
             if name != 'optimum'), fontsize=9)
         panels[-1].set(xlabel='plant time [min]', xlim=(0.0, minutes[-1]))
         legend(figure, panels, 5)

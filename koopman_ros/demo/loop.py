@@ -95,8 +95,8 @@ class Operator:
         self._setpoints: SignalPublisher | None = SignalPublisher(wiring.setpoints, states,
                                                                   self._publisher)
         self._listen(wiring.measured, states, partial(self._on_part, self._measured))
-        self._listen(wiring.active_setpoints, states, lambda heard: self._active.update(
-            heard.values), topics.LATCHED_QOS)
+        self._listen(wiring.active_setpoints, states, lambda sample: self._active.update(
+            sample.values), topics.LATCHED_QOS)
         self._commands = self._listen(
             wiring.commands, inputs, partial(self._on_part, self._commanded))
 
@@ -104,11 +104,11 @@ class Operator:
         return self.harness.node.create_publisher(kind, topic, topics.LOOP_QOS)
 
     def _listen(self, places: Mapping[str, MessageField], units: Mapping[str, str],
-                hear: Callable[[SignalSample], None],
+                on_sample: Callable[[SignalSample], None],
                 qos: QoSProfile = topics.LOOP_QOS) -> SignalSubscriber:
         node = self.harness.node
         return SignalSubscriber(node, lambda topic, callback, kind: node.create_subscription(
-            kind, topic, callback, qos), places, units, hear)
+            kind, topic, callback, qos), places, units, on_sample)
 
     @property
     def found_loop(self) -> bool:
@@ -188,10 +188,10 @@ class Operator:
         if not model.exists():
             raise HarnessError(status.message)
 
-    def _on_part(self, parts: dict[int, dict[str, float]], heard: SignalSample) -> None:
+    def _on_part(self, parts: dict[int, dict[str, float]], sample: SignalSample) -> None:
         """Take a message, and show the row that it makes whole."""
-        stamp = heard.stamp_ns
-        parts.setdefault(stamp, {}).update(heard.values)
+        stamp = sample.stamp_ns
+        parts.setdefault(stamp, {}).update(sample.values)
         if (len(self._measured.get(stamp, ())) == len(self._wiring.measured)
                 and len(self._commanded.get(stamp, ())) == len(self._wiring.commands)):
             self.last_stamp_ns = stamp
@@ -218,17 +218,17 @@ def foreign(harness: Harness, wiring: SignalTopics) -> str:
     commands = {place.topic for place in wiring.commands.values()}
     names = [name for name, namespace in node.get_node_names_and_namespaces()
              if namespace == '/']
-    there = [f'a node /{name}' for name in names if name in _NODES]
+    present = [f'a node /{name}' for name in names if name in _NODES]
     if names.count(node.get_name()) > 1:
-        there.append(f'another node /{node.get_name()}')
+        present.append(f'another node /{node.get_name()}')
     for topic in sorted(used):
-        there += [f'{topics.node_name(info)} publishes {topic}'
-                  for info in node.get_publishers_info_by_topic(topic)]
+        present += [f'{topics.node_name(info)} publishes {topic}'
+                    for info in node.get_publishers_info_by_topic(topic)]
     for topic in sorted(commands):
-        there += [f'{topics.node_name(info)} subscribes to {topic}'
-                  for info in node.get_subscriptions_info_by_topic(topic)
-                  if not info.node_name.startswith('_ros2cli')]
-    return ', '.join(dict.fromkeys(there))
+        present += [f'{topics.node_name(info)} subscribes to {topic}'
+                    for info in node.get_subscriptions_info_by_topic(topic)
+                    if not info.node_name.startswith('_ros2cli')]
+    return ', '.join(dict.fromkeys(present))
 
 
 @contextlib.contextmanager

@@ -124,12 +124,12 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
     task = Task(system, states[0], *steady_state(system, setpoints),
                 tuning.state_weight, tuning.input_weight,
                 plant.sample_period / system.seconds_per_time_unit, len(states) - 1)
-    courses = {'linear law': linear_law(task), 'optimum': optimum(task)}
-    linear, best = courses.values()
+    trajectories = {'linear law': linear_law(task), 'optimum': optimum(task)}
+    linear, best = trajectories.values()
     cost = cost_along(task, states, inputs[:-1])
     title = (f'{system.name}: {change}. Cost over the optimum without rate limit: learned '
              f'{cost / best.cost:.4f}, linear {linear.cost / best.cost:.4f}')
-    _draw(picture, title, run, courses, signals, scenario, model.states, tuning, code)
+    _draw(picture, title, run, trajectories, signals, scenario, model.states, tuning, code)
     counts = summary(bag).counts
     result: dict[str, object] = {
         'unit': {signal: signals.states[signal] for signal in setpoints},
@@ -152,7 +152,7 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
     return result
 
 
-def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTrajectory],
+def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, OptimalTrajectory],
           signals: Signals, scenario: Scenario, box: Coordinates, tuning: Tuning,
           code: ExportedLoop | None) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
@@ -175,12 +175,12 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
                            label='set-point')
                 panel.text(
                     0.99, 0.06, f'ends {run.final_error(signal, setpoint):+.1e} off, linear law '
-                    f'{courses["linear law"].states[-1, i] - setpoint:+.1e} [{unit}]',
+                    f'{trajectories["linear law"].states[-1, i] - setpoint:+.1e} [{unit}]',
                     transform=panel.transAxes, ha='right', fontsize=8)
             panel.plot(run.seconds, shown(run.measured[signal], unit), **learned)
-            for name, course in courses.items():
+            for name, trajectory in trajectories.items():
                 # a course that diverges stays at the edge
-                values = np.clip(np.nan_to_num(shown(course.states[:, i], unit), nan=high),
+                values = np.clip(np.nan_to_num(shown(trajectory.states[:, i], unit), nan=high),
                                  2.0 * low - high, 2.0 * high - low)
                 panel.plot(times(values), values, label=name, **_STYLES[name])
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
@@ -198,8 +198,8 @@ def _draw(path: Path, title: str, run: DemoRun, courses: Mapping[str, OptimalTra
                 panel.text(
                     0.99, 0.06, f'C code at most {code.largest()[signal]:.1e} [{unit}] off',
                     transform=panel.transAxes, ha='right', fontsize=8)
-            for name, course in courses.items():
-                values = np.clip(np.nan_to_num(shown(course.inputs[:, j], unit), nan=high),
+            for name, trajectory in trajectories.items():
+                values = np.clip(np.nan_to_num(shown(trajectory.inputs[:, j], unit), nan=high),
                                  low, high)
                 panel.step(times(values), values, where='post', label=name, **_STYLES[name])
             panel.set_ylabel(f'{signal} [{unit_label(unit)}]')

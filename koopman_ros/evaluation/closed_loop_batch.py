@@ -28,7 +28,7 @@ from koopman_ros.core.solvers import (
 )
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import AppliedInputs, Estimate, MeasuredState, PendingInputs
-from koopman_ros.execution import Tell
+from koopman_ros.execution import Notify
 from koopman_ros.model import LiftedModel, NetworkObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
 from koopman_ros.tuning import InputLimits, Tuning
@@ -104,7 +104,7 @@ class LoopBatch:
                   for one in (self.plant.linearised, self.plant.model)))
 
 
-def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
+def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], notify: Notify
                 ) -> tuple[Any, ...] | None:
     """
     Run some of the loops; None where `tell` ended them.
@@ -115,7 +115,7 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
     """
     starts, targets, inputs = cases
     limits, m = given.tuning.limits, given.plant.model.n_u
-    ended = _run(given, given.laws(targets, inputs), cases, tell)
+    ended = _run(given, given.laws(targets, inputs), cases, notify)
     if ended is None:
         return None
     costs, no_gain = ended
@@ -124,7 +124,7 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
         endless = np.full(m, np.inf)
         some = starts[hopeless], targets[hopeless], inputs[hopeless]
         free = given.within(InputLimits(-endless, endless, endless))
-        ended = _run(given, free.laws(*some[1:]), some, tell)
+        ended = _run(given, free.laws(*some[1:]), some, notify)
         if ended is None:
             return None
         costs[:, hopeless], no_gain[hopeless] = ended
@@ -132,7 +132,7 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], tell: Tell
     ratios, excess = _cost_ratios(own, np.min(others, axis=0)), _cost_ratios(own, informed)
     if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
         some = starts[beaten], targets[beaten], inputs[beaten]
-        again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, tell,
+        again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, notify,
                      operated=False)
         if again is None:
             return None
@@ -309,8 +309,8 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
             y[~active] = np.nan
             if number >= samples:
                 # where one law has arrived the others may, too; all of them get the same time
-                there = arrived()
-                active &= there.any(axis=0) & (active & ~there).any(axis=0)
+                at_target = arrived()
+                active &= at_target.any(axis=0) & (active & ~at_target).any(axis=0)
                 if not active.any():
                     break
             noise = given.noise * rng.standard_normal((M, n))
@@ -330,5 +330,5 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
                 for _ in range(steps):
                     ahead = runge_kutta_step(lambda y: flow(y, v), ahead, length / steps)
                 y = np.where(active[..., None], ahead, y)
-        there = arrived()
-    return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain
+        at_target = arrived()
+    return np.where(at_target & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

@@ -85,23 +85,23 @@ def optimum(task: Task) -> OptimalTrajectory:
     riccati = solve_riccati(system.slope(task.x_ref, task.u_ref), system.input_matrix(task.x_ref),
                             np.diag(task.Q), np.diag(task.R))
     K = riccati.K if riccati.solved else np.zeros_like(riccati.K)
-    course = _constant_law(task, task.u_ref, K, task.x_ref)
-    if not math.isfinite(course.cost):
+    trajectory = _constant_law(task, task.u_ref, K, task.x_ref)
+    if not math.isfinite(trajectory.cost):
         raise ValueError(f'{system.name}: the linear law does not stabilise the plant from '
                          f'{system.describe_state(task.x0)}: start nearer to the set-point')
     for _ in range(_MAX_ITERATIONS):
-        change, gains, gain = _improvement(task, course)
-        if gain <= 1e-10 * course.cost:
-            return course
-        length, better = 1.0, course
-        while better.cost >= course.cost and length >= _SHORTEST_STEP:
-            better = _roll_out(task, course.inputs + length * change, gains, course.states)
+        change, gains, gain = _improvement(task, trajectory)
+        if gain <= 1e-10 * trajectory.cost:
+            return trajectory
+        length, better = 1.0, trajectory
+        while better.cost >= trajectory.cost and length >= _SHORTEST_STEP:
+            better = _roll_out(task, trajectory.inputs + length * change, gains, trajectory.states)
             length *= 0.5
-        if better.cost >= course.cost:
+        if better.cost >= trajectory.cost:
             break
-        course = better
-    raise ValueError(f'{system.name}: no optimum found: the cost is {course.cost:.6g} and could '
-                     f'still fall by {gain:.3g}; shorten the horizon or the period')
+        trajectory = better
+    raise ValueError(f'{system.name}: no optimum found: the cost is {trajectory.cost:.6g} and '
+                     f'could still fall by {gain:.3g}; shorten the horizon or the period')
 
 
 def _constant_law(task: Task, u: Array, K: Array, x: Array) -> OptimalTrajectory:
@@ -138,11 +138,11 @@ def _after_a_period(task: Task, y: Array, u: Array) -> Array:
     return y
 
 
-def _improvement(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, float]:
+def _improvement(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Array, float]:
     """Return a change of the inputs, its gains (N, n_u, n_x), and how far the cost would fall."""
     n = task.system.n_x
-    F, g, H = _expansion(task, course)
-    change, gains = np.empty_like(course.inputs), np.empty((len(F), task.system.n_u, n))
+    F, g, H = _expansion(task, trajectory)
+    change, gains = np.empty_like(trajectory.inputs), np.empty((len(F), task.system.n_u, n))
     slope, curvature, gain = np.zeros(n), np.zeros((n, n)), 0.0
     for k in reversed(range(len(F))):
         h = g[k] + F[k].T @ slope
@@ -155,7 +155,7 @@ def _improvement(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, f
     return change, gains, gain
 
 
-def _expansion(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, Array]:
+def _expansion(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Array, Array]:
     """
     Expand all samples at once by state and input at their beginning, p = n_x + n_u in number.
 
@@ -165,7 +165,7 @@ def _expansion(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, Arr
     system = task.system
     n, N = system.n_x, task.samples
     p = n + system.n_u
-    effort = np.concatenate([np.zeros((N, n)), 2.0 * task.R * (course.inputs - task.u_ref)], 1)
+    effort = np.concatenate([np.zeros((N, n)), 2.0 * task.R * (trajectory.inputs - task.u_ref)], 1)
     weight = np.diag(np.concatenate([np.zeros(n), 2.0 * task.R]))
     from_input = np.eye(p)[n:]
     ends = np.cumsum([n, n * p, p, p * p])
@@ -174,13 +174,13 @@ def _expansion(task: Task, course: OptimalTrajectory) -> tuple[Array, Array, Arr
         x, F = y[:, :n], y[:, ends[0]:ends[1]].reshape(N, n, p)
         QF = 2.0 * task.Q[:, None] * F
         return np.concatenate([part.reshape(N, -1) for part in (
-            system.derivative(x, course.inputs),
-            system.slope(x, course.inputs) @ F + system.input_matrix(x) @ from_input,
+            system.derivative(x, trajectory.inputs),
+            system.slope(x, trajectory.inputs) @ F + system.input_matrix(x) @ from_input,
             np.einsum('kip,ki->kp', QF, x - task.x_ref) + effort,
             F.transpose(0, 2, 1) @ QF + weight)], axis=1)
 
     y = np.zeros((N, ends[-1]))
-    y[:, :n] = course.states[:-1]
+    y[:, :n] = trajectory.states[:-1]
     y[:, n:ends[1]] = np.eye(n, p).ravel()
     for _ in range(task.substeps):
         y = runge_kutta_step(rate, y, task.period / task.substeps)

@@ -7,12 +7,12 @@ from koopman_ros.execution.backends import (
     Backend,
     backend_of,
     executor_rejection,
+    Notify,
     SchedulerLost,
     Serial,
-    Tell,
     Watch,
     WorkerLost,
 )
 
-__all__ = ['Backend', 'SchedulerLost', 'Serial', 'Tell', 'Watch', 'WorkerLost', 'backend_of',
+__all__ = ['Backend', 'Notify', 'SchedulerLost', 'Serial', 'Watch', 'WorkerLost', 'backend_of',
            'executor_rejection']

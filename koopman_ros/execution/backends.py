@@ -13,12 +13,12 @@ Item = TypeVar('Item')
 Found = TypeVar('Found')
 
 # Reports the progress of a task; True requests its end with the result so far.
-Tell = Callable[[Any], bool]
+Notify = Callable[[Any], bool]
 # Called with the name of a task and its progress, and with ('', None) every 0.1 s; True requests
 # the end of all tasks.
 Watch = Callable[[str, Any], bool]
 # (shared value, item, tell) -> result
-Task = Callable[[Any, Item, Tell], Found]
+Task = Callable[[Any, Item, Notify], Found]
 
 _ADDRESSES = ('tcp://', 'tls://')
 
@@ -75,17 +75,17 @@ class Serial(Backend):
         """Run tasks, see :meth:`Backend.run`."""
         ended = False
 
-        def telling(name: str) -> Tell:
-            def tell(value: Any) -> bool:
+        def notifier(name: str) -> Notify:
+            def notify(value: Any) -> bool:
                 nonlocal ended
                 ended = watch(name, value) or ended
                 return ended
 
-            return tell
+            return notify
 
         for name, item in items.items():
             try:
-                found = function(shared, item, telling(name))
+                found = function(shared, item, notifier(name))
             except Exception as error:
                 error.add_note(f'in {name}')
                 raise

@@ -138,6 +138,6 @@ class ReplayJob(Job):
             Path(f'/proc/{self.process.pid}/autogroup').write_text(f'{_NICE}\n')
 
     @property
-    def said(self) -> str:
+    def last_output(self) -> str:
         """Last lines of its standard error."""
         return '\n'.join(self.errors)

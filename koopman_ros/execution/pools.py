@@ -80,7 +80,7 @@ class _Pool(Backend):
         """Yield number and result, or exception, of the tasks as they end."""
         names, values = list(items), list(map(cloudpickle.dumps, items.values()))
         open_, losses, abandoned = set(range(len(names))), Counter[int](), float('inf')
-        with self._messages(call) as (send, source, news, stop):
+        with self._messages(call) as (send, source, received, stop):
             futures: dict[Future[Any], int] = {}
             try:
                 while open_ and abandoned == float('inf'):
@@ -88,7 +88,7 @@ class _Pool(Backend):
                     batch = {n for n in open_ if not losses[n]} or {min(open_)}
                     futures = {self._workers().submit(_call, send, source, n, values[n]): n
                                for n in sorted(batch)}
-                    lost, begun = set[int](), set[int]()
+                    lost, started = set[int](), set[int]()
                     while futures:
                         for future in wait(futures, PERIOD, FIRST_COMPLETED).done:
                             number = futures.pop(future)
@@ -98,17 +98,18 @@ class _Pool(Backend):
                             elif not isinstance(found, _NotBegun):
                                 open_.discard(number)
                                 yield number, found
-                        told = news()
-                        begun |= {number for number, _ in told}
-                        asked = [watch(names[n], value) for n, value in told if value is not None]
-                        if any([*asked, watch('', None)]) and abandoned == float('inf'):
+                        messages = received()
+                        started |= {number for number, _ in messages}
+                        requests = [watch(names[n], value) for n, value in messages
+                                    if value is not None]
+                        if any([*requests, watch('', None)]) and abandoned == float('inf'):
                             stop()
                             abandoned = time.monotonic() + _PATIENCE
                         if time.monotonic() > abandoned:
                             return
                     if lost:
                         self._abandon(futures)
-                    for number in lost & begun if lost & begun else lost:
+                    for number in lost & started if lost & started else lost:
                         losses[number] += 1
                         if losses[number] == _ATTEMPTS:
                             open_.discard(number)
@@ -174,15 +175,15 @@ class Processes(_Pool):
             source = folder / 'call'
             source.write_bytes(call)
 
-            def news() -> list[tuple[int, Any]]:
-                told = {path.name: path.read_bytes() for path in folder.iterdir()
-                        if path.name.isdigit()}
-                new = [(int(key), pickle.loads(data)) for key, data in told.items()
+            def received() -> list[tuple[int, Any]]:
+                messages = {path.name: path.read_bytes() for path in folder.iterdir()
+                            if path.name.isdigit()}
+                new = [(int(key), pickle.loads(data)) for key, data in messages.items()
                        if seen.get(key) != data]
-                seen.update(told)
+                seen.update(messages)
                 return new
 
-            yield partial(_to_folder, folder), source, news, (folder / _STOP).touch
+            yield partial(_to_folder, folder), source, received, (folder / _STOP).touch
 
 
 def _to_folder(folder: Path, number: int, value: Any) -> bool:
@@ -246,23 +247,23 @@ class Cluster(_Pool):
     @contextlib.contextmanager
     def _messages(self, call: bytes) -> Generator[_Messages]:
         import distributed
-        token, told = uuid.uuid4().hex, queue.SimpleQueue[tuple[int, Any]]()
+        token, messages = uuid.uuid4().hex, queue.SimpleQueue[tuple[int, Any]]()
         event = distributed.Event(token, client=self._client)
 
-        def news() -> list[tuple[int, Any]]:
+        def received() -> list[tuple[int, Any]]:
             if self._client.status != 'running':
                 raise self._lost()
-            return [told.get() for _ in range(told.qsize())]
+            return [messages.get() for _ in range(messages.qsize())]
 
         def stop() -> None:
             with contextlib.suppress(OSError, RuntimeError):
                 event.set()
 
-        self._client.subscribe_topic(token, lambda message: told.put(message[1]))
+        self._client.subscribe_topic(token, lambda message: messages.put(message[1]))
         try:
             # not scattered: that would be lost with the worker that has it
             source = self._client.submit(bytes, call, pure=False)
-            yield partial(_to_topic, token), source, news, stop
+            yield partial(_to_topic, token), source, received, stop
         finally:
             with contextlib.suppress(OSError, ValueError, RuntimeError):
                 self._client.unsubscribe_topic(token)
@@ -291,14 +292,14 @@ def _call(send: _Send, source: Path | bytes, number: int, item: bytes) -> Any:
     function, shared = _unpacked(source)
     last = -PERIOD
 
-    def tell(value: Any) -> bool:
+    def notify(value: Any) -> bool:
         nonlocal last
         if time.monotonic() - last < PERIOD:
             return False
         last = time.monotonic()
         return send(number, value)
 
-    return function(shared, pickle.loads(item), tell)
+    return function(shared, pickle.loads(item), notify)
 
 
 def _worker_lost(name: str) -> WorkerLost:

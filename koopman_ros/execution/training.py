@@ -74,7 +74,7 @@ class TrainingJob(Job):
         try:
             while not self.state.ended:
                 line = self.line()
-                self.state = self._ended() if line is None else self._told(line)
+                self.state = self._ended() if line is None else self._parsed(line)
         except queue.Empty:
             pass
         return self.state
@@ -84,20 +84,20 @@ class TrainingJob(Job):
         self._cancelled = True
         super().cancel()
 
-    def _told(self, line: str) -> JobState:
+    def _parsed(self, line: str) -> JobState:
         try:
-            said = json.loads(line)
+            message = json.loads(line)
         except ValueError:
             # cut off when the process was killed, or printed by a library
             return self.state
-        if 'progress' in said:
-            return replace(self.state, share=said['progress'],
-                           text=said['text'] or self.state.text)
-        if 'summary' in said:
-            return JobState(1.0, outcome_text(said['summary']), True, said['summary'])
-        if 'stopped' in said:
+        if 'progress' in message:
+            return replace(self.state, share=message['progress'],
+                           text=message['text'] or self.state.text)
+        if 'summary' in message:
+            return JobState(1.0, outcome_text(message['summary']), True, message['summary'])
+        if 'stopped' in message:
             return JobState(self.state.share, _CANCELLED, True)
-        return JobState(self.state.share, f'training failed: {said["error"]}', True)
+        return JobState(self.state.share, f'training failed: {message["error"]}', True)
 
     def _ended(self) -> JobState:
         """Return the state of a process that ended without a last line."""

@@ -323,7 +323,7 @@ def _remedy(found: Identified, i: int) -> str:
         f'{name} (explains {100.0 * share:.0f} % of its square)' for share, name in causes)
 
 
-def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float]]
+def uncovered_setpoints(states: Coordinates, targets: Mapping[str, Sequence[float]]
                         ) -> tuple[str, ...]:
     """
     Say which set-points that are wanted a trained range leaves out.
@@ -331,7 +331,7 @@ def uncovered_setpoints(states: Coordinates, wanted: Mapping[str, Sequence[float
     :param wanted: lowest and highest set-point of some of the states by name, in their units.
     """
     found = []
-    for name, (low, high) in wanted.items():
+    for name, (low, high) in targets.items():
         i = states.names.index(name)
         lower, upper = states.lower[i], states.upper[i]
         if max(lower - low, high - upper) > _MISSING * (high - low):

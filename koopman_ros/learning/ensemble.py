@@ -80,9 +80,10 @@ def inconsistency(found: Identified) -> str:
                 f'{ratio:.2g} times as much in the other half: train from its last part, or '
                 'record again')
     x, u = _samples([*shared[0], *shared[1]])
-    said = _differing('drifts fitted to the first and to the second half of the record', drift,
-                      [0.5 * (drifts[1].rate(x, u) - drifts[0].rate(x, u))], x, u, largest=True)
-    return said and f'{said}; if the plant changed during the record, train from its last part'
+    warning = _differing('drifts fitted to the first and to the second half of the record', drift,
+                         [0.5 * (drifts[1].rate(x, u) - drifts[0].rate(x, u))], x, u, largest=True)
+    return warning and (
+        f'{warning}; if the plant changed during the record, train from its last part')
 
 
 def _fitted(drift: DriftModel | NetworkDrift, episodes: Sequence[Episode]) -> Drift:

@@ -259,9 +259,9 @@ def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Ep
     segments = Segments.of([indexed.part(0, count)] if count > 1 else [indexed.part(0, 2)], step)
     rows = np.flatnonzero(segments.x[:, 0, 0])[:count]
     y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])
-    there, n_x = ~np.isnan(y), len(states)
+    present, n_x = ~np.isnan(y), len(states)
     home, memory = np.zeros(n_x), 1.0
-    for i, column, seen in zip(measured, y.T, there.T, strict=True):
+    for i, column, seen in zip(measured, y.T, present.T, strict=True):
         if seen.any():
             home[i] = column[seen][0]
 
@@ -277,12 +277,12 @@ def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Ep
             rate, states.to_physical(p[:, :n_x]), disturbance(p))
         found = states.to_deviation(path[rows])[..., measured] - y[:, None]
         return np.hstack((np.clip(np.nan_to_num(
-            np.swapaxes(found, 0, 1)[:, there], nan=_LOST), -_LOST, _LOST), p[:, n_x:]))
+            np.swapaxes(found, 0, 1)[:, present], nan=_LOST), -_LOST, _LOST), p[:, n_x:]))
 
     def fitted(start: Array) -> OptimizeResult:
         def slopes(p: Array) -> Array:
-            here, *others = errors(p + 1e-4 * np.vstack([np.zeros(len(p)), np.eye(len(p))]))
-            return np.transpose(np.subtract(others, here)) / 1e-4
+            reference, *others = errors(p + 1e-4 * np.vstack([np.zeros(len(p)), np.eye(len(p))]))
+            return np.transpose(np.subtract(others, reference)) / 1e-4
 
         return least_squares(lambda p: errors(p[None])[0], start, slopes, max_nfev=_EVALUATIONS)
 
@@ -291,8 +291,8 @@ def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Ep
                                for guess in _GUESSES)]
     best = min((fitted(home + shift) for shift in shifts), key=lambda one: float(one.cost)).x
     if usual is not None:
-        squares = np.zeros(there.shape)
-        squares[there] = errors(best[None])[0] ** 2
+        squares = np.zeros(present.shape)
+        squares[present] = errors(best[None])[0] ** 2
         scale = usual / states.scale[measured]
         if np.sqrt(np.mean(np.mean(squares, axis=0) / scale ** 2)) > _OTHER_DAY:
             memory = _memory(rate, states, states.to_physical(best), episode)

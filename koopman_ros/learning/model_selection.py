@@ -252,11 +252,11 @@ def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch |
         return None
     before = sum(counts[other] for other in list(counts)[:list(counts).index(name)])
 
-    def told(now: MultistartProgress) -> bool:
+    def on_progress(now: MultistartProgress) -> bool:
         return watch(replace(now, name=name, finished=before + now.finished,
                              total=sum(counts.values())))
 
-    return told
+    return on_progress
 
 
 def _noted(model: LiftedModel, one: ModelCandidate) -> LiftedModel:

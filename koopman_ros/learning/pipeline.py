@@ -129,16 +129,16 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     _check_disturbances(plant, episodes)
     lag = known = _given_lag(task, plant, episodes) / seconds
     dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
-    sought = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
+    searched = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
     commanded, fixed = episodes, frozenset(task.characteristics)
     while True:
-        if sought:
-            lag = find_lags(plant, _delayed(commanded, dead_time / seconds), known, sought,
+        if searched:
+            lag = find_lags(plant, _delayed(commanded, dead_time / seconds), known, searched,
                             watch=lambda: progress.estimating(0, 1, 'lag'))
             dead_time = _dead_time(task, plant, _behind(commanded, lag), progress)
         episodes = _behind(_delayed(commanded, dead_time / seconds), lag)
         found = _estimate(task, plant, episodes, methods, progress, backend, fixed)
-        if not sought or found.drift.characteristics.keys() <= fixed:
+        if not searched or found.drift.characteristics.keys() <= fixed:
             break
         # with the characteristics the lags are found better
         plant = replace(plant, characteristics=found.drift.characteristics)

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from koopman_ros.core.datasets import Episode
-from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.execution import Backend, Notify, Serial
 from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
 from koopman_ros.records import (
     ImportReport,
@@ -34,7 +34,7 @@ _LONGER = 4
 _Numbered: TypeAlias = tuple[int, str]  # a bag, with its number in the record
 # Called with the samples that were read; it may raise to end the reading.
 Tick = Callable[[int], None]
-_Reader = Callable[[Any, _Numbered, Tell], Any]
+_Reader = Callable[[Any, _Numbered, Notify], Any]
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _chosen(survey: RecordStatistics, found: Selection, account: ImportReport) -
         found.group * sum(map(len, episodes))))
 
 
-def _streamed(source: RecordSource, bag: str, account: ImportReport, tell: Tell
+def _streamed(source: RecordSource, bag: str, account: ImportReport, notify: Notify
               ) -> Iterator[Episode]:
     """Yield the episodes of a bag, and report the samples so far."""
     read = 0
@@ -167,24 +167,24 @@ def _streamed(source: RecordSource, bag: str, account: ImportReport, tell: Tell
                                    tolerance_ns=source.tolerance_ns,
                                    least_jumps=source.least_jumps):
         read += len(episode)
-        tell(read)
+        notify(read)
         yield episode
 
 
-def _surveyed(source: RecordSource, numbered: _Numbered, tell: Tell
+def _surveyed(source: RecordSource, numbered: _Numbered, notify: Notify
               ) -> tuple[RecordStatistics, ImportReport]:
     account = ImportReport()
     survey = RecordStatistics.empty(len(source.states), len(source.inputs))
-    for episode in _streamed(source, numbered[1], account, tell):
+    for episode in _streamed(source, numbered[1], account, notify):
         survey.add(episode)
     return survey, account
 
 
-def _selected(given: tuple[RecordSource, Selection, int], numbered: _Numbered, tell: Tell
+def _selected(given: tuple[RecordSource, Selection, int], numbered: _Numbered, notify: Notify
               ) -> Selection:
     (source, start, seed), (number, bag) = given, numbered
     rng = np.random.default_rng([seed, number])
     selection = start.empty()
-    for episode in _streamed(source, bag, ImportReport(), tell):
+    for episode in _streamed(source, bag, ImportReport(), notify):
         selection.offer(number, episode, rng)
     return selection

@@ -163,19 +163,20 @@ def _check_as_state(task: TrainingTask) -> None:
 _Signal = TypeVar('_Signal', RecordedState, RecordedInput)
 
 
-def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: str
+def _in_order(given: Sequence[_Signal], required: Coordinates, kind: str, path: str
               ) -> list[_Signal]:
     """Return signals in the order of a lift; ValueError where they are not the same."""
     by_name = {signal.name: signal for signal in given}
     found = {(signal.name, signal.unit) for signal in given}
-    if len(by_name) != len(given) or found != set(zip(wanted.names, wanted.units, strict=True)):
-        said, needed = (
+    if len(by_name) != len(given) or found != set(
+            zip(required.names, required.units, strict=True)):
+        listed, needed = (
             ', '.join(f'{name} [{unit}]' for name, unit in pairs) or 'none'
             for pairs in (((s.name, s.unit) for s in given),
-                          zip(wanted.names, wanted.units, strict=True)))
+                          zip(required.names, required.units, strict=True)))
         raise ValueError(f'the current model {path} has the {kind}s {needed}, but the task has '
-                         f'{said}: give the same names and units, each once')
-    return [by_name[name] for name in wanted.names]
+                         f'{listed}: give the same names and units, each once')
+    return [by_name[name] for name in required.names]
 
 
 def _unknown(task: TrainingTask) -> PlantDescription:

@@ -38,7 +38,7 @@ def main() -> int:
     threading.Thread(target=_wait_for_end_of_input, args=(stop,), daemon=True).start()
     last = -_PERIOD
 
-    def now_and_then(share: float, text: str) -> bool:
+    def throttled(share: float, text: str) -> bool:
         nonlocal last
         if time.monotonic() - last >= _PERIOD:
             last = time.monotonic()
@@ -46,7 +46,7 @@ def main() -> int:
         return stop.is_set()
 
     try:
-        summary, files = reported(retrain(TrainingTask.of(json.loads(line)), now_and_then))
+        summary, files = reported(retrain(TrainingTask.of(json.loads(line)), throttled))
     except BrokenPipeError:
         # the process that started it is gone
         return 1

@@ -283,9 +283,9 @@ class ControllerNode(ManagedNode):
             self.get_logger().warning('the stamp of the measurement jumped back by more than 1 s: '
                                       'controller time is reset', throttle_duration_sec=1.0)
         # of many measurements within PERIOD the status shows the first, and then the last
-        until, *told = self._last_status
+        until, *shown = self._last_status
         now = time.monotonic()
-        self._status_pending = [report.level, report.reason is None] == told and now < until
+        self._status_pending = [report.level, report.reason is None] == shown and now < until
         if not self._status_pending:
             self._publish_status(report, now)
 

@@ -75,7 +75,7 @@ class PanelNode(LoopNode):
     Forward messages to the view model, and actions of operators to topics and services.
 
     The pages run in a thread of their own; they read :attr:`snapshot`, which is replaced as a
-    whole, and call :meth:`ask`.
+    whole, and call :meth:`request`.
     """
 
     def __init__(self) -> None:
@@ -126,8 +126,8 @@ class PanelNode(LoopNode):
                           ('measured_disturbances', _WATCHING),
                           ('applied', _WATCHING), ('commands', _WATCHING),
                           ('active_setpoints', topics.LATCHED_QOS)):
-            SignalSubscriber(self, lambda topic, hear, of,
-                             qos=qos: matching.subscribe(topic, hear, of, qos),
+            SignalSubscriber(self, lambda topic, callback, of,
+                             qos=qos: matching.subscribe(topic, callback, of, qos),
                              getattr(self._wiring, kind), self._signals.units,
                              partial(self._on_signal, kind))
         matching.subscribe(topics.CONTROLLER_INTERNALS, self._on_internals, qos=_WATCHING)
@@ -184,7 +184,7 @@ class PanelNode(LoopNode):
         """The last training and comparison."""
         return self._watch.learning
 
-    def ask(self, action: Action) -> Future[Answer]:
+    def request(self, action: Action) -> Future[Answer]:
         """Carry out an action of an operator; the answer follows."""
         future: Future[Answer] = Future()
         self._actions.append((action, future))
@@ -193,8 +193,8 @@ class PanelNode(LoopNode):
 
     # Messages.
 
-    def _on_signal(self, kind: str, heard: SignalSample) -> None:
-        self.view.take_signals(kind, heard.values, heard.stamp_ns / NANOSECONDS, time.time())
+    def _on_signal(self, kind: str, sample: SignalSample) -> None:
+        self.view.take_signals(kind, sample.values, sample.stamp_ns / NANOSECONDS, time.time())
 
     def _on_internals(self, message: JointState) -> None:
         self.view.take_internals(dict(zip(message.name, message.position, strict=False)))
@@ -334,8 +334,9 @@ class PanelNode(LoopNode):
             reply(answer)
 
         # as the controller reads the value from the message
-        there, back = conversion(unit, place.unit), conversion(place.unit, unit)
-        self._requests.add(SETPOINT if setpoint else MANUAL, name, float(back(float(there(own)))),
+        to_si, from_si = conversion(unit, place.unit), conversion(place.unit, unit)
+        self._requests.add(SETPOINT if setpoint else MANUAL, name,
+                           float(from_si(float(to_si(own)))),
                            time.monotonic(), on_answer, accepted)
 
     def _rejection(self, codes: Sequence[str], name: str, value: float) -> str:

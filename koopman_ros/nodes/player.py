@@ -94,7 +94,7 @@ class PlayerNode(LoopNode):
         self._open: int | None = None  # stamp of the measurement that has no answer yet
         self._began, self._sent = False, 0
         self._received: set[str] = set()  # topics of which subscribers have received a message
-        self._due = self._wall_start = self._said = self._asked = time.monotonic()
+        self._due = self._wall_start = self._last_report = self._last_sent = time.monotonic()
         self._timer: Any = wall_timer(self, _POLL_PERIOD_NS / NANOSECONDS, self._on_timer)
 
     def _on_timer(self) -> None:
@@ -102,7 +102,7 @@ class PlayerNode(LoopNode):
             if not self._began:
                 self._begin()
             elif self._open is not None:
-                if time.monotonic() - self._asked > self._settings.answer_timeout:
+                if time.monotonic() - self._last_sent > self._settings.answer_timeout:
                     self._give_up(
                         f'no command for the measurement at {self._open / NANOSECONDS:.3f} s '
                         f'within {self._settings.answer_timeout:g} s: check that the controller '
@@ -130,7 +130,7 @@ class PlayerNode(LoopNode):
             # before the time counts: the first message of a type takes a tenth of a second
             self._next = next(self._messages, None)
             self._due, self._wall_start = self._now(), time.monotonic()
-            self._said = self._wall_start
+            self._last_report = self._wall_start
             self.get_logger().info(f'playing {self._settings.bag}')
         elif time.monotonic() - self._wall_start > self._settings.wait_timeout:
             self._give_up(
@@ -171,9 +171,9 @@ class PlayerNode(LoopNode):
                 return
             message, self._next = self._next, next(self._messages, None)
             self._publish(message)
-            if message.topic in self._measured and self._whole(message):
+            if message.topic in self._measured and self._completes(message):
                 self._open = _stamp_ns(message)
-                self._asked = time.monotonic()
+                self._last_sent = time.monotonic()
                 break
             following = self._next
             # the first one of a topic tells that the subscribers have found it; later ones go
@@ -191,7 +191,7 @@ class PlayerNode(LoopNode):
             self._received.add(message.topic)
         self._say_progress()
 
-    def _whole(self, message: records.BagMessage) -> bool:
+    def _completes(self, message: records.BagMessage) -> bool:
         """Return whether a message completes a measurement."""
         stamp_ns = _stamp_ns(message) or 0
         if stamp_ns != self._parts[0]:
@@ -213,8 +213,8 @@ class PlayerNode(LoopNode):
         self._sent += 1
 
     def _say_progress(self) -> None:
-        if time.monotonic() - self._said >= _PROGRESS_PERIOD:
-            self._said = time.monotonic()
+        if time.monotonic() - self._last_report >= _PROGRESS_PERIOD:
+            self._last_report = time.monotonic()
             self.get_logger().info(f'{self._sent} of {self._total} messages')
 
     def _finish(self) -> None:

@@ -72,8 +72,8 @@ class _AlarmRows:
 
     def show(self, alarms: Sequence[Alarm]) -> None:
         """Show these alarms in this order."""
-        for gone in set(self._rows) - {alarm.key for alarm in alarms}:
-            self._rows.pop(gone)[0].delete()
+        for removed in set(self._rows) - {alarm.key for alarm in alarms}:
+            self._rows.pop(removed)[0].delete()
         for at, alarm in enumerate(alarms):
             if alarm.key not in self._rows:
                 with self._list, box('alarm').props('role=listitem') as row:
@@ -130,4 +130,4 @@ def _act(page: PageLayout, what: str, key: str, seconds: float | None = None) ->
     if (alarms.acknowledge(key, who, now) if what == 'acknowledge' else
             alarms.unshelve(key, who, now) if seconds is None else
             alarms.shelve(key, seconds, who, now)):
-        page.source.ask(Action(who, what, key, seconds))
+        page.source.request(Action(who, what, key, seconds))

@@ -49,7 +49,7 @@ class Source(Protocol):
     def title(self) -> str:
         """Title of all pages."""
 
-    def ask(self, action: Action) -> Future[Answer]:
+    def request(self, action: Action) -> Future[Answer]:
         """Carry out an action of an operator; called from any thread."""
 
 
@@ -114,8 +114,8 @@ class PageLayout:
                 beat.set_text(f'wall time {clock(now.wall)}')
                 attribute(beat, 'data-beat', f'{now.wall:.1f}')
             silent = [f'no message from the {one.role} since {clock(one.since)}' + (
-                '' if one.ever else ', the start of the panel') for one in now.silences]
-            known = any(one.ever for one in now.silences)
+                '' if one.seen else ', the start of the panel') for one in now.silences]
+            known = any(one.seen for one in now.silences)
             banner.set_text(f'⚠ {"Connection lost" if known else "Waiting"}: {"; ".join(silent)}')
             show_if(banner, bool(silent))
 
@@ -164,7 +164,7 @@ class PageLayout:
         """Carry out an action of the visitor if it is an operator; return the answer."""
         if not self.visitor.may_act():
             return NOT_ALLOWED
-        future = self.source.ask(Action(self.visitor.name, what, name, value, old))
+        future = self.source.request(Action(self.visitor.name, what, name, value, old))
         try:
             answer: Answer = await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
         except TimeoutError:

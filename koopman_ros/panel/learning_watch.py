@@ -123,7 +123,7 @@ class LearningWatch:
         now = self.learning.comparison
         self.learning.comparison = ReplayComparison(
             'cancelled', model=now.model, since=now.since) if self._cancelled else read_comparison(
-                Path(self._folder.name), now.model, now.since, self._job.said)
+                Path(self._folder.name), now.model, now.since, self._job.last_output)
         self._job = None
         self._folder.cleanup()
 

@@ -86,8 +86,8 @@ class _AuthMiddleware:
                              users=self._keeper.users is not None):
             return Response(f'rejected: {reason}\n', 403)
         if not logged_in and scope['path'] != '/login':
-            asked = '' if scope['path'] == '/' else f'?page={scope["path"]}'
-            return RedirectResponse(f'/login{asked}', 303) if page else Response(
+            query = '' if scope['path'] == '/' else f'?page={scope["path"]}'
+            return RedirectResponse(f'/login{query}', 303) if page else Response(
                 'log in first\n', 401)
         if scope['type'] == 'http' and scope['path'].startswith(_SOCKETS):
             # the id of a socket that polls would be a credential

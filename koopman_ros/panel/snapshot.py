@@ -40,7 +40,7 @@ class SilentTopic:
 
     role: str
     since: float  #: wall time of its last message, or of the start of the panel
-    ever: bool  #: whether there was any message
+    seen: bool  #: whether there was any message
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Snapshot:
     def status(self, name: str) -> TaskStatus:
         """Return the status of a task: empty for none, an error for a silent node."""
         found = self.statuses.get(name, TaskStatus(name, OK, ''))
-        lost = any(one.ever and one.role == name.partition(':')[0] != PLANT
+        lost = any(one.seen and one.role == name.partition(':')[0] != PLANT
                    for one in self.silences)
         return replace(found, level=ERROR, message=LOST) if lost else found
 

@@ -278,12 +278,12 @@ class SignalTopics:
                 places = getattr(self, kind)
                 if missing := [name for name, found in places.items() if not found.topic]:
                     return f'{missing[0]} has no topic: set one'
-            heard = {found.topic: name for name, found in (
+            used = {found.topic: name for name, found in (
                 *self.measured.items(), *self.measured_disturbances.items())}
             for name, found in self.commands.items():
-                if found.topic in heard:
+                if found.topic in used:
                     return (f'{name} is commanded on {found.topic!r}, the topic on which '
-                            f'{heard[found.topic]} is measured: change one of them')
+                            f'{used[found.topic]} is measured: change one of them')
         except ValueError as error:
             return str(error)
         return ''

@@ -161,33 +161,33 @@ class ParameterTable(Generic[T]):
         rows: list[tuple[Specification, _Path]] = []
         makers: dict[str, _Make] = {}
         for item in fields(kind):
-            how, name = item.metadata, item.name
-            here: _Path = (*path, attrgetter(name))
-            if 'nested' in how:
-                own, makers[name] = self._layout(how['nested'], prefix, here)
-            elif 'plugins' in how or 'per_signal' in how:
+            metadata, name = item.metadata, item.name
+            place: _Path = (*path, attrgetter(name))
+            if 'nested' in metadata:
+                own, makers[name] = self._layout(metadata['nested'], prefix, place)
+            elif 'plugins' in metadata or 'per_signal' in metadata:
                 inner = [(key, found, '') for key, found in self._plugins.items()] if (
-                    'plugins' in how) else [(signal, how['per_signal'], its_unit)
-                                            for signal, its_unit in self._of(item).items()]
-                parts = {key: self._layout(found, f'{prefix}{key}.', (*here, itemgetter(key)), of)
+                    'plugins' in metadata) else [(signal, metadata['per_signal'], its_unit)
+                                                 for signal, its_unit in self._of(item).items()]
+                parts = {key: self._layout(found, f'{prefix}{key}.', (*place, itemgetter(key)), of)
                          for key, found, of in inner}
                 own = [row for several, _ in parts.values() for row in several]
                 makers[name] = partial(_made, _frozen, {
                     key: make for key, (_, make) in parts.items()})
-            elif 'group' in how:
-                own = [(replace(row, name=f'{name}.{row.name}'), (*here, itemgetter(row.name)))
+            elif 'group' in metadata:
+                own = [(replace(row, name=f'{name}.{row.name}'), (*place, itemgetter(row.name)))
                        for row in self._groups[name]]
                 makers[name] = partial(_made, _frozen, {
                     row.name: itemgetter(f'{name}.{row.name}') for row in self._groups[name]})
-            elif 'column' in how:
-                column = {f'{prefix}{signal}.{how["column"].name or name}': its_unit
+            elif 'column' in metadata:
+                column = {f'{prefix}{signal}.{metadata["column"].name or name}': its_unit
                           for signal, its_unit in self._of(item).items()}
                 own = [(_row(one, item, of, self._defaults), (
-                    *here, itemgetter(i), float, partial(_as_shown, item, unit=of)))
+                    *place, itemgetter(i), float, partial(_as_shown, item, unit=of)))
                     for i, (one, of) in enumerate(column.items())]
                 makers[name] = partial(_array, item, column)
             else:
-                own = [(_row(prefix + name, item, unit, self._defaults), here)]
+                own = [(_row(prefix + name, item, unit, self._defaults), place)]
                 makers[name] = itemgetter(prefix + name)
             rows += own
         return rows, partial(_made, kind, makers)

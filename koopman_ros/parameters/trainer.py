@@ -382,11 +382,11 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
 
 def _wiring(signals: Signals, given: Mapping[str, Any]) -> SignalTopics:
     """Return the places of signals, the usual ones but for those that parameters name."""
-    said = {**signals.defaults(), **given}
+    chosen = {**signals.defaults(), **given}
 
     def own(kind: type[Any], name: str) -> Any:
-        return kind(**{row.name: said[f'{name}.{row.name}'] for row in fields(kind)
-                       if f'{name}.{row.name}' in said})
+        return kind(**{row.name: chosen[f'{name}.{row.name}'] for row in fields(kind)
+                       if f'{name}.{row.name}' in chosen})
 
     return SignalTopics(signals, {name: own(StatePlaces, name) for name in signals.states},
                         {name: own(InputPlaces, name) for name in signals.inputs},

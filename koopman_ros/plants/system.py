@@ -104,11 +104,11 @@ class ControlAffineSystem:
                 ('drift_jacobian(x)', self.drift_jacobian, (*state.shape, self.n_x)),
                 ('B(x)', self.input_matrix, (*state.shape, self.n_u)),
             ):
-                got = np.shape(function(state))
-                if got != expected:
+                actual = np.shape(function(state))
+                if actual != expected:
                     raise ValueError(
                         f'incompatible {name} at x of shape {state.shape}: '
-                        f'expected {expected}, got {got}')
+                        f'expected {expected}, got {actual}')
         self._check_jacobian()
 
     def _check_jacobian(self) -> None:

@@ -40,18 +40,18 @@ def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[Recorded
     times = [part.stamp_ns for part in parts]
     base = min(times, key=len)
     rows = [_nearest(own, base) for own in times]
-    whole = np.ones(len(base), dtype=bool)
+    complete = np.ones(len(base), dtype=bool)
     for own, row in zip(times, rows, strict=True):
         # each the nearest of the other, so that none is taken twice
-        whole &= ((np.abs(own[row] - base) <= tolerance_ns)
-                  & (_nearest(base, own)[row] == np.arange(len(base))))
-    rows = [row[whole] for row in rows]
+        complete &= ((np.abs(own[row] - base) <= tolerance_ns)
+                     & (_nearest(base, own)[row] == np.arange(len(base))))
+    rows = [row[complete] for row in rows]
     _count_others(states, times, rows, tolerance_ns, dropped)
     x = np.column_stack([part.values[row] for part, row in zip(parts, rows, strict=True)])
     logs = np.max([part.log_ns[row] for part, row in zip(parts, rows, strict=True)], axis=0)
     every = np.column_stack([own[row] for own, row in zip(times, rows, strict=True)])
     stamps, last = np.unique(every.ravel()[::-1], return_index=True)
-    return AlignedSamples(base[whole], x, (stamps, np.repeat(logs, len(states))[::-1][last]))
+    return AlignedSamples(base[complete], x, (stamps, np.repeat(logs, len(states))[::-1][last]))
 
 
 def named(states: Sequence[RecordedState], state: RecordedState, text: str) -> str:

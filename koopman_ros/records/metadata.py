@@ -75,15 +75,15 @@ class RecordedFile:
 def bag_metadata(files: Sequence[RecordedFile]) -> dict[str, Any]:
     """Return the metadata of a bag of these MCAP files, keys in the order of rosbag2."""
     ranges = [file.time_range_ns for file in files if file.time_range_ns is not None]
-    whole = _time_range((min(first for first, _ in ranges), max(last for _, last in ranges))
+    total = _time_range((min(first for first, _ in ranges), max(last for _, last in ranges))
                         if ranges else None)
     entries = [file.as_metadata() for file in files]
     topics = {name: topic for file in files for name, topic in file.topics.items()}
     return {
         'version': _VERSION,
         'storage_identifier': 'mcap',
-        'duration': whole['duration'],
-        'starting_time': whole['starting_time'],
+        'duration': total['duration'],
+        'starting_time': total['starting_time'],
         'message_count': sum(entry['message_count'] for entry in entries),
         'topics_with_message_count': [{
             'topic_metadata': {

@@ -164,8 +164,8 @@ def _check_names(states: Sequence[SignalColumn], inputs: Sequence[SignalColumn],
     every = [one.name for one in (*states, *inputs)]
     if not (states and inputs):
         raise ValueError('a record has states and inputs: name at least one of each')
-    if twice := [name for name in every if every.count(name) > 1]:
-        raise ValueError(f'{twice[0]} is named twice: give each signal once')
+    if repeated := [name for name in every if every.count(name) > 1]:
+        raise ValueError(f'{repeated[0]} is named twice: give each signal once')
     if unknown := [name for name in linear if name not in every[len(states):]]:
         raise ValueError(f'linear names {unknown[0]}, which is not an input: choose from '
                          f'{", ".join(every[len(states):])}')

@@ -163,12 +163,12 @@ def _publish(node: Node, options: argparse.Namespace) -> None:
 
 def _echo(node: Node, options: argparse.Namespace) -> None:
     kind = _kind(node, options)
-    heard: list[Any] = []
-    node.create_subscription(kind, options.topic, heard.append, topics.matching_profile(
+    received: list[Any] = []
+    node.create_subscription(kind, options.topic, received.append, topics.matching_profile(
         topics.LOOP_QOS, node.get_publishers_info_by_topic(options.topic), _HISTORY))
     shown = 0
     while not options.count or shown < options.count:
-        _show(_plain(_wait(node, options.timeout, lambda: heard and heard.pop(0),
+        _show(_plain(_wait(node, options.timeout, lambda: received and received.pop(0),
                            f'no message on {options.topic} for {options.timeout:g} s')))
         print('---', flush=True)
         shown += 1

@@ -74,8 +74,9 @@ class ControlLoop:
         :param last: that commanded, of whose inputs some may still act.
         :param latched: whether the safe state is latched from before.
         """
-        asked = self.state.setpoint
-        self.state = State(self.state.mode, Setpoint(asked.requested, scheduled=asked.scheduled),
+        previous = self.state.setpoint
+        self.state = State(self.state.mode,
+                           Setpoint(previous.requested, scheduled=previous.scheduled),
                            applied=last.applied, supervisor=(
                                Supervisor.latched_before() if latched else Supervisor()))
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True
@@ -130,7 +131,7 @@ class ControlLoop:
             if not self.active:
                 return None
             if self.timeout and silence > self.timeout and self.state.time_ns is not None:
-                return self._command(silence, _CAUSES[self.timing.no_news(self.timeout)])
+                return self._command(silence, _CAUSES[self.timing.silence_cause(self.timeout)])
             if self._manual_waits(silence) or (acting and self._setpoint_waits(silence)):
                 return self._command(silence, None)
             return None

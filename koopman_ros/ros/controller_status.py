@@ -140,7 +140,7 @@ def _control_status(now: StatusContext, warnings: Sequence[tuple[str, str]]) -> 
         condition = warnings[0][0]
     elif not message:
         message = _in_order(now)
-    if now.complaint and now.timing.no_news(_PATIENCE) is Advance.TWO_SOURCES:
+    if now.complaint and now.timing.silence_cause(_PATIENCE) is Advance.TWO_SOURCES:
         message += f'; {now.complaint}'
     return TaskReport(level, message, lambda: _figures(now, condition))
 
@@ -178,7 +178,7 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
         if now.timing.busy:
             return Severity.ERROR, (f'no command for more than {timeout:g} s, because the node is '
                                     f'busy: {action}{doing}; reduce the load of the node')
-        if (why := now.timing.no_news(timeout)) is not None:
+        if (why := now.timing.silence_cause(timeout)) is not None:
             what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
                     else 'two nodes have published the measurement')
             return Severity.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
@@ -224,7 +224,7 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
     unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.recovery
                   and now.timing.silence > max(1.0, 2.0 * interval))
     if report.measurement.arrival is Arrival.REPEATED or (
-            now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
+            now.timing.silence > overdue and now.timing.silence_cause(overdue) is Advance.OLD):
         yield MEASUREMENTS, (
             'the stamp of the measurement does not advance: the last command is held; stamp each '
             'measurement with its time')

@@ -288,10 +288,10 @@ class ExperimentRun:
         for i, name in enumerate(self._units):
             if name not in values:
                 continue
-            value, asked = values[name], float(self.progress.command[i])
-            monitor = self._monitors[i] = self._monitors[i].after(value, asked, now)
+            value, command = values[name], float(self.progress.command[i])
+            monitor = self._monitors[i] = self._monitors[i].after(value, command, now)
             if monitor.deviations >= _DEVIATIONS and now - monitor.since >= _DEVIATION_TIME:
-                self._on_end(reason(code, signal=name, value=value, requested=asked))
+                self._on_end(reason(code, signal=name, value=value, requested=command))
                 return
 
     def _on_record(self, message: String) -> None:

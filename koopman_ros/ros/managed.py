@@ -181,8 +181,8 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set
-        heard = [one for one in self.subscriptions if one.msg_type is not Clock]
-        return (list(self.timers), list(self.services), heard,
+        subscriptions = [one for one in self.subscriptions if one.msg_type is not Clock]
+        return (list(self.timers), list(self.services), subscriptions,
                 list(self.publishers))
 
 

@@ -69,7 +69,7 @@ class Measurements:
             node, endpoints.subscribe, wiring.applied, signals.inputs, self._on_applied)
         # the first command begins from them
         self._wait = InputWait[Sample](node, lambda: (
-            not self._begun() and not self.applied.complete and self._inputs.published()), answer)
+            not (self._commanded() or self.applied.complete) and self._inputs.published()), answer)
         SignalSubscriber(node, endpoints.subscribe, wiring.measured_disturbances,
                          signals.disturbances, self.disturbances.take)
         self._quality: dict[str, float] = {}
@@ -84,7 +84,7 @@ class Measurements:
                 'is used')
         self._active = False
 
-    def begin(self, timing: Timing, window: Callable[[], float], begun: Callable[[], bool]
+    def begin(self, timing: Timing, window: Callable[[], float], commanded: Callable[[], bool]
               ) -> None:
         """
         Pass on measurements from now on.
@@ -92,7 +92,7 @@ class Measurements:
         :param window: s between two changes of the source within which one may take over.
         :param begun: whether there was a command, before which the measured inputs are awaited.
         """
-        self._timing, self._window, self._begun, self._active = timing, window, begun, True
+        self._timing, self._window, self._commanded, self._active = timing, window, commanded, True
         self._sources = {topic: TimeBase(late=-1) for topic in self._sources}
         self._wait.clear()
 

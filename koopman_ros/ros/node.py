@@ -69,21 +69,21 @@ class LoopNode(HostedNode):
     def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
                             *args: Any, **options: Any) -> Subscription:
         """Subscribe as any node does; a time that cannot be does not reach its clock."""
-        def hear(message: ClockMessage) -> None:
-            told = message.clock
-            if told.sec >= 0 and told.nanosec < NANOSECONDS:
+        def on_clock(message: ClockMessage) -> None:
+            clock = message.clock
+            if clock.sec >= 0 and clock.nanosec < NANOSECONDS:
                 callback(message)
                 return
             self._clocks_rejected += 1
             self.get_logger().warning(
-                f'ignored an invalid /clock message (sec {told.sec}, nanosec {told.nanosec}; '
+                f'ignored an invalid /clock message (sec {clock.sec}, nanosec {clock.nanosec}; '
                 f'{self._clocks_rejected} so far): check the publisher of /clock',
                 throttle_duration_sec=10.0)
 
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
         return super().create_subscription(
-            msg_type, topic, self.guarded(hear if msg_type is ClockMessage else callback), *args,
-            **options)
+            msg_type, topic, self.guarded(on_clock if msg_type is ClockMessage else callback),
+            *args, **options)
 
     def declare_parameters(self, namespace: str, parameters: list[Any],
                            ignore_override: bool = False) -> list[Parameter]:

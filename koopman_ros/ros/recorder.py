@@ -83,7 +83,7 @@ class Recorder:
         self._empty_ns: dict[str, int] = {}  # when nothing waited in each
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
         self._at_take = get_rmw_implementation_identifier() in _STAMPED_AT_TAKE
-        self._begun = time.monotonic()
+        self._start_time = time.monotonic()
         self.simulated = bool(node.get_parameter('use_sim_time').value)
         # 0 before the first /clock
         self._now_ns = node.get_clock().now().nanoseconds if self.simulated else 0
@@ -129,12 +129,12 @@ class Recorder:
         unstamped = [topic for topic, name in self._names.items() if name in self._known
                      and name not in topics.TYPES and not hasattr(self._known[name][0], 'header')]
         if self.simulated:
-            waited = time.monotonic() - self._begun
-            said = '' if self._now_ns or waited < _CLOCK_PATIENCE else (
+            waited = time.monotonic() - self._start_time
+            text = '' if self._now_ns or waited < _CLOCK_PATIENCE else (
                 'nothing is recorded before the first /clock message, because use_sim_time is '
                 'set: publish /clock, or set use_sim_time to false')
         elif unstamped and self._node.count_publishers(topics.CLOCK):
-            said = (f'{unstamped[0]} has no stamps and is logged in wall time, although /clock is '
+            text = (f'{unstamped[0]} has no stamps and is logged in wall time, although /clock is '
                     'published: start the trainer with use_sim_time set to true')
             # by which a reader sees how fast the plant ran
             self._types.setdefault(topics.CLOCK, Clock)
@@ -142,9 +142,9 @@ class Recorder:
             self.counts.setdefault(topics.CLOCK, 0)
         else:
             return
-        if said and said != self.complaint:
-            self._node.get_logger().warning(said)
-        self.complaint = said
+        if text and text != self.complaint:
+            self._node.get_logger().warning(text)
+        self.complaint = text
 
     def take(self) -> None:
         """Record the received messages."""
@@ -198,7 +198,7 @@ class Recorder:
                 topics.CLOCK, self._clock)])
         for taken in heapq.merge(*waiting, key=lambda taken: taken.received_ns):
             if not taken.topic:
-                self._hear(taken.data)
+                self._on_clock(taken.data)
                 continue
             if self.simulated:
                 if not self._now_ns:
@@ -214,7 +214,7 @@ class Recorder:
             self._writer.write(taken.topic, taken.data, taken.received_ns, taken.sent_ns)
             self.counts[taken.topic] += 1
 
-    def _hear(self, data: bytes) -> None:
+    def _on_clock(self, data: bytes) -> None:
         """Set the node's time from a message on /clock; ignore an invalid time."""
         now = deserialize_message(data, Clock).clock
         if now.sec >= 0 and now.nanosec < NANOSECONDS:

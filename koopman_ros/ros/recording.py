@@ -47,9 +47,9 @@ class Recording:
     def start(self) -> str:
         """Start a bag and return a sentence that names it; OSError without room, e.g."""
         # to the millisecond: recordings may follow each other quickly
-        wanted = Path(self.settings.output or datetime.datetime.now().strftime(
+        requested = Path(self.settings.output or datetime.datetime.now().strftime(
             'koopman_ros_%Y_%m_%d-%H_%M_%S_%f')[:-3])
-        output = free_name(wanted)
+        output = free_name(requested)
         if reason := self._too_little_room(output):
             raise OSError(f'{reason}: free some space, or choose another disk')
         writer = BagWriter(
@@ -61,22 +61,22 @@ class Recording:
         self._path = str(output)
         for timer in self._timers:
             timer.reset()
-        said = f'recording to {output}'
-        if output == wanted:
-            self._node.get_logger().info(said)
+        text = f'recording to {output}'
+        if output == requested:
+            self._node.get_logger().info(text)
         else:
-            said += f', because {wanted} already exists'
-            self._node.get_logger().warning(said)
-        return said
+            text += f', because {requested} already exists'
+            self._node.get_logger().warning(text)
+        return text
 
     def stop(self) -> str:
         """Complete the bag and return a sentence that counts it; OSError when that fails."""
         recorder = self._end()
         if self._problem:
             raise OSError(self._problem)
-        said = f'recorded {sum(recorder.counts.values())} messages to {self._path}'
-        self._node.get_logger().info(said)
-        return said
+        text = f'recorded {sum(recorder.counts.values())} messages to {self._path}'
+        self._node.get_logger().info(text)
+        return text
 
     def flushed(self) -> str:
         """Return the path of the present or the last bag with all of it on disk, or ''."""
@@ -97,10 +97,10 @@ class Recording:
         try:
             recorder.close()
         except (OSError, LookupError) as error:
-            said = f'{self._path} is not complete: {error}'
-            self._node.get_logger().error(said)
+            text = f'{self._path} is not complete: {error}'
+            self._node.get_logger().error(text)
             # the first error tells more
-            self._problem = self._problem or said
+            self._problem = self._problem or text
         return recorder
 
     def _attempt(self, work: Callable[[Recorder], None]) -> None:
@@ -165,11 +165,11 @@ class Recording:
             **{f'messages on {topic}': count for topic, count in counts.items()}})
 
 
-def free_name(wanted: Path) -> Path:
+def free_name(requested: Path) -> Path:
     """Return the path, or the first of run_2, run_3, ... (run_2.mcap, ...) that does not exist."""
-    path, number = wanted, 1
+    path, number = requested, 1
     while os.path.lexists(path):
         number += 1
-        path = wanted.with_name(f'{wanted.stem}_{number}.mcap' if wanted.suffix == '.mcap'
-                                else f'{wanted.name}_{number}')
+        path = requested.with_name(f'{requested.stem}_{number}.mcap' if requested.suffix == '.mcap'
+                                   else f'{requested.name}_{number}')
     return path

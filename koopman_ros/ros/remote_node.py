@@ -99,13 +99,13 @@ class RemoteNode:
         names = [name for name in listed.result.names if not name.startswith(_OF_RCLPY)]
 
         def on_described(described: Any) -> None:
-            def on_values(got: Any) -> None:
-                if described is None or got is None or len(got.values) != len(names):
+            def on_values(response: Any) -> None:
+                if described is None or response is None or len(response.values) != len(names):
                     self._read_again()
                     return
                 self._reading = False
                 self._take({one.name: one for one in map(
-                    _description, described.descriptors, got.values)})
+                    _description, described.descriptors, response.values)})
 
             self.call('get_parameters', GetParameters.Request(names=names), on_values)
 

@@ -28,7 +28,7 @@ class SetpointTable:
     """Set-points by signal, in the units of their messages."""
 
     places: Mapping[str, MessageField]
-    courses: Mapping[str, tuple[Array, Array]]  #: times in s from the first row on, and values
+    trajectories: Mapping[str, tuple[Array, Array]]  #: times in s from the first row, and values
 
     @staticmethod
     def read(settings: PlayerParameters, wiring: SignalTopics | None) -> 'SetpointTable':
@@ -43,37 +43,38 @@ class SetpointTable:
         try:
             table = table_of(settings.bag)
             times = seconds_of(table, '', 0.0)
-            courses = {}
+            trajectories = {}
             for name, place in wiring.setpoints.items():
                 if (found := header_of(table, name)) is None:
                     continue
                 column, unit = found
-                here = conversion(unit or display_unit(wiring.signals.states[name]), place.unit)
+                convert = conversion(unit or display_unit(wiring.signals.states[name]), place.unit)
                 values = np.array(table[column], dtype=np.float64)
                 given = np.isfinite(times) & np.isfinite(values)
-                courses[name] = _course(times[given], np.array(
-                    [here(value) for value in values[given].tolist()]), settings)
+                trajectories[name] = _trajectory(times[given], np.array(
+                    [convert(value) for value in values[given].tolist()]), settings)
         except (OSError, ValueError) as error:
             raise ConfigurationError(f'{settings.bag}: {error}') from error
-        if not courses:
+        if not trajectories:
             raise ConfigurationError(
                 f'{settings.bag} has no column {" or ".join(wiring.setpoints)}: name the columns '
                 'time [s] and <signal> [unit]')
-        return SetpointTable(wiring.setpoints, courses)
+        return SetpointTable(wiring.setpoints, trajectories)
 
     @property
     def content(self) -> BagSummary:
         """The messages as those of a bag."""
-        topics = {name: f'/{self.places[name].topic.lstrip("/")}' for name in self.courses}
+        topics = {name: f'/{self.places[name].topic.lstrip("/")}' for name in self.trajectories}
         return BagSummary(
-            {topics[name]: len(times) for name, (times, _) in self.courses.items()},
-            {topics[name]: self.places[name].type for name in self.courses}, {}, None, None, True)
+            {topics[name]: len(times) for name, (times, _) in self.trajectories.items()},
+            {topics[name]: self.places[name].type for name in self.trajectories}, {}, None, None,
+            True)
 
     def messages(self, clock: Clock, lead: float) -> Iterator[BagMessage]:
         """Yield the messages in the order of their times, the first one now."""
         begin_ns = clock.now().nanoseconds
-        rows = sorted((time, name, value) for name, course in self.courses.items()
-                      for time, value in zip(*(part.tolist() for part in course), strict=True))
+        rows = sorted((time, name, value) for name, trajectory in self.trajectories.items()
+                      for time, value in zip(*(part.tolist() for part in trajectory), strict=True))
         for time, name, value in rows:
             place = self.places[name]
             message = message_class(place.type)()
@@ -85,7 +86,7 @@ class SetpointTable:
                              serialize_message(message))
 
 
-def _course(times: Array, values: Array, settings: PlayerParameters) -> tuple[Array, Array]:
+def _trajectory(times: Array, values: Array, settings: PlayerParameters) -> tuple[Array, Array]:
     """Return times and values of steps, or of ramps between them."""
     if (np.diff(times) < 0.0).any():
         raise ValueError('the times do not increase: sort the rows')

@@ -68,24 +68,24 @@ def by_topic(places: Mapping[str, MessageField]) -> Iterator[tuple[str, Any, lis
         yield topic, kind, names
 
 
-def _converted(name: str, unit: str, wanted: str) -> Conversion:
+def _converted(name: str, unit: str, target_unit: str) -> Conversion:
     try:
-        return conversion(unit, wanted)
+        return conversion(unit, target_unit)
     except ValueError as error:
         raise ConfigurationError(f'{name}: {error}: set another unit') from error
 
 
 def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., None]:
     """Return a callback to which rclpy passes a message with its middleware information."""
-    def hear(*arrived: Any) -> None:
+    def callback(*arrived: Any) -> None:
         # rclpy's EventsExecutor of Jazzy hands over both as one tuple
         message, info = arrived if len(arrived) == 2 else arrived[0]
         take(message, info)
 
     # rclpy chooses the arguments by the callback's signature
-    hear.__signature__ = inspect.signature(  # type: ignore[attr-defined]
+    callback.__signature__ = inspect.signature(  # type: ignore[attr-defined]
         lambda message, info: None)
-    return hear
+    return callback
 
 
 class SignalSubscriber:
@@ -104,8 +104,8 @@ class SignalSubscriber:
 
     def __init__(self, node: Node, subscribe: Callable[..., Subscription],
                  places: Mapping[str, MessageField], units: Mapping[str, str],
-                 hear: Callable[[SignalSample], None]) -> None:
-        self._node, self._hear = node, hear
+                 callback: Callable[[SignalSample], None]) -> None:
+        self._node, self._callback = node, callback
         self.subscriptions: list[Subscription] = []
         self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
         for topic, kind, names in by_topic(places):
@@ -128,10 +128,10 @@ class SignalSubscriber:
             values[name] = converted(number) if lowest <= number <= highest else math.nan
         if values:
             header = getattr(message, 'header', None)
-            self._hear(SignalSample(self._node.get_clock().now().to_msg() if header is None
-                                    else header.stamp, header.frame_id if header else '', values,
-                                    header is not None, topic,
-                                    info['publication_sequence_number']))
+            self._callback(SignalSample(
+                self._node.get_clock().now().to_msg() if header is None else header.stamp,
+                header.frame_id if header else '', values, header is not None, topic,
+                info['publication_sequence_number']))
 
     def published(self) -> bool:
         """Whether one of the topics is published."""

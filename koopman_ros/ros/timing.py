@@ -29,8 +29,8 @@ class Timing:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._simulated = bool(node.get_parameter('use_sim_time').value)
-        self._wall = self._begun = time.monotonic()
-        self._ticked = (0, self._begun)  # last time on /clock, and when it came by the steady one
+        self._wall = self._start = time.monotonic()
+        self._ticked = (0, self._start)  # last time on /clock, and when it came by the steady one
         self._sim = self._sim_now()
         self._base = TimeBase()
         self._spacing = 0.0  # s by the steady clock, between the last two stamps that advanced
@@ -108,10 +108,10 @@ class Timing:
     @property
     def without_clock(self) -> bool:
         """Whether `use_sim_time` is set and /clock is not published."""
-        waited = time.monotonic() - self._begun
+        waited = time.monotonic() - self._start
         return self._simulated and self._sim_now() == 0 and waited > _CLOCK_PATIENCE
 
-    def no_news(self, within: float) -> Advance | None:
+    def silence_cause(self, within: float) -> Advance | None:
         """Return why the last measurement was not newer, if it was received within `seconds`."""
         if self._ignored is None or self._since(*self._ignored[:2]) > within:
             return None

@@ -171,21 +171,21 @@ class EndpointMonitor:
     def _look_in_turn(self) -> None:
         if (now := time.monotonic()) < self._next_look:
             return
-        begun = time.thread_time()
+        started = time.thread_time()
         self._look()
-        self._next_look = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
+        self._next_look = now + (time.thread_time() - started) * self._loops / _LOOK_SHARE
 
     def _look(self) -> None:
         conflicts = {topic: self._conflict(topic) for topic in self._exclusive}
         self._shared = {topic: bool(conflict) for topic, conflict in conflicts.items()}
         complaints = dict.fromkeys(
             complaint for own in self._own for complaint in self._complaints(own))
-        said = '; '.join(filter(None, conflicts.values())), '; '.join(complaints)
-        before, self._last_complaints = self._last_complaints, said
-        for complaint in said:
+        texts = '; '.join(filter(None, conflicts.values())), '; '.join(complaints)
+        before, self._last_complaints = self._last_complaints, texts
+        for complaint in texts:
             if complaint and complaint not in before:
                 self._node.get_logger().warning(complaint)
-        if said != before:
+        if texts != before:
             self._on_change()
 
     def _conflict(self, topic: str) -> str:
@@ -202,8 +202,8 @@ class EndpointMonitor:
         subscribes = isinstance(own, Subscription)
         publishers = self._node.get_publishers_info_by_topic(topic)
         subscriptions = self._node.get_subscriptions_info_by_topic(topic)
-        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, this node for '
-                f'{kind}: stop that node, or remap its topic'
+        texts = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, this node '
+                 f'for {kind}: stop that node, or remap its topic'
                 for other in (*publishers, *subscriptions) if other.topic_type != kind]
         for other in publishers if subscribes else subscriptions:
             offered, requested = _explicit(own.qos_profile), _explicit(other.qos_profile)
@@ -216,11 +216,11 @@ class EndpointMonitor:
             if subscribes and offered.reliability is ReliabilityPolicy.BEST_EFFORT:
                 remedy += (f', or start this node with -p qos_overrides.{topic}.subscription.'
                            'reliability:=best_effort')
-            said.append(
+            texts.append(
                 f'{topic}: {node_name(other)} {"publishes" if subscribes else "subscribes"} with '
                 'an incompatible quality of service, so no messages are received: '
                 f'{reason.replace("ERROR: ", "").strip(";")}; {remedy}')
-        return said
+        return texts
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:

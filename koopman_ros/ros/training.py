@@ -97,9 +97,9 @@ class Training:
         self._state = self._job.state
         self._progress = TrainingProgress(self._node.get_logger().info)
         self._timer.reset()
-        said = f'training from {", ".join(bags)}'
-        self._node.get_logger().info(said)
-        return said
+        announcement = f'training from {", ".join(bags)}'
+        self._node.get_logger().info(announcement)
+        return announcement
 
     def complete(self) -> None:
         """End a training that is under way; nothing is written then."""

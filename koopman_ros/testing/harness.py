@@ -199,9 +199,9 @@ class Harness:
     def listen(self, kind: Any, topic: str, qos: QoSProfile = LOOP_QOS, *,
                raw: bool = False) -> list[Any]:
         """Return a list to which every message of a topic will be added."""
-        heard: list[Any] = []
-        self.node.create_subscription(kind, topic, heard.append, qos, raw=raw)
-        return heard
+        received: list[Any] = []
+        self.node.create_subscription(kind, topic, received.append, qos, raw=raw)
+        return received
 
     def speak(self, kind: Any, topic: str, qos: QoSProfile = LOOP_QOS, *,
               to: str, subscribers: int = 1) -> Publisher:
@@ -216,16 +216,16 @@ class Harness:
         # it learns of them in the order in which they were made: this call's come last
         client = self.node.create_client(GetParameters, f'{node}/get_parameters')
         self.wait_until(client.service_is_ready)
-        asked: list[Future] = []
+        futures: list[Future] = []
         due = 0.0
 
         def answered() -> bool:
             nonlocal due
             # the response is lost when the node does not know the reader yet: ask again
             if (now := time.monotonic()) >= due:
-                asked.append(client.call_async(GetParameters.Request(names=['use_sim_time'])))
+                futures.append(client.call_async(GetParameters.Request(names=['use_sim_time'])))
                 due = now + _ASK_AGAIN
-            return any(future.done() for future in asked)
+            return any(future.done() for future in futures)
 
         self.wait_until(answered)
         self.node.destroy_client(client)

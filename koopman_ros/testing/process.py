@@ -200,8 +200,8 @@ def _reserved_domain() -> Iterator[int]:
     # runs side by side start looking at different places
     offset = os.getpid() % len(_DOMAINS)
     for domain in (*_DOMAINS[offset:], *_DOMAINS[:offset]):
-        with _reservation(f'domain_{domain}') as mine:
-            if mine:
+        with _reservation(f'domain_{domain}') as reserved:
+            if reserved:
                 yield domain
                 return
     raise RuntimeError('all ROS domains are taken by other runs: wait until one ends')
@@ -219,8 +219,8 @@ def reserved_output(wanted: Path) -> Iterator[Path]:
     while True:
         # a name of a socket has little room
         digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:32]
-        with _reservation(f'output_{digest}') as mine:
-            if mine:
+        with _reservation(f'output_{digest}') as reserved:
+            if reserved:
                 yield folder
                 return
         number += 1
@@ -231,10 +231,10 @@ def reserved_output(wanted: Path) -> Iterator[Path]:
 def _reservation(name: str) -> Iterator[bool]:
     """Hold a name on this machine; yields whether it was free."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
-        mine = True
+        reserved = True
         try:
             # an abstract name, which disappears with the process that holds it
             held.bind(f'\0koopman_ros_{name}')
         except OSError:
-            mine = False
-        yield mine
+            reserved = False
+        yield reserved

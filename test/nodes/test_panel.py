@@ -212,7 +212,7 @@ class Panel:
         return self.ros.wait_until(condition)
 
     def ask(self, what: str, name: str = '', number: Any = None) -> Answer:
-        future: Future[Answer] = self.node.ask(Action('anna', what, name, number))
+        future: Future[Answer] = self.node.request(Action('anna', what, name, number))
         self.wait(future.done)
         return future.result()
 

@@ -175,7 +175,7 @@ def context(own: Controller, state: State, report: StepReport, silence: float = 
             awaited='', late={}, missing={}, duplicated={}),
         timing=SimpleNamespace(silence=silence, wall_silence=0.0, paused=False,
                                without_clock=False, age=math.nan, busy=False, answer_seconds=0.0,
-                               no_news=lambda _: None))
+                               silence_cause=lambda _: None))
 
 
 @pytest.mark.parametrize(('silence', 'warned'), [(0.6, False), (1.4, False), (2.5, True)])

@@ -54,12 +54,12 @@ def test_stamps_that_do_not_advance_end_no_silence(
         clocks.pass_by(0.2)
         assert measured(timing, stamps[k % len(stamps)]) is Advance.OLD
     assert timing.silence == pytest.approx(20.0)
-    assert timing.no_news(10.0) is Advance.OLD
+    assert timing.silence_cause(10.0) is Advance.OLD
     clocks.pass_by(11.0)
     # then nothing arrives at all
-    assert timing.no_news(10.0) is None
+    assert timing.silence_cause(10.0) is None
     assert measured(timing, 7.2) is Advance.NEW
-    assert (timing.silence, timing.no_news(10.0)) == (0.0, None)
+    assert (timing.silence, timing.silence_cause(10.0)) == (0.0, None)
 
 
 def test_seconds_count_as_far_as_they_have_passed_and_one_more(

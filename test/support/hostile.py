@@ -73,7 +73,7 @@ class HostileSource:
         self.snapshot = own.snapshot(NOW + 2.0)
         self.asked: list[Action] = []
 
-    def ask(self, action: Action) -> Future[Answer]:
+    def request(self, action: Action) -> Future[Answer]:
         """Reject what an operator asks for, in words that are no better."""
         self.asked.append(action)
         future: Future[Answer] = Future()

@@ -35,7 +35,7 @@ class Equations(Drift):
     """
 
     plant: Any  #: the class, see :func:`koopman_ros.plants.plant_class`
-    sought: tuple[Constant, ...]
+    estimated: tuple[Constant, ...]
     theta: Array  #: (p,) the angles
     #: (n_x,) that a class is given which takes one, for what it stands still at does not matter
     #: here and may not exist; None for another
@@ -44,7 +44,7 @@ class Equations(Drift):
     __repr__ = short_repr
 
     @classmethod
-    def of(cls, plant: Any, sought: Sequence[Constant], known: PlantDescription,
+    def of(cls, plant: Any, estimated: Sequence[Constant], known: PlantDescription,
            x: Array, u: Array
            ) -> Equations:
         """
@@ -55,25 +55,25 @@ class Equations(Drift):
             move about their nominal values.
         :raises ValueError: when the names and units are not those of the plant's class.
         """
-        theta = np.arcsin([one.start for one in sought])
-        system = _built(plant, sought, theta, None)
+        theta = np.arcsin([one.start for one in estimated])
+        system = _built(plant, estimated, theta, None)
         _check(system, plant, known)
         nominal: Array | None = system.nominal_state
         try:
-            _built(plant, sought, theta, nominal)
+            _built(plant, estimated, theta, nominal)
         except ValueError:
             nominal = None
         names = (*known.state_names,
                  *(name for name in system.state_names if name not in known.state_names))
         places = [system.state_names.index(name) for name in names[len(known.state_names):]]
         middle, half = system.nominal_state[places], 0.5 * system.state_scale[places]
-        whole = replace(
+        completed = replace(
             known, state_names=names, B=None, input_matrix_degree=0,
             state_units=(*known.state_units, *(system.state_units[i] for i in places)),
             nominal_state=np.concatenate((known.nominal_state, middle)))
         ends = np.linspace(-1.0, 1.0, len(x))[:, None]
-        box = Box.of(whole, np.hstack([x, middle + half * ends]), u, nominal=False)
-        return cls(box, plant, tuple(sought), theta, nominal)
+        box = Box.of(completed, np.hstack([x, middle + half * ends]), u, nominal=False)
+        return cls(box, plant, tuple(estimated), theta, nominal)
 
     @property
     def form(self) -> str:
@@ -161,7 +161,7 @@ class Equations(Drift):
                         dtype=np.int64)
 
     def _at(self, theta: Array) -> ControlAffineSystem:
-        return _built(self.plant, self.sought, theta, self.nominal)
+        return _built(self.plant, self.estimated, theta, self.nominal)
 
     @cached_property
     def _speed(self) -> float:
@@ -183,19 +183,19 @@ def _rate(system: ControlAffineSystem, x: Array, u: Array) -> Array:
     return system.drift(x) + system.forcing(x, u)
 
 
-def _built(plant: Any, sought: Sequence[Constant], theta: Array, nominal: Array | None
+def _built(plant: Any, estimated: Sequence[Constant], theta: Array, nominal: Array | None
            ) -> ControlAffineSystem:
     return build(plant, {one.name: one.value(share) for one, share in zip(
-        sought, np.sin(theta).tolist(), strict=True)}, nominal)
+        estimated, np.sin(theta).tolist(), strict=True)}, nominal)
 
 
 def _check(system: ControlAffineSystem, plant: Any, known: PlantDescription) -> None:
     """Raise ValueError unless the signals are states and all inputs of the equations."""
-    for kind, whole in (('state', False), ('input', True)):
+    for kind, exact in (('state', False), ('input', True)):
         own, given = (dict(zip(getattr(one, f'{kind}_names'), getattr(one, f'{kind}_units'),
                                strict=True)) for one in (system, known))
-        if not given.items() <= own.items() or (whole and given != own):
-            said, needed = (', '.join(f'{name} [{unit}]' for name, unit in one.items()) or 'none'
-                            for one in (given, own))
-            raise ValueError(f'the record has the {kind}s {said}, but {plant.__name__} has '
+        if not given.items() <= own.items() or (exact and given != own):
+            listed, needed = (', '.join(f'{name} [{unit}]' for name, unit in one.items()) or 'none'
+                              for one in (given, own))
+            raise ValueError(f'the record has the {kind}s {listed}, but {plant.__name__} has '
                              f'{needed}: use the names and units of the class')

@@ -50,11 +50,11 @@ def check_inputs(plant: PlantDescription, episodes: Sequence[Episode]) -> tuple[
     names = [plant.input_names[j] for j in together]
     measure = (f'correlation {np.clip(correlation[together[0], together[1]], -1.0, 1.0):.4g}'
                if len(names) == 2 else f'condition index {index:.3g}')
-    said = f'{", ".join(names[:-1])} and {names[-1]} moved together ({measure})'
+    sentence = f'{", ".join(names[:-1])} and {names[-1]} moved together ({measure})'
     if index >= _STRONG:
-        raise ValueError(f'{said}: their separate effects cannot be identified; step them '
+        raise ValueError(f'{sentence}: their separate effects cannot be identified; step them '
                          'independently')
-    return (f'{said}: their separate effects are uncertain; step them independently',)
+    return (f'{sentence}: their separate effects are uncertain; step them independently',)
 
 
 def _window_means(episodes: Sequence[Episode]) -> Array:

@@ -69,8 +69,8 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     :raises Stopped: when `watch` requested it.
     """
     plant = replace(plant, B=None, input_matrix_degree=0)
-    sought = estimated_parameters_of(equations, ranges or {})
-    start = Equations.of(equations, sought, plant,
+    estimated = estimated_parameters_of(equations, ranges or {})
+    start = Equations.of(equations, estimated, plant,
                          np.concatenate([e.interpolated() for e in episodes]),
                          np.concatenate([e.u for e in episodes]))
     n_y = len(plant.state_names)
@@ -78,7 +78,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     predictor = _filter(record, start, n_y)
     predictor = spanned(predictor, record.estimates(predictor))
     predictor, refined = _refined(record, predictor, _stage(
-        watch, 0, f'{len(sought)} constants of {equations.__name__}'))
+        watch, 0, f'{len(estimated)} constants of {equations.__name__}'))
     method = INNOVATIONS_FORM if np.any(refined.gain) else OUTPUT_ERROR
     left = record.innovations(predictor, record.choose)
     scale = start.box.states.scale[:n_y]
@@ -89,7 +89,7 @@ def estimate_parameters(plant: PlantDescription, episodes: Sequence[Episode], eq
     predictor = Predictor(refined.model, predictor.gain)
     predictor = spanned(predictor, record.estimates(predictor))
     found = record.identified(predictor, method, [score], _stage(watch, 2, 'linear model'))
-    return replace(found, constants=_estimates(sought, refined))
+    return replace(found, constants=_estimates(estimated, refined))
 
 
 def _stage(watch: Watch, number: int, text: str) -> Callable[..., bool]:
@@ -157,10 +157,10 @@ def _fitted(record: SplitRecord, start: Predictor[Equations], gain: Array, parts
                             tolerance=_TOLERANCE, monitor=monitor)
 
 
-def _estimates(sought: Sequence[Constant], refined: Refined[Equations]
+def _estimates(estimated: Sequence[Constant], refined: Refined[Equations]
                ) -> tuple[EstimatedConstant, ...]:
     """Return values, standard errors and how they are to be taken."""
-    shares, p = refined.model.shares, len(sought)
+    shares, p = refined.model.shares, len(estimated)
     matrix = refined.information()
     inside = np.abs(shares) < 1.0 - _EDGE
     # one that its range holds is no parameter any more
@@ -174,7 +174,7 @@ def _estimates(sought: Sequence[Constant], refined: Refined[Equations]
     deviations = np.full(p, np.nan)
     deviations[inside] = np.sqrt(np.diag(covariance)[:int(np.sum(inside))])
     found = []
-    for one, share, deviation in zip(sought, shares.tolist(), deviations.tolist(), strict=True):
+    for one, share, deviation in zip(estimated, shares.tolist(), deviations.tolist(), strict=True):
         standing = EstimateStatus.ESTIMATED
         if np.isnan(deviation):
             standing = EstimateStatus.AT_LOWER_END if share < 0.0 else EstimateStatus.AT_UPPER_END

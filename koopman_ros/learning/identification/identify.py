@@ -17,7 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import expect, short_repr
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.core.plugins import contained
-from koopman_ros.execution import Backend, Serial, Tell
+from koopman_ros.execution import Backend, Notify, Serial
 from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.base import (
     DriftProblem,
@@ -115,8 +115,8 @@ class EstimatedConstant:
     def __str__(self) -> str:
         error = '' if self.standing is not EstimateStatus.ESTIMATED else (
             f' +- {self.standard_error:.2g}')
-        said = f' ({self.standing.value})' if self.standing.value else ''
-        return f'{self.value:.6g}{error} {self.unit}{said}'
+        suffix = f' ({self.standing.value})' if self.standing.value else ''
+        return f'{self.value:.6g}{error} {self.unit}{suffix}'
 
 
 @dataclass(frozen=True)
@@ -304,10 +304,10 @@ class _DegreeCandidate:
     failures: tuple[str, ...]  # reasons of methods that raised unexpectedly
 
 
-def _candidate(given: _Given, degree: int, tell: Tell) -> _DegreeCandidate:
+def _candidate(given: _Given, degree: int, notify: Notify) -> _DegreeCandidate:
     """Estimate a drift of a degree by every method, and refine the best."""
     def monitor(*_: object) -> bool:
-        return tell(None)
+        return notify(None)
 
     monitor()
     estimates, failures = _estimates(given, degree)

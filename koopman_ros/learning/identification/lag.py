@@ -229,7 +229,7 @@ class _DivergedError(Exception):
 
 
 def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
-              sought: Sequence[int], *, watch: Callable[[], object] = lambda: None) -> Array:
+              searched: Sequence[int], *, watch: Callable[[], object] = lambda: None) -> Array:
     """
     Find the lags (n_u,) of inputs by simulations of a record of all states.
 
@@ -299,7 +299,7 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
         return next((other for other in sorted(times.tolist()) if step / 4.0 < other < found
                      and not clearly_positive(squares(j, other) - errors)), found)
 
-    for j in sought:
+    for j in searched:
         while True:
             try:
                 lag[j] = search(j)

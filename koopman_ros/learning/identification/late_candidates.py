@@ -64,12 +64,12 @@ def late_as_suits(one: StructureCandidate, manipulated: Sequence[bool], samples:
     """
     record = one.record
     longest = _longest(record)
-    here = own = one.late or (0,) * len(record.plant.input_names)
+    current = own = one.late or (0,) * len(record.plant.input_names)
     found = dict[tuple[int, ...], Refined[Refinable]]()
 
     def cost(late: tuple[int, ...]) -> float:
         if late not in found:
-            near = found.get(here)
+            near = found.get(current)
             found[late] = fitted_by_simulation(
                 near.model if near else one.model, record.later(late).pieces(samples),
                 near.starts if near else one.starts, iterations=_FEW_STEPS, monitor=monitor)
@@ -79,13 +79,13 @@ def late_as_suits(one: StructureCandidate, manipulated: Sequence[bool], samples:
     for j in np.flatnonzero(manipulated).tolist():
         for shift in (sign * size for size in _SHIFTS for sign in (1, -1)):
             while not monitor():
-                late = (*here[:j], here[j] + shift, *here[j + 1:])
-                if not (0 <= late[j] <= longest and cost(late) < (1.0 - _LESS) * cost(here)):
+                late = (*current[:j], current[j] + shift, *current[j + 1:])
+                if not (0 <= late[j] <= longest and cost(late) < (1.0 - _LESS) * cost(current)):
                     break
-                here = late
-    if here == own:
+                current = late
+    if current == own:
         return None
-    moved, best = record.later(here), found[here]
+    moved, best = record.later(current), found[current]
     data = moved.pieces(samples)
     return candidate_of(
         fitted_by_simulation(best.model, data, best.starts, monitor=monitor), one.start, data,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import time
 
 from koopman_ros.core.datasets import Array
-from koopman_ros.execution import Backend, Tell
+from koopman_ros.execution import Backend, Notify
 from koopman_ros.learning.identification.drift import DriftModel, Segments
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.output_error import fitted_by_simulation, Refined
@@ -75,12 +75,13 @@ def best_units(choice: Choice) -> int | None:
     return min(networks)[1] if networks else None
 
 
-def _network(shared: Shared, item: tuple[int, int], tell: Tell) -> Refined[NetworkDrift] | None:
+def _network(shared: Shared, item: tuple[int, int], notify: Notify
+             ) -> Refined[NetworkDrift] | None:
     """Return a network that fits the record; None where it may diverge."""
     end = time.process_time() + shared.budget
 
     def monitor(*_: object) -> bool:
-        tell(None)
+        notify(None)
         return time.process_time() > end
 
     monitor()

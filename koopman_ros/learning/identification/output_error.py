@@ -324,13 +324,13 @@ class _Problem(Generic[_Model]):
                 own_gradient += (starts @ weighed.swapaxes(0, 1).reshape(M, -1, 1))[..., 0]
         if not self.smooth:
             return gradient, matrix
-        whole = np.zeros((p + M * n_x,) * 2)
-        whole[:p, :p] = matrix
+        full = np.zeros((p + M * n_x,) * 2)
+        full[:p, :p] = matrix
         for m in range(M):
             block = slice(p + m * n_x, p + (m + 1) * n_x)
-            whole[block, block], whole[block, :p] = own[m, :, p:], own[m, :, :p]
-            whole[:p, block] = own[m, :, :p].T
-        return np.concatenate((gradient, own_gradient.ravel())), whole
+            full[block, block], full[block, :p] = own[m, :, p:], own[m, :, :p]
+            full[:p, block] = own[m, :, :p].T
+        return np.concatenate((gradient, own_gradient.ravel())), full
 
     def sensitivities(self, model: _Model, K: Array, before: Array, after: Array, q: int
                        ) -> Iterator[tuple[slice, Array]]:

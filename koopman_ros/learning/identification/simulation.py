@@ -67,21 +67,21 @@ def fitted(errors: Callable[[Array], Array], tried: Array) -> tuple[Array, Array
                 np.take_along_axis(found, chosen[:, None], axis=0)[0])
 
     with np.errstate(all='ignore'):
-        best, least, here = best_of(tried)
+        best, least, current = best_of(tried)
         shifts = _SHIFT * np.eye(best.shape[1])[:, None]
         for _ in range(_SEARCHES):
-            slopes = np.moveaxis(errors(best + shifts) - here, 0, -1) / _SHIFT
+            slopes = np.moveaxis(errors(best + shifts) - current, 0, -1) / _SHIFT
             normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
-            right = np.einsum('kmij,kmi->mj', slopes, here)
+            right = np.einsum('kmij,kmi->mj', slopes, current)
             if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
                 break
             inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-            offer, own, there = best_of((best - (inverse @ right[..., None])[..., 0])[None])
+            offer, own, proposed = best_of((best - (inverse @ right[..., None])[..., 0])[None])
             before = np.sum(least, axis=-1)
             better = np.sum(own, axis=-1) < before
             best, least = (np.where(better[:, None], *both) for both in (
                 (offer, best), (own, least)))
-            here = np.where(better[:, None], there, here)
+            current = np.where(better[:, None], proposed, current)
             if np.all(np.sum(least, axis=-1) >= (1.0 - _GAIN) * before):
                 break
     return best, least

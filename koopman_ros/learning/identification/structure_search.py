@@ -71,11 +71,11 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     end = time.process_time() + BUDGET
     try:
         measured = estimate(plant, given, 0)
-        sought = measured.drift.characteristics.keys() - set(given)
+        candidates = measured.drift.characteristics.keys() - set(given)
     except NotMonotoneError:
         # so it may seem where a state between input and measurement is not measured
         measured = estimate(plant, plant.input_names, 0)
-        sought = set(plant.input_names) - set(given)
+        candidates = set(plant.input_names) - set(given)
     plant = replace(plant, characteristics=measured.drift.box.inputs.characteristics)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes, 0.0):
@@ -92,8 +92,8 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
                            searched=('input_matrix_degree',))
     if _explains(measured, plant, episodes, _SLIGHT):
         return measured
-    if sought:
-        plant = with_characteristics(plant, episodes, sought, seed=seed, dead_times=dead_times,
+    if candidates:
+        plant = with_characteristics(plant, episodes, candidates, seed=seed, dead_times=dead_times,
                                       backend=backend)
     return identify_unmeasured(
         plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,

@@ -113,10 +113,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     begun = itertools.count()
 
     def stage(text: str, limit: float = end) -> Callable[..., bool]:
-        told = stage_monitor(watch, min(next(begun), total - 1), total, text)
+        cancelled = stage_monitor(watch, min(next(begun), total - 1), total, text)
 
         def monitor(*_: object) -> bool:
-            return told() or time.process_time() > limit
+            return cancelled() or time.process_time() > limit
 
         if monitor():
             choice.steps.append(f'stopped after {limit - now:.0f} s: {text}')

@@ -134,9 +134,9 @@ def _input_integral(episode: Episode, box: Box, middle: float, half: float) -> A
     edges = np.unique(np.concatenate(([middle - half], inside, [middle + half])))
     begin, end = map(box.inputs.to_deviation, episode.inputs_between(edges))
     s = (edges - middle) / half
-    once, twice = _antiderivatives(s)
-    area = np.diff(once)
-    return half * (area @ begin + (once[1:] - np.diff(twice) / np.diff(s)) @ (end - begin))
+    first, second = _antiderivatives(s)
+    area = np.diff(first)
+    return half * (area @ begin + (first[1:] - np.diff(second) / np.diff(s)) @ (end - begin))
 
 
 def _product_integral(episode: Episode, box: Box, middle: float, half: float, degree: int

@@ -134,13 +134,14 @@ class IncrementalTraining:
         root = self.root(data)
         n_z = root.layout.n_z + len(V)
         layout = replace(root.layout, n_z=n_z, hidden=len(b))
-        begun = Parameters(W, b, V, data.x.new_zeros((n_z, n_z)), root.layout.split(root.theta).B)
-        size = _lifted(layout, begun, data).z[:, n_z - len(V):].square().mean(0).sqrt()
+        initial = Parameters(
+            W, b, V, data.x.new_zeros((n_z, n_z)), root.layout.split(root.theta).B)
+        size = _lifted(layout, initial, data).z[:, n_z - len(V):].square().mean(0).sqrt()
         if not bool((size > _STILL).all()):
             raise ValueError('a coordinate of the initial lift is constant on the samples: use '
                              'that of a plant in the same range, or none')
-        begun = replace(begun, V=V / size[:, None])
-        theta = _with_linear_fits(layout, begun, data, torch.Generator().manual_seed(0))
+        initial = replace(initial, V=V / size[:, None])
+        theta = _with_linear_fits(layout, initial, data, torch.Generator().manual_seed(0))
         return TrainedLift(layout, theta, MinimumStatus.CONVERGED)
 
     def _extended(self, data: ScaledSamples, n_z: int, parent: TrainedLift, seed: int
@@ -156,14 +157,14 @@ class IncrementalTraining:
                                                   dtype=torch.float64).to(data.x)])
         layout = replace(old, n_z=n_z, hidden=len(b))
         zero = data.x.new_zeros
-        begun = Parameters(W, b, zero((layout.n_free, layout.hidden)), zero((n_z, n_z)), given.B)
-        features = _lifted(layout, begun, data).features
+        initial = Parameters(W, b, zero((layout.n_free, layout.hidden)), zero((n_z, n_z)), given.B)
+        features = _lifted(layout, initial, data).features
         targets = (_least_spanned_product(parent, data)[:, None]
                    if n_z == old.n_z + 1 else _whitened(data.x))
-        begun = replace(begun, V=torch.cat([
+        initial = replace(initial, V=torch.cat([
             torch.cat([given.V, zero((len(given.V), count))], 1),
             _ridge_fit(features, targets).T]))
-        return layout, _with_linear_fits(layout, begun, data, generator)
+        return layout, _with_linear_fits(layout, initial, data, generator)
 
 
 def _lifted(layout: Layout, parameters: Parameters, data: ScaledSamples) -> Pass:

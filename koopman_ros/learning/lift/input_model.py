@@ -44,15 +44,15 @@ class InputModel:
         if not callable(plant.B):
             return InputModel(n_u, 0, nominal)
         deviation = box.states.to_deviation(x)
-        wanted = box.input_matrix(plant.input_matrix(x)) - nominal
-        size = float(np.sqrt(np.mean(wanted ** 2 + nominal ** 2)))
-        error = float(np.sqrt(np.mean(wanted ** 2)))
+        target = box.input_matrix(plant.input_matrix(x)) - nominal
+        size = float(np.sqrt(np.mean(target ** 2 + nominal ** 2)))
+        error = float(np.sqrt(np.mean(target ** 2)))
         if error <= _ROUNDING * size:
             return InputModel(n_u, 0, nominal)
         for degree in range(1, _HIGHEST_DEGREE + 1):
             # the regressors of an input of 1
             phi = InputTerms.regressors(deviation, np.ones((len(x), 1)), degree)[:, 1:]
-            flat = wanted.reshape(len(x), -1)
+            flat = target.reshape(len(x), -1)
             terms = np.linalg.lstsq(phi, flat, rcond=None)[0]
             error = float(np.sqrt(np.mean((phi @ terms - flat) ** 2)))
             if error <= _ROUNDING * size:

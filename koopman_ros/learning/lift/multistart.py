@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from koopman_ros.execution import Backend, Tell
+from koopman_ros.execution import Backend, Notify
 from koopman_ros.learning.lift.algorithm_1 import Algorithm1
 from koopman_ros.learning.lift.incremental import IncrementalTraining, TrainedLift
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
@@ -60,7 +60,7 @@ class Tracker:
         self._rw = math.nan
         self._step = 0, math.nan
 
-    def told(self, _: str, value: tuple[int, float] | None) -> bool:
+    def count(self, _: str, value: tuple[int, float] | None) -> bool:
         """Report the step and the cost of a start, or where they stood last."""
         if value is not None:
             self._step = value[0], math.sqrt(2.0 * value[1])
@@ -105,18 +105,18 @@ def run_starts(backend: Backend, recipe: Recipe, data: ScaledSamples, n_z: int,
     items = {f'start {i + 1} with n_z = {n_z}': (
         recipe.of_start(i) if isinstance(recipe, IncrementalTraining) else recipe, number)
         for i, number in enumerate(seeds)}
-    return backend.run(_start, items, shared=(data, n_z, parent, budget), watch=tracker.told)
+    return backend.run(_start, items, shared=(data, n_z, parent, budget), watch=tracker.count)
 
 
 def _start(shared: tuple[ScaledSamples, int, TrainedLift | None, float],
-           item: tuple[Recipe, int], tell: Tell) -> TrainedLift | str:
+           item: tuple[Recipe, int], notify: Notify) -> TrainedLift | str:
     (data, n_z, parent, budget), (recipe, seed) = shared, item
     end, late = time.process_time() + budget, False
 
     def monitor(*step: float) -> bool:
         nonlocal late
         late = time.process_time() > end
-        return tell(step) or late
+        return notify(step) or late
 
     try:
         with _one_thread():

@@ -52,13 +52,13 @@ def with_units_of(drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
 
     :raises ValueError: for a model without a network.
     """
-    ours, theirs = lift.observables, drift.observables
-    if not (isinstance(ours, NetworkObservables) and isinstance(theirs, NetworkObservables)):
+    linear, neural = lift.observables, drift.observables
+    if not (isinstance(linear, NetworkObservables) and isinstance(neural, NetworkObservables)):
         raise ValueError('only a network has hidden units')
-    idle = np.zeros((len(ours.V), len(theirs.W)))
+    idle = np.zeros((len(linear.V), len(neural.W)))
     return replace(lift, readout=None, observables=replace(
-        ours, W=np.vstack([ours.W, theirs.W]), b=np.concatenate([ours.b, theirs.b]),
-        V=np.hstack([ours.V, idle])))
+        linear, W=np.vstack([linear.W, neural.W]), b=np.concatenate([linear.b, neural.b]),
+        V=np.hstack([linear.V, idle])))
 
 
 @dataclass(frozen=True)
