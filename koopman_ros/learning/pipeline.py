@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import glob
 import hashlib
@@ -16,7 +16,7 @@ import shutil
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Episode, PlantDescription, sample_interval
+from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.progress import progress_line
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
@@ -28,51 +28,31 @@ from koopman_ros.learning.acceptance import (
     uncovered_setpoints,
 )
 from koopman_ros.learning.downsampling import coverage
+from koopman_ros.learning.drift_estimation import estimate_drift
 from koopman_ros.learning.drift_sampling import alternative_models, compare_classes
 from koopman_ros.learning.free_run import AnyModel, FREE_RUN, FreeRun, simulate
 from koopman_ros.learning.identification import (
-    estimate_parameters,
-    find_dead_times,
-    find_lags,
-    IdentificationMethod,
     Identified,
-    identify_non_affine,
-    identify_structure,
-    identify_unmeasured,
-    identify_with_characteristics,
-    lagged,
     methods_of,
-    Stopped,
-    with_lag,
 )
-from koopman_ros.learning.lift.multistart import MultistartProgress
 from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison
+from koopman_ros.learning.pipeline_progress import JUDGED, OnProgress, PipelineProgress, WRITING
 from koopman_ros.learning.record import read_record, RecordSource, reduced, TrainingRecord
 from koopman_ros.learning.retrained import Retrained
 from koopman_ros.learning.task import resolve_signals, TrainingTask
-from koopman_ros.model import LiftedModel, load, LONGEST_DEAD_TIME, save
+from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
-from koopman_ros.plants import plant_class
 from koopman_ros.records import Record, RecordedInput, RecordedState
 
 # A smaller change, in half-ranges of the current model's range, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
 
-# Shares of the whole at which reading, estimating, learning and judging begin and end.
-_STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
-           'decide': (0.9, 1.0)}
-# Shares of deciding in which the closed loops are run, and further ones, too.
-_JUDGED, _WRITING = 0.8, 0.9
 DRIFT, LINEAR_MODEL = 'estimated drift', 'best linear model'  #: compared with the new model
-# A command that is a state follows the input of the model with this lag, in samples of the record.
-_COMMAND_LAG = 1.0
 # % of the motion: errors on another day scatter by more than smaller differences say.
 _LESS_FIT = 1.0
 
-# Called with the completed share in [0, 1] and the current step; True asks to stop.
-OnProgress = Callable[[float, str], bool]
 
 
 def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
@@ -105,7 +85,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
 
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
              given: Record | None, test: Record | None) -> Retrained:
-    progress, thresholds = _Progress(on_progress), _checked(task)
+    progress, thresholds = PipelineProgress(on_progress), _checked(task)
     current, sibling = (load(path).joined if path else None
                         for path in (task.model, task.warm_start_model))
     if task.model_class == SAME:
@@ -126,29 +106,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
-    _check_disturbances(plant, episodes)
-    lag = known = _given_lag(task, plant, episodes) / seconds
-    dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)
-    searched = [j for j, name in enumerate(plant.input_names) if task.lag.get(name) == -1.0]
-    commanded, fixed = episodes, frozenset(task.characteristics)
-    while True:
-        if searched:
-            lag = find_lags(plant, _delayed(commanded, dead_time / seconds), known, searched,
-                            watch=lambda: progress.estimating(0, 1, 'lag'))
-            dead_time = _dead_time(task, plant, _behind(commanded, lag), progress)
-        episodes = _behind(_delayed(commanded, dead_time / seconds), lag)
-        found = _estimate(task, plant, episodes, methods, progress, backend, fixed)
-        if not searched or found.drift.characteristics.keys() <= fixed:
-            break
-        # with the characteristics the lags are found better
-        plant = replace(plant, characteristics=found.drift.characteristics)
-        fixed = frozenset(plant.characteristics)
-    found = replace(found, dead_time=found.dead_time + dead_time / seconds,
-                    disturbances=plant.disturbance_names)
-    moved = np.isin(plant.input_names, task.as_state) & (lag == 0.0)
-    if lag.any() or moved.any():
-        found = with_lag(found, np.where(moved, _COMMAND_LAG * sample_interval(episodes), lag),
-                         [name for name, own in zip(plant.input_names, moved, strict=True) if own])
+    estimate = estimate_drift(task, plant, episodes, methods, progress, backend)
+    found, plant, episodes = estimate.found, estimate.plant, estimate.episodes
     dead_time = seconds * found.dead_time
     recorded = Record(replace(plant, time_unit='s', B=None, input_matrix_degree=0),
                       tuple(one for one in record.episodes if one.delayed(dead_time) is not None),
@@ -174,7 +133,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     offsets = found.offsets / seconds if len(found.offsets) == len(recorded.episodes) else (
         np.zeros((len(recorded.episodes), len(box.states))))
     # commands are no states of a record
-    offsets = offsets[:, :offsets.shape[1] - int(np.sum(moved))]
+    offsets = offsets[:, :offsets.shape[1] - len(estimate.as_state)]
     runs = _free_runs(learned, recorded, test, offsets)
     others = {name: _free_runs(replace(found, drift=drift), recorded, test, offsets)
               for name, drift in ((DRIFT, found.drift), (LINEAR_MODEL, found.linear))}
@@ -184,7 +143,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
-    progress('decide', _WRITING, 'writing')
+    progress('decide', WRITING, 'writing')
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes, learned.chosen.name, runs['record']
                              ).with_disturbances(task.disturbances)
@@ -213,7 +172,7 @@ def _hidden(task: TrainingTask) -> bool:
 
 
 def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
-          inputs: Sequence[RecordedInput], current: LiftedModel | None, progress: _Progress
+          inputs: Sequence[RecordedInput], current: LiftedModel | None, progress: PipelineProgress
           ) -> TrainingRecord:
     """Read the bags of a task."""
     source = RecordSource(
@@ -222,68 +181,6 @@ def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
     progress('read', 0.0, 'reading bags')
     return read_record(source, task.most_samples, task.seed, hidden=_hidden(task),
                        tick=progress.reading(2 * source.size()), backend=backend)
-
-
-def _check_disturbances(plant: PlantDescription, episodes: Sequence[Episode]) -> None:
-    """Raise ValueError for a measured disturbance that does not change in the record."""
-    for name in plant.disturbance_names:
-        j = plant.input_names.index(name)
-        values = np.concatenate([one.u[:, j] for one in episodes])
-        if not np.ptp(values) > 0.0:
-            raise ValueError(f'{name} is {values[0]:.6g} in the whole record: leave it out of the '
-                             'measured disturbances, or record while it changes')
-
-
-def _dead_time(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode],
-               progress: _Progress) -> Array:
-    """Return the dead times (n_u,) as the task has them, or as estimated from the record, in s."""
-    names, seconds = plant.input_names, SECONDS_PER_TIME_UNIT[plant.time_unit]
-    if unknown := ', '.join(name for name in task.dead_time if name not in names):
-        raise ValueError(f'dead_time names {unknown}: the inputs are {", ".join(names)}')
-    given = np.array([task.dead_time.get(name, 0.0) for name in names])
-    if not (np.all(np.isfinite(given)) and np.all(given >= 0.0)):
-        raise ValueError(f'dead_time is {dict(task.dead_time)}, must be 0 s or more')
-    if late := ', '.join(name for name in task.disturbances if task.dead_time.get(name)):
-        raise ValueError(f'dead_time names {late}: a measured disturbance has none')
-    known = [name in task.dead_time or name in task.disturbances for name in names]
-    episodes = _delayed(episodes, given / seconds)
-    if not episodes:
-        raise ValueError(f'no episode is longer than dead_time = {max(given):g} s: record longer')
-    if task.physical_model or all(known):
-        return given
-    return given + seconds * find_dead_times(
-        episodes, known, watch=lambda: progress.estimating(0, 1, 'dead time')).values
-
-
-def _delayed(episodes: Sequence[Episode], dead_time: Array) -> list[Episode]:
-    return [late for one in episodes if (late := one.delayed(dead_time)) is not None]
-
-
-def _behind(episodes: Sequence[Episode], lag: Array) -> list[Episode]:
-    """Return episodes with inputs behind lags (n_u,), in time units; ValueError for none."""
-    found = [late for one in episodes if (late := lagged(one, lag)) is not None]
-    if episodes and not found:
-        raise ValueError(f'no episode is longer than four lags of {max(lag):g}: record longer')
-    return found
-
-
-def _given_lag(task: TrainingTask, plant: PlantDescription, episodes: Sequence[Episode]) -> Array:
-    """Return the lags (n_u,) that the task has, in s; 0 for one that is to be found."""
-    names = plant.input_names
-    if wrong := ', '.join(name for name in task.lag if name not in names or (
-            name in task.disturbances and task.lag[name])):
-        raise ValueError(f'lag names {wrong}: choose from the manipulated inputs '
-                         f'{", ".join(name for name in names if name not in task.disturbances)}')
-    shortest = 0.5 * SECONDS_PER_TIME_UNIT[plant.time_unit] * sample_interval(episodes)
-    for name, value in task.lag.items():
-        if not (value in (-1.0, 0.0) or shortest <= value <= LONGEST_DEAD_TIME):
-            raise ValueError(f'lag of {name} is {value:g} s, must be {shortest:.3g} s (half of a '
-                             f'sample interval) to {LONGEST_DEAD_TIME:g} s, 0 for none, or -1 to '
-                             'find it')
-        if value and any(one.linear and one.linear[names.index(name)] for one in episodes):
-            raise ValueError(f'the record has the applied {name}: set its lag to 0, or record its '
-                             'commands')
-    return np.array([max(task.lag.get(name, 0.0), 0.0) for name in names])
 
 
 def _free_runs(model: AnyModel, recorded: Record, test: Record | None, offsets: Array
@@ -328,74 +225,8 @@ def _checked(task: TrainingTask) -> Thresholds:
     return Thresholds(task.margin, task.condition)
 
 
-class _Progress:
-    """Reports how far a training is; raises Stopped when it is asked to end."""
-
-    def __init__(self, on_progress: OnProgress) -> None:
-        self._on_progress, self.learned, self._read = on_progress, 0.0, 0
-
-    def __call__(self, stage: str, share: float, text: str) -> None:
-        begin, end = _STAGES[stage]
-        if self._on_progress(begin + share * (end - begin), text):
-            raise Stopped
-
-    def reading(self, total: int) -> Callable[[int], None]:
-        """Return a tick that is given the samples that were read, of a total."""
-        def tick(samples: int) -> None:
-            self._read += samples
-            self('read', min(1.0, self._read / total), 'reading bags')
-
-        return tick
-
-    def estimating(self, done: int, total: int, text: str) -> bool:
-        self('estimate', done / total, f'estimating: {text}')
-        return False
-
-    def learning(self, now: MultistartProgress) -> bool:
-        self.learned = now.finished / now.total
-        self('learn', self.learned, f'learning: {now.name}, {now.text}')
-        return False
-
-    def judging_further(self, share: float) -> bool:
-        self('decide', _JUDGED + share * (_WRITING - _JUDGED), 'judging: further closed loops')
-        return False
-
-    def judging(self, name: str, share: float) -> bool:
-        # the closed loops of the last class come after all starts
-        done = ('decide', _JUDGED * share) if self.learned == 1.0 else ('learn', self.learned)
-        self(*done, f'judging: {name}')
-        return False
-
-
-def _estimate(task: TrainingTask, plant: PlantDescription, episodes: list[Episode],
-              methods: Mapping[str, IdentificationMethod], progress: _Progress, backend: Backend,
-              given: Collection[str]) -> Identified:
-    """
-    Estimate the drift: a polynomial, one with unmeasured states, or a plant's equations.
-
-    :param given: inputs of which no characteristic is sought.
-    """
-    seed, watch = task.seed, progress.estimating
-    if task.physical_model:
-        return estimate_parameters(plant, episodes, plant_class(task.physical_model),
-                                   task.constants, seed=seed, watch=watch)
-    if task.as_state:
-        return identify_non_affine(plant, episodes, task.as_state, methods=methods, seed=seed,
-                                   watch=watch, backend=backend)
-    if task.unmeasured_states < 0 and not task.model:
-        return identify_structure(plant, episodes, given=given, methods=methods,
-                                  seed=seed, watch=watch, backend=backend,
-                                  dead_times=not task.dead_time)
-    if task.unmeasured_states > 0:
-        return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
-                                   watch=watch, backend=backend, dead_times=not task.dead_time)
-    return identify_with_characteristics(
-        plant, episodes, given=given, methods=methods, seed=seed, watch=watch,
-        backend=backend)
-
-
 def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
-           progress: _Progress, backend: Backend
+           progress: PipelineProgress, backend: Backend
            ) -> tuple[ClassComparison | None, AcceptanceResult | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a rejection; from a sibling first."""
     task, found = bare.task, bare.found
@@ -412,7 +243,7 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
                 device=task.device, backend=backend, begin=begin)
         except TrainingFailed as error:
             reasons: tuple[str, ...] = (str(error),)
-        progress('decide', _JUDGED, 'judging')
+        progress('decide', JUDGED, 'judging')
         if learned is not None:
             decision = evaluate_model(found, learned, bare.present, thresholds,
                                       watch=progress.judging_further, backend=backend)

@@ -12,8 +12,7 @@ import pytest
 
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
-from koopman_ros.learning import pipeline as task_module
-from koopman_ros.learning import retrain, TrainingTask, write_report
+from koopman_ros.learning import drift_estimation, pipeline, retrain, TrainingTask, write_report
 from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.identification.alternatives import TransformedDrift
@@ -72,13 +71,13 @@ def accepted(bag, tmp_path_factory):
 def estimated(accepted, monkeypatch):
     """Let a retraining go on from what the accepted one has estimated."""
     monkeypatch.setattr(
-        task_module, 'identify_with_characteristics', lambda *_, **__: accepted[0].found)
+        drift_estimation, 'identify_with_characteristics', lambda *_, **__: accepted[0].found)
 
 
 @pytest.fixture
 def learned(accepted, estimated, monkeypatch):
     """Let it go on from what the accepted one has learned, too."""
-    monkeypatch.setattr(task_module, 'compare_classes', lambda *_, **__: accepted[0].learned)
+    monkeypatch.setattr(pipeline, 'compare_classes', lambda *_, **__: accepted[0].learned)
 
 
 def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
@@ -166,13 +165,15 @@ def test_models_of_alternative_drifts_are_kept_next_to_the_model(
         bag, accepted, tmp_path, monkeypatch):
     """That of a training before goes."""
     drift = accepted[0].found.drift
-    monkeypatch.setattr(task_module, 'identify_with_characteristics', lambda *_, **__: replace(
+    found = replace(
         accepted[0].found, alternatives=(
             TransformedDrift(drift.box, drift, np.eye(1), np.zeros(1)),
             replace(drift, coefficients=1.02 * drift.coefficients),
             # more coordinates than a file may have
             replace(drift, degree=33, coefficients=np.pad(
-                drift.coefficients, ((0, 34 - len(drift.coefficients)), (0, 0)))))))
+                drift.coefficients, ((0, 34 - len(drift.coefficients)), (0, 0))))))
+    monkeypatch.setattr(
+        drift_estimation, 'identify_with_characteristics', lambda *_, **__: found)
     (tmp_path / 'new.alternative_7.safetensors').touch()
     told = []
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'),
@@ -192,8 +193,8 @@ def test_models_of_alternative_drifts_are_kept_next_to_the_model(
 
 @pytest.mark.usefixtures('learned')
 def test_rejected_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
-    original = task_module.evaluate_model
-    monkeypatch.setattr(task_module, 'evaluate_model', lambda *arguments, **named: replace(
+    original = pipeline.evaluate_model
+    monkeypatch.setattr(pipeline, 'evaluate_model', lambda *arguments, **named: replace(
         original(*arguments, **named), rmse=np.array([np.inf]), reasons=('it diverges',)))
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
     assert 'rollout_rmse' not in load(retrained.model_file).provenance.metrics
@@ -203,11 +204,11 @@ def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkey
     def reject(*_):
         raise PermissionError
 
-    monkeypatch.setattr(task_module.os, 'link', reject)
+    monkeypatch.setattr(pipeline.os, 'link', reject)
     output = tmp_path / 'a.safetensors'
     for content in (b'first', b'second'):
         output.write_bytes(content)
-        assert task_module._place(output, True) == output
+        assert pipeline._place(output, True) == output
         assert (tmp_path / 'a.previous.safetensors').read_bytes() == content
         assert output.read_bytes() == content
 

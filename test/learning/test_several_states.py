@@ -15,8 +15,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.execution.training import constant_lines, scalars
-from koopman_ros.learning import pipeline as task_module
-from koopman_ros.learning import retrain, TrainingTask, write_report
+from koopman_ros.learning import drift_estimation, retrain, TrainingTask, write_report
 from koopman_ros.learning.identification import identify, identify_unmeasured
 from koopman_ros.learning.task import resolve_signals
 from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
@@ -175,7 +174,7 @@ def test_a_measured_input_replaces_the_command(lagging, measured):
 
 def test_a_level_that_is_in_no_bag_is_learned_with_the_other(short_bag, tmp_path, monkeypatch):
     """Tank 1 flows into tank 2, so that what it holds shows there."""
-    monkeypatch.setattr(task_module, 'identify_unmeasured', lambda *given, **others:
+    monkeypatch.setattr(drift_estimation, 'identify_unmeasured', lambda *given, **others:
                         identify_unmeasured(*given, **{**others, **FEWER}))
     with quick_retraining(16):
         found = retrain(TrainingTask((str(short_bag),), str(tmp_path / 'new.safetensors'), '',

@@ -9,8 +9,12 @@ from functools import partial
 
 import pytest
 
-from koopman_ros.learning import compare_classes, evaluate_model
-from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning import (
+    compare_classes,
+    drift_estimation,
+    evaluate_model,
+    pipeline,
+)
 from koopman_ros.learning.report import _sections
 from support.known_plants import methods
 
@@ -21,17 +25,17 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
     """Estimate by a few methods alone, and try laws in so many loops."""
     fewer = {'degrees': degrees, 'methods': methods(*windows)}
     with pytest.MonkeyPatch.context() as patch:
-        for original in (task_module.identify_with_characteristics,
-                         task_module.identify_non_affine):
+        for original in (drift_estimation.identify_with_characteristics,
+                         drift_estimation.identify_non_affine):
             def quick(*given, _original=original, **others):
                 return _original(*given, **{**others, **fewer})
 
-            patch.setattr(task_module, original.__name__, quick)
-        patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
-        patch.setattr(task_module, 'evaluate_model', partial(evaluate_model, loops=loops))
+            patch.setattr(drift_estimation, original.__name__, quick)
+        patch.setattr(pipeline, 'compare_classes', partial(compare_classes, loops=loops))
+        patch.setattr(pipeline, 'evaluate_model', partial(evaluate_model, loops=loops))
         yield
 
 
-def page_of(retrained: task_module.Retrained) -> str:
+def page_of(retrained: pipeline.Retrained) -> str:
     """Return what the page of a retraining says; its picture takes half a second to draw."""
     return '\n\n'.join(map(str, _sections(retrained)))
