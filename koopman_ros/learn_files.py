@@ -27,7 +27,8 @@ from koopman_ros.model import LiftedModel, load
 from koopman_ros.model_classes import BEST
 from koopman_ros.parameters.signal_topics import described, Signals
 from koopman_ros.parameters.table import ParameterTable
-from koopman_ros.parameters.trainer import trainer_table, TrainerParameters
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.parameters.trainer_table import trainer_table
 from koopman_ros.records import read, Record, RecordedInput, RecordedState
 
 # Parameters of the trainer that are options here, by the same names.

@@ -29,7 +29,7 @@ from koopman_ros.core.message_fields import KNOWN_TYPES, place
 from koopman_ros.model import load
 from koopman_ros.parameters.signal_topics import DEFAULT_SYSTEM, KINDS
 from koopman_ros.parameters.table import Specification
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain

@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.signal_topics import SignalTopics
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
 from koopman_ros.ros.time_conversion import stamp_message

@@ -40,7 +40,7 @@ from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.signal_topics import bundled_plants, plant_defaults, Signals
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.plants import steady_state
 from koopman_ros.records import summary
 from koopman_ros.tuning import Tuning

@@ -18,7 +18,7 @@ from koopman_ros import records
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.player import player_table
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode

@@ -9,7 +9,8 @@ from typing import Any
 from koopman_ros.execution.training import JobState
 from koopman_ros.parameters.signal_topics import SIGNALS, SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import trainer_signals, trainer_table, TrainerParameters
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.parameters.trainer_table import trainer_signals, trainer_table
 from koopman_ros.ros import topics
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.managed import ManagedNode

@@ -21,7 +21,8 @@ from koopman_ros.parameters.signal_topics import (
     system_of,
 )
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
-from koopman_ros.parameters.trainer import SignalParameters, trainer_signals
+from koopman_ros.parameters.trainer import SignalParameters
+from koopman_ros.parameters.trainer_table import trainer_signals
 
 
 def _shown_unit() -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 from koopman_ros.core.declaration import parameter
 from koopman_ros.parameters.signal_topics import DEFAULT_SYSTEM, rejection, system_of
 from koopman_ros.parameters.table import ParameterTable
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 
 
 @dataclass(frozen=True)

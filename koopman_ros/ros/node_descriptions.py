@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.model import load
-from koopman_ros.parameters import controller, panel, plant, player, trainer
+from koopman_ros.parameters import controller, panel, plant, player, trainer_table
 from koopman_ros.parameters.signal_topics import (
     bundled_plants,
     DEFAULT_SYSTEM,
@@ -74,7 +74,7 @@ def table_of(name: str, given: Mapping[str, Any]) -> ParameterTable[Any]:
     model = model or plant_defaults(system, 'controller').get('model', '')
     present = load(model_path(model)) if model else None
     if name == 'trainer':
-        return trainer.trainer_table(present, given)
+        return trainer_table.trainer_table(present, given)
     if present is None:
         raise ConfigurationError(
             f'the system {system!r} has no model: name one in the parameter model, or in '
@@ -106,7 +106,7 @@ class Program:
 def _wiring(given: Mapping[str, Any]) -> tuple[SignalTopics, tuple[str, ...]]:
     """Return the places of the signals, and the recorded topics."""
     settings = table_of('trainer', given).snapshot({})
-    signals = trainer.trainer_signals(
+    signals = trainer_table.trainer_signals(
         load(model_path(given['model'])) if 'model' in given else None,
         {**{name: getattr(settings, name) for name in SIGNALS}, **given})
     return SignalTopics.of(signals, settings), settings.topics

@@ -11,7 +11,7 @@ import pytest
 from koopman_ros.core.message_fields import MessageField, place
 from koopman_ros.parameters.signal_topics import named_units, Signals
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import trainer_signals, trainer_table
+from koopman_ros.parameters.trainer_table import trainer_signals, trainer_table
 
 
 def joints() -> SimpleNamespace:

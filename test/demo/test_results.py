@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.demo.results import read_run
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.records import BagWriter, message_definition, read_messages
 from support.recorded_runs import Run, write_bag
 

@@ -15,7 +15,7 @@ import pytest
 
 from koopman_ros.execution import backend_of, SchedulerLost, Serial, WorkerLost
 from koopman_ros.execution.pools import Cluster, Processes
-from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.trainer_table import trainer_table
 
 KINDS = ('', 'process', 'joblib:2', 'dask')
 

@@ -21,7 +21,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.signal_topics import Signals
-from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.trainer_table import trainer_table
 from koopman_ros.records import read_messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_nanoseconds

@@ -17,7 +17,7 @@ from koopman_ros.control.state import EstimateReport
 from koopman_ros.core.paths import config_directory
 from koopman_ros.demo import reactor
 from koopman_ros.estimation import Innovation
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_messages import active_constraints, internals
 

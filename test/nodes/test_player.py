@@ -30,7 +30,7 @@ from koopman_ros.event_log.run import replayed_bag
 from koopman_ros.nodes import player
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.player import player_table
-from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness

@@ -28,7 +28,7 @@ from koopman_ros.parameters.table import (
     per_signal,
     Specification,
 )
-from koopman_ros.parameters.trainer import trainer_signals, trainer_table
+from koopman_ros.parameters.trainer_table import trainer_signals, trainer_table
 from koopman_ros.ros.node import LoopNode, range_of
 from koopman_ros.ros.node_descriptions import main, POLICY_FILE, tables
 from koopman_ros.ros.training import task_fields

@@ -22,7 +22,7 @@ from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.model import Box
-from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.trainer_table import trainer_table
 from koopman_ros.plants import (
     advance,
     box_episodes,
