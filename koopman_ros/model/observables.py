@@ -153,15 +153,15 @@ class NetworkObservables(Observables):
         return J, M, H
 
     def _hidden(self, x: Array) -> Array:
-        return np.tanh(x @ self.W.T + self.b)
+        return np.tanh(x.dot(self.W.T) + self.b)
 
     def _lifted(self, x: Array, h: Array) -> Array:
-        free: Array = (h - self.value_at_zero) @ self.V.T
+        free: Array = (h - self.value_at_zero).dot(self.V.T)
         return np.concatenate((x, free), axis=-1) if self.identity else free
 
     def _bent(self, slope: Array) -> Array:
         """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""
-        return (slope @ self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
+        return slope.dot(self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
 
     @cached_property
     def _of_states(self) -> Array:
