@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import Enum
 import math
 from typing import Any, NamedTuple
@@ -39,13 +39,12 @@ class Mode(Enum):
     MANUAL = 'manual'
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """All that a controller remembers between two measurements."""
 
     mode: Mode = Mode.AUTOMATIC  #: who commands
     #: requested, active and scheduled set-points
-    setpoint: Setpoint = field(default_factory=Setpoint)
+    setpoint: Setpoint = Setpoint()
     #: (n_u,) requested by the operator in manual mode, or None
     manual_input: Array | None = None
     time_ns: int | None = None  #: stamp of the last measurement, or None before the first
@@ -53,14 +52,14 @@ class State:
     command: Array | None = None  #: (n_u,) last command, or None before the first
     commanded_ns: int | None = None  #: when it was given, or None
     #: applied inputs that act, or will act; empty before the first command
-    applied: AppliedInputs = field(default_factory=AppliedInputs)
+    applied: AppliedInputs = AppliedInputs()
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
     accepted: Accepted | None = None  #: the last accepted measurement
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
     disturbances: MeasuredDisturbances | None = None  #: measured ones; None without any so far
-    history: History = field(default_factory=History)  #: of the estimate, for late values
-    supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
+    history: History = History()  #: of the estimate, for late values
+    supervisor: Supervisor = Supervisor()  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
     recovery: SafeStateRecovery | None = None
     law: str | None = None  #: the level whose law gave the last command; None when none did
@@ -71,11 +70,12 @@ class State:
     #: next one is looked for; None at first, and where every state has a set-point
     target: Array | None = None
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def restarted(self, time_ns: int | None) -> State:
         """Return the state after a measurement, without the parts that may have made it fail."""
-        return replace(self, **WITHOUT_LAW, estimate=None, history=History(),
+        return self._replace(**WITHOUT_LAW, estimate=None, history=History(),
                        recovery=None, target=None, time_ns=time_ns)
 
     @property
