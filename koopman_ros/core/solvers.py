@@ -117,13 +117,13 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n = len(A)
     D, W = over_interval(A, B, Q, R, interval)
-    D = D[:n]
-    scale = _scale(_size(W[:n, :n]), _size(D[:, n:]) ** 2 / (_size(W[n:, n:]) or 1.0))
+    D, size_Q = D[:n], _size(W[:n, :n])
+    scale = _scale(size_Q, _size(D[:, n:]) ** 2 / (_size(W[n:, n:]) or 1.0))
     size = n + len(W)
     less = np.zeros((size, size))
     less[:n, n:], less[n:, :n], less[n:, n:] = D, -D.T, W / -scale
     more = less.copy()
-    more[:, :n] *= -1.0
+    more[n:, :n] = D.T
     diagonals = more.ravel()
     diagonals[n:n * size:size + 1] += 2.0
     diagonals[n * size:2 * n * size:size + 1] += 2.0
@@ -139,7 +139,7 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     feedback = right.T.dot(K)
     loop = D[:, :n] - D[:, n:].dot(K)
     loop.ravel()[::n + 1] += 1.0
-    terms = _size(W[:n, :n]) + 2.0 * _size(PD[:, :n]) + _size(feedback)
+    terms = size_Q + 2.0 * _size(PD[:, :n]) + _size(feedback)
     return P, K, _size(cost[:n, :n] - feedback) / terms, loop
 
 
@@ -156,21 +156,21 @@ def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n, m = B.shape
     N = n + m
-    M = np.zeros((2 * N, 2 * N))
+    powers = np.zeros((4, 2 * N, 2 * N))
+    M, M2, M3, M4 = powers
     M[N:N + n, N:N + n], M[N:N + n, N + n:] = A, B
     M[:N, :N] = -M[N:, N:].T
     doublings = max(0, math.frexp(1.5 * _size(M) * interval)[1])
     M[:n, N:N + n], M[n:N, N + n:] = Q, R
     M *= math.ldexp(interval, -doublings)
-    M2 = M.dot(M)
-    M4 = M2.dot(M2)
-    powers = np.concatenate((M, M2, M2.dot(M), M4)).reshape(4, -1)
-    *parts, total = _SERIES.dot(powers).reshape(-1, *M.shape)
+    M.dot(M, out=M2)
+    M2.dot(M, out=M3)
+    M2.dot(M2, out=M4)
+    *parts, total = _SERIES.dot(powers.reshape(4, -1)).reshape(powers.shape)
     for part in reversed(parts):
         total = part + M4.dot(total)
     D, W = total[N:, N:], total[:N, N:]
-    W = 0.5 * (W + D.T.dot(W))
-    W = W + W.T
+    W = W + D.T.dot(W)
     for _ in range(doublings):
         DW = D.T.dot(W)
         W = 2.0 * W + DW + DW.T + DW.dot(D)
