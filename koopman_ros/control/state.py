@@ -119,30 +119,46 @@ NOTHING_MEASURED = MeasurementReport()
 
 
 class EstimateReport(NamedTuple):
-    """The estimate in the units of the signals."""
+    """The estimate, for which numbers in the units of the signals are calculated when read."""
 
-    state: Array  #: (n_x,) in state units
-    #: (n_u,) as an input that would have the same effect, in input units; NaN where not known
-    disturbance: Array
-    at_bound: bool  #: whether the disturbance is as large as is allowed
-    #: (n_x, n_x) of the state's error, in products of state units; None where not known
-    covariance: Array | None
-    innovation: Innovation | None  #: how well the measurements were predicted, or None
+    estimate: Estimate  #: in scaled deviations
+    estimator: Estimator  #: of the level that acts
 
-    @staticmethod
-    def of(estimate: Estimate, estimator: Estimator) -> EstimateReport:
-        """Return the report of an estimate, even if the estimator fails."""
-        states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
+    @property
+    def state(self) -> Array:
+        """The estimated state (n_x,), in state units."""
+        return self.estimator.model.states.to_physical(self.estimate.x)
+
+    @property
+    def disturbance(self) -> Array:
+        """The disturbance as an input (n_u,) with the same effect; NaN where not known."""
+        inputs = self.estimator.model.inputs
         try:
-            disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
-            at_bound = bool(estimator.at_bound(estimate.w))
+            return np.asarray(self.estimator.as_input(self.estimate.w)) * inputs.scale
         except BaseException as error:
             contained(error)
-            disturbance, at_bound = np.full(len(inputs), np.nan), False
-        return EstimateReport(
-            states.to_physical(estimate.x), disturbance, at_bound, None if P is None else (
-                states.scale[:, None] * P[:len(states), :len(states)] * states.scale),
-            estimate.innovation)
+            return np.full(len(inputs), np.nan)
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether the disturbance is as large as is allowed."""
+        try:
+            return bool(self.estimator.at_bound(self.estimate.w))
+        except BaseException as error:
+            contained(error)
+            return False
+
+    @property
+    def covariance(self) -> Array | None:
+        """That of the state's error (n_x, n_x), in products of units; None where not known."""
+        states, P = self.estimator.model.states, self.estimate.covariance
+        return None if P is None else (
+            states.scale[:, None] * P[:len(states), :len(states)] * states.scale)
+
+    @property
+    def innovation(self) -> Innovation | None:
+        """How well the measurements were predicted; None where not known."""
+        return self.estimate.innovation
 
     @property
     def deviation(self) -> Array | None:

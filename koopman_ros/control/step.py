@@ -303,7 +303,7 @@ class ControlStep(Configuration):
                 command: CommandReport = NO_COMMAND) -> StepReport:
         active, manual = state.setpoint.active, state.mode is Mode.MANUAL
         depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
-        known = None if state.estimate is None else EstimateReport.of(
+        known = None if state.estimate is None else EstimateReport(
             state.estimate, self.estimation.level(state.supervisor).estimator)
         steady = () if target is None else (
             target.residual, self.model.states.to_physical(target.x),
